@@ -82,9 +82,9 @@ def read_listing(
             f"{folder} holds photos in {len(held)} formats ({', '.join(held)}) and is read as "
             f"{held[0]}; in a recipe, data.format: {held[1]} reads the other"
         )
-    found = known[held[0] if format == "auto" else format].read(folder, images)
     if images is not None and not (folder / images).is_dir():
         raise FileNotFoundError(f"{folder / images} does not exist: correct `images`")
+    found = known[held[0] if format == "auto" else format].read(folder, images)
     found = located(found, found.folder or folder, images, outside)
     still = [frame.name for frame in found.frames if frame.time is None and not frame.problems]
     if still and len({frame.time is None for frame in found.frames}) > 1:
@@ -103,7 +103,6 @@ def present_frames(
     What is left out is logged. Raises FileNotFoundError when fewer than two images or a mask do not
     exist, ValueError for poses and intrinsics that cannot be right.
     """
-    # A listing of a stranger must not name other files of this machine.
     found = read_listing(folder, format, images, outside)
     frames = [frame for frame in found.frames if frame.split != "unused"]
     count = len(frames)

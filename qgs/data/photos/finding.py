@@ -6,6 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from pathlib import PurePosixPath
 
 from PIL import Image
@@ -24,75 +25,68 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     where two files may be meant, and for a file outside of `folder`.
     """
     frames = [frame for frame in found.frames if frame.name]
-    photos = found_files(folder, (frame.path for frame in frames), images, outside)
-    maps = [file for frame in frames for file in (frame.mask, frame.depth) if file]
+    maps = {file for frame in frames for file in (frame.mask, frame.depth) if file}
+    where = found_files(folder, (frame.path for frame in frames), images, outside)
     # A photo is no mask of another one.
-    others = found_files(folder, {*maps} - {*photos}, None, outside)
-    where = photos | {file: real for file, real in others.items() if real not in photos.values()}
-    if not outside:
-        for file in filter(None, (*(frame.path for frame in frames), *maps)):
-            if not is_inside(folder, where.get(file, file)):
-                raise ValueError(
-                    f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: "
-                    "move it into the folder, or train with data.outside=true"
-                )
-    moved = [file for file in where if _told(file, where[file], images)]
-    if moved:
-        ways = Counter(_told(file, where[file], images) for file in moved)
-        first = f"{name_shown(str(moved[0]))} as {where[moved[0]]}"
+    photos = {*where.values()}
+    for file, real in found_files(folder, maps - {*where}, None, outside).items():
+        if real not in photos:
+            where[file] = real
+    ways = Counter[str]()
+    for file, real in where.items():
+        # Reduced copies alone are how data sets are shipped.
+        silent = real == file or images or real.parent.name.startswith("images_")
+        if real.name != file.name:
+            alike = _key(real.name) == _key(file.name)
+            ways["in other letters" if alike else "with another suffix"] += 1
+        elif not silent:
+            ways["in another folder"] += 1
+    if ways:
+        file, real = next(pair for pair in where.items() if pair[0] != pair[1])
         warn_once(
-            f"{len(moved)} of {len(where)} files that {found.file} lists are found elsewhere: "
-            f"{listed(f'{count} {way}' for way, count in ways.items())}; {first}"
+            f"{ways.total()} of {len(where)} files are not found as {found.file} lists them, but "
+            f"{listed(f'{count} {way}' for way, count in ways.items())}: {real} for "
+            f"{name_shown(str(file))}"
         )
-    return replace(
-        found,
-        frames=[
-            replace(
-                frame,
-                path=where.get(frame.path, frame.path),
-                name="/".join(inside(folder, where[frame.path]))
-                if frame.path in where and where[frame.path] != frame.path
-                else frame.name,
-                mask=frame.mask and where.get(frame.mask, frame.mask),
-                depth=frame.depth and where.get(frame.depth, frame.depth),
+
+    def put(frame: PhotoFrame) -> PhotoFrame:
+        path, mask, depth = (where.get(f, f) for f in (frame.path, frame.mask, frame.depth))
+        name = frame.name if path == frame.path else "/".join(inside(folder, path))
+        return replace(frame, name=name, path=path, mask=mask, depth=depth)
+
+    frames = [put(frame) if frame.name else frame for frame in found.frames]
+    for file in () if outside else (where.get(f, f) for f in (*maps, *(f.path for f in frames))):
+        # A listing of a stranger must not name other files of this machine.
+        if not is_inside(folder, file):
+            raise ValueError(
+                f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: move "
+                "it into the folder, or train with data.outside=true"
             )
-            for frame in found.frames
-        ],
-    )
-
-
-def _told(file: UPath, real: UPath, images: str | None) -> str:
-    """Return how the listed `file` was found; "" where nobody needs to be told."""
-    if real.name != file.name:
-        return "in other letters" if _key(real.name) == _key(file.name) else "with another suffix"
-    # Reduced copies alone are how data sets are shipped.
-    silent = real == file or images or real.parent.name.startswith("images_")
-    return "" if silent else "in another folder"
+    return replace(found, frames=frames)
 
 
 def found_files(
     folder: UPath, files: Iterable[UPath], images: str | None = None, outside: bool = False
-) -> Mapping[UPath, UPath]:
+) -> dict[UPath, UPath]:
     """Return where listed `files` are, of those that are found.
 
     A file is looked for in `folder`, and in `images` there, without more and more of the folders
     that are listed before its name. images, outside: as of `located`. Raises as that.
     """
-    files = [*dict.fromkeys(files)]
+    files = {file: is_inside(folder, file) for file in files}
     bases = [folder / images] if images else [folder, image_folder(folder, None)]
-    allowed = (file for file in files if outside or is_inside(folder, file))
+    allowed = (file for file, within in files.items() if outside or within)
     found = {} if images else {file: file for file in existing(allowed)}
     # A file that is listed itself is not meant by another name, too.
     meant = dict(found)
     indexed = cache(_index)
-    for file in files:
-        parts = inside(folder, file)
-        parts = file.parts[1:] if not is_inside(folder, file) else parts
-        for first in range(0 if file in found else len(parts)):
-            for base in bases:
-                real = _resolved(base, parts[first:], indexed)
-                if real and file not in found and meant.setdefault(real, file) == file:
-                    found[file] = real
+    for file in files.keys() - found:
+        parts = inside(folder, file) if files[file] else file.parts[1:]
+        for first, base in product(range(len(parts)), bases):
+            real = _resolved(base, parts[first:], indexed)
+            if real and meant.setdefault(real, file) == file:
+                found[file] = real
+                break
     return found
 
 

@@ -26,7 +26,9 @@ from qgs.data.photos.reader import (
 )
 from qgs.paths import read_json
 
-PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+PINHOLE = (
+    "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV",
+)  # fmt: skip
 """Camera models that are a pinhole where no coefficient bends rays."""
 _COEFFICIENTS = (
     "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y",

@@ -9,13 +9,11 @@ import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields
 from itertools import chain
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
 
 import numpy as np
-import pycolmap
 import torch
 from upath import UPath
 
@@ -33,7 +31,7 @@ from qgs.data.photos.reader import (
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.paths import listing, open_file
 from qgs.wording import listed, name_shown, warn_once
-from qgs_photos.datasets.lenses import BendingLens, ColmapLens, Fisheye, RadialTangential, bending
+from qgs_photos.datasets.lenses import FOCAL, bending, model_name, parameters
 from qgs_photos.image_files import image_files
 
 _PLACES = (
@@ -45,20 +43,6 @@ _PLACES = (
     "dense/sparse",
     "dense/*/sparse",
 )
-_FOCAL = ("f", "fx", "fy")
-_MODELS: dict[str, tuple[int, str, type[BendingLens] | None]] = {
-    "SIMPLE_PINHOLE": (0, "f cx cy", None),
-    "PINHOLE": (1, "fx fy cx cy", None),
-    "SIMPLE_RADIAL": (2, "f cx cy k1", RadialTangential),
-    "RADIAL": (3, "f cx cy k1 k2", RadialTangential),
-    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2", RadialTangential),
-    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4", Fisheye),
-    "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1", Fisheye),
-    "RADIAL_FISHEYE": (9, "f cx cy k1 k2", Fisheye),
-}
-"""Number in binary files, parameters in their order, and lens of camera models; of others, slower
-ones by pycolmap."""
-_NAMES = {number: name for name, (number, _, _) in _MODELS.items()}
 _LONGER = "a file goes on after as many records as it promises"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
@@ -76,13 +60,14 @@ class Colmap(PhotoReader):
     @classmethod
     def lens(cls, model: str, coefficients: Mapping[str, float]) -> Lens | None:
         """See `PhotoReader`."""
-        kind = Fisheye if model == "OPENCV_FISHEYE" else RadialTangential
-        known = {field.name: coefficients.get(field.name, 0.0) for field in fields(kind)}
-        # files with several cameras have these at the top, for all models
-        others = coefficients.keys() - known.keys() - {"p1", "p2"}
-        if others or not (kind is Fisheye or model in PINHOLE):
-            return None
-        return bending(kind(**known))
+        # nerfstudio has a k3 in models where COLMAP has none
+        kind = "FULL_OPENCV" if model in PINHOLE else model
+        with suppress(ValueError):
+            # files with several cameras have p1 and p2 at the top, for all models
+            known = {"p1", "p2", *parameters(kind)}
+            known -= {"k4", "k5", "k6"} if kind != model else set()
+            return None if coefficients.keys() - known else bending(kind, coefficients)
+        return None
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
@@ -203,9 +188,9 @@ def _binary_cameras(model: UPath) -> Iterator[Camera]:
     with open_file(model / "cameras.bin") as file:
         for _ in range(_unpacked("<Q", file)[0]):
             number, kind, width, height = _unpacked("<IiQQ", file)
-            name = _NAMES.get(kind) or _name(kind)
-            parameters = _unpacked(f"<{len(_parameters(name))}d", file)
-            yield number, (name, width, height, parameters)
+            name = model_name(kind)
+            values = _unpacked(f"<{len(parameters(name))}d", file)
+            yield number, (name, width, height, values)
         if file.read(1):
             raise ValueError(_LONGER)
 
@@ -233,44 +218,27 @@ def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
     return struct.unpack(format, content)
 
 
-def _name(number: int) -> str:
-    """Return the name of a camera model. Raises ValueError for none of pycolmap's."""
-    return pycolmap.CameraModelId(number).name
-
-
-def _parameters(model: str) -> list[str]:
-    """Return the names of a camera model's parameters. Raises ValueError for an unknown one."""
-    if model in _MODELS:
-        return _MODELS[model][1].split()
-    return pycolmap.Camera(model=model).params_info.split(", ")
+def _camera(model: str, width: int, height: int, values: Sequence[float]) -> dict[str, Any]:
+    """Return the fields of a `PhotoFrame` that the camera took."""
+    size, problems = listed_size(height, width)
+    try:
+        if not np.isfinite(values).all():
+            raise ValueError("it has numbers that are none")
+        named = dict(zip(parameters(model), values, strict=True))
+        # simple models have one focal length for both axes
+        focal = [named.pop(key) for key in FOCAL if key in named]
+        # a panorama has none
+        intrinsics = (*(focal[:1] + focal[-1:]), named.pop("cx"), named.pop("cy"))
+        lens = bending(model, named)
+    except (ValueError, KeyError) as error:
+        return _faulty(f"the camera {model} with {len(values)} numbers cannot be used ({error})")
+    return {"size": size, "problems": problems, "intrinsics": intrinsics, "lens": lens}
 
 
 def _faulty(reason: str) -> dict[str, Any]:
-    """Return the fields of a photo that no known camera took."""
+    """Return the fields of a photo that no camera is known of."""
     fix = "export the model again, or undistort the photos with `colmap image_undistorter`"
     return {"intrinsics": (math.nan,) * 4, "problems": (FrameProblem(reason, fix),)}
-
-
-def _camera(model: str, width: int, height: int, parameters: Sequence[float]) -> dict[str, Any]:
-    """Return the fields of a `PhotoFrame` that the camera took."""
-    try:
-        values = dict(zip(_parameters(model), parameters, strict=True))
-    except (ValueError, RuntimeError):
-        return _faulty(f"the camera model {model} is not known with {len(parameters)} parameters")
-    size, problems = listed_size(height, width)
-    # simple models have one focal length for both axes
-    focal = [values[key] for key in _FOCAL if key in values]
-    if not focal or not np.isfinite(parameters).all():
-        return _faulty(f"the camera, {model} {list(parameters)}, has no focal length, or NaN")
-    intrinsics = (focal[0], focal[-1], values["cx"], values["cy"])
-    bent = {key: value for key, value in values.items() if key not in (*_FOCAL, "cx", "cy")}
-    if model not in _MODELS:
-        ideal = dict.fromkeys(_FOCAL, 1.0) | {"cx": 0.0, "cy": 0.0} | bent
-        lens = ColmapLens(model, tuple(ideal[key] for key in values))
-    else:
-        kind = _MODELS[model][2]
-        lens = bending(kind(**bent)) if kind else None
-    return {"size": size, "problems": problems, "intrinsics": intrinsics, "lens": lens}
 
 
 def _c2w(*cam_from_world: float) -> np.ndarray:

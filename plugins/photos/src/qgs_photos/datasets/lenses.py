@@ -1,34 +1,56 @@
 """Lenses that bend rays, and photos without their distortion."""
 
+import importlib
 import math
-from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-import pycolmap
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.data.photos.nerfstudio import PINHOLE
 from qgs.data.photos.reader import Intrinsics, Lens, Size
 
+FOCAL = ("f", "fx", "fy")
+"""Parameters of a camera model that are focal lengths."""
 MOST_ZOOM = 2.0
 # Rows that are undistorted at once: photos of phones would take gigabytes.
 _ROWS = 64
 
 
+@dataclass(frozen=True)
 class BendingLens(Lens):
-    """A lens by its function from the pinhole's plane z = 1 to its own."""
+    """Any of COLMAP's lenses that bend rays, by pycolmap; OpenCV's are among them.
 
-    @abstractmethod
+    parameters: as COLMAP orders them, with focal lengths of 1 and the principal point at 0. turns:
+    clockwise quarters from its camera to this one.
+    """
+
+    model: str
+    parameters: tuple[float, ...]
+    turns: int = 0
+
     def distorted(self, points: Tensor) -> Tensor:
-        """Return where the lens puts points (..., 2) of the plane z = 1."""
+        """Return where the lens puts points (..., 2) of the plane z = 1 on its own."""
+        camera = _pycolmap().Camera(model=self.model, width=1, height=1, params=self.parameters)
+        # a quarter clockwise makes (-y, x) of (x, y)
+        plane = torch.view_as_complex(points.double().contiguous()).numpy() * (-1j) ** self.turns
+        flat = plane.ravel()
+        bent = camera.img_from_cam(np.stack([flat.real, flat.imag, np.ones(len(flat))], -1))
+        turned = (bent @ [1, 1j]).reshape(plane.shape) * 1j**self.turns
+        return torch.view_as_real(torch.from_numpy(turned)).to(points)
 
     def sees(self, points: Tensor) -> Tensor:
         """Return whether points (..., 2) lie before where the function turns back."""
         return points.norm(dim=-1) < _reach(self)
+
+    def turned(self) -> Self:
+        """See `Lens`."""
+        return replace(self, turns=self.turns + 1)
 
     def undistorted(
         self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
@@ -60,84 +82,34 @@ class BendingLens(Lens):
         return _whole_zoom(intrinsics, self, size, target)
 
 
-@dataclass(frozen=True)
-class RadialTangential(BendingLens):
-    """OpenCV's plumb-bob model (Brown, 1966), also COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV."""
+def bending(model: str, coefficients: Mapping[str, float]) -> BendingLens | None:
+    """Return the lens of a camera model of COLMAP; None where it is a pinhole.
 
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
-
-    def distorted(self, points: Tensor) -> Tensor:
-        """See `BendingLens`."""
-        # kornia's distort_points takes half as long again, and this is most of undistorting.
-        x, y = points.unbind(-1)
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        u = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
-        v = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
-        return torch.stack([u, v], -1)
-
-    def turned(self) -> Self:
-        """See `Lens`."""
-        # (p2, p1) is a vector in the image.
-        return replace(self, p1=self.p2, p2=-self.p1)
-
-
-@dataclass(frozen=True)
-class Fisheye(BendingLens):
-    """OpenCV's fisheye model (Kannala and Brandt, 2006); equidistant without coefficients."""
-
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-
-    def distorted(self, points: Tensor) -> Tensor:
-        """See `BendingLens`."""
-        radius = points.norm(dim=-1, keepdim=True)
-        theta = radius.atan()
-        t2 = theta * theta
-        bent = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
-        return points * torch.where(radius > 0, bent / radius, 1.0)
-
-    def turned(self) -> Self:
-        """See `Lens`: it is the same all around."""
-        return self
-
-
-@dataclass(frozen=True)
-class ColmapLens(BendingLens):
-    """Any of COLMAP's lenses, by pycolmap.
-
-    parameters: as COLMAP orders them, with focal lengths of 1 and the principal point at 0. turns:
-    clockwise quarters from its camera to this one.
+    coefficients: by COLMAP's names; others are 0. Raises ValueError for an unknown model.
     """
-
-    model: str
-    parameters: tuple[float, ...]
-    turns: int = 0
-
-    def distorted(self, points: Tensor) -> Tensor:
-        """See `BendingLens`."""
-        camera = pycolmap.Camera(model=self.model, width=1, height=1, params=self.parameters)
-        # a quarter clockwise makes (-y, x) of (x, y)
-        plane = torch.view_as_complex(points.double().contiguous()).numpy() * (-1j) ** self.turns
-        flat = plane.ravel()
-        bent = camera.img_from_cam(np.stack([flat.real, flat.imag, np.ones(len(flat))], -1))
-        turned = (bent @ [1, 1j]).reshape(plane.shape) * 1j**self.turns
-        return torch.view_as_real(torch.from_numpy(turned)).to(points)
-
-    def turned(self) -> Self:
-        """See `Lens`."""
-        return replace(self, turns=self.turns + 1)
+    names = parameters(model)
+    if model in PINHOLE and not any(coefficients.values()):
+        return None
+    ideal = dict.fromkeys(FOCAL, 1.0) | dict(coefficients)
+    return BendingLens(model, tuple(ideal.get(name, 0.0) for name in names))
 
 
-def bending(lens: BendingLens) -> BendingLens | None:
-    """Return `lens`, or None where it leaves every ray as a pinhole would."""
-    return lens if isinstance(lens, Fisheye) or any(vars(lens).values()) else None
+def parameters(model: str) -> list[str]:
+    """Return the names of a camera model's parameters. Raises ValueError for an unknown model."""
+    try:
+        return _pycolmap().Camera(model=model).params_info.split(", ")
+    except RuntimeError as error:
+        raise ValueError(f"the camera model {model} is not known") from error
+
+
+def model_name(number: int) -> str:
+    """Return the name of the camera model that has this number in binary files of COLMAP."""
+    return _pycolmap().CameraModelId(number).name
+
+
+def _pycolmap() -> Any:
+    # it takes a while to load, and most photos are of pinholes
+    return importlib.import_module("pycolmap")
 
 
 @lru_cache(maxsize=4096)
