@@ -6,13 +6,13 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import product
+from itertools import chain, product
 from pathlib import PurePosixPath
 
 from PIL import Image
 from upath import UPath
 
-from qgs.data.photos.reader import Listing, existing, image_folder
+from qgs.data.photos.reader import Listing, PhotoFrame, existing, image_folder
 from qgs.paths import listing
 from qgs.wording import listed, name_shown, warn_once
 
@@ -25,11 +25,13 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     where two files may be meant, and for a file outside of `folder`.
     """
     frames = [frame for frame in found.frames if frame.name]
-    maps = {file for frame in frames for file in (frame.mask, frame.depth) if file}
+    maps = [*filter(None, chain.from_iterable((f.mask, f.depth) for f in frames))]
     where = found_files(folder, (frame.path for frame in frames), images, outside)
     # A photo is no mask of another one.
     photos = {*where.values()}
-    for file, real in found_files(folder, maps - {*where}, None, outside).items():
+    for file, real in found_files(
+        folder, [m for m in maps if m not in where], None, outside
+    ).items():
         if real not in photos:
             where[file] = real
     ways = Counter[str]()
@@ -50,7 +52,8 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
         )
 
     def put(frame: PhotoFrame) -> PhotoFrame:
-        path, mask, depth = (where.get(f, f) for f in (frame.path, frame.mask, frame.depth))
+        path = where.get(frame.path, frame.path)
+        mask, depth = (file and where.get(file, file) for file in (frame.mask, frame.depth))
         name = frame.name if path == frame.path else "/".join(inside(folder, path))
         return replace(frame, name=name, path=path, mask=mask, depth=depth)
 
@@ -80,7 +83,7 @@ def found_files(
     # A file that is listed itself is not meant by another name, too.
     meant = dict(found)
     indexed = cache(_index)
-    for file in files.keys() - found:
+    for file in [file for file in files if file not in found]:
         parts = inside(folder, file) if files[file] else file.parts[1:]
         for first, base in product(range(len(parts)), bases):
             real = _resolved(base, parts[first:], indexed)
