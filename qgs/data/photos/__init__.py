@@ -82,8 +82,6 @@ def read_listing(
             f"{folder} holds photos in {len(held)} formats ({', '.join(held)}) and is read as "
             f"{held[0]}; in a recipe, data.format: {held[1]} reads the other"
         )
-    if images is not None and not (folder / images).is_dir():
-        raise FileNotFoundError(f"{folder / images} does not exist: correct `images`")
     found = known[held[0] if format == "auto" else format].read(folder, images)
     found = located(found, found.folder or folder, images, outside)
     still = [frame.name for frame in found.frames if frame.time is None and not frame.problems]
@@ -119,7 +117,7 @@ def present_frames(
     if len(present) < 2:
         raise FileNotFoundError(
             f"{found.file} names {count} images, but {len(present)} exist and 2 are needed: add "
-            f"{listed(missing, 3) or 'photos'}"
+            f"{listed(missing, 3) or 'photos'}, or name the folder that they are in as `images`"
         )
     if missing:
         warn_once(f"{len(missing)} of {count} images of {folder} are missing: {listed(missing, 3)}")

@@ -29,11 +29,8 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     where = found_files(folder, (frame.path for frame in frames), images, outside)
     # A photo is no mask of another one.
     photos = {*where.values()}
-    for file, real in found_files(
-        folder, [m for m in maps if m not in where], None, outside
-    ).items():
-        if real not in photos:
-            where[file] = real
+    others = found_files(folder, (file for file in maps if file not in where), None, outside)
+    where |= {file: real for file, real in others.items() if real not in photos}
     ways = Counter[str]()
     for file, real in where.items():
         # Reduced copies alone are how data sets are shipped.
@@ -77,7 +74,7 @@ def found_files(
     that are listed before its name. images, outside: as of `located`. Raises as that.
     """
     files = {file: is_inside(folder, file) for file in files}
-    bases = [folder / images] if images else [folder, image_folder(folder, None)]
+    bases = [*([] if images else [folder]), image_folder(folder, images)]
     allowed = (file for file, within in files.items() if outside or within)
     found = {} if images else {file: file for file in existing(allowed)}
     # A file that is listed itself is not meant by another name, too.

@@ -200,8 +200,13 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:
-    """Return `wanted`, else images or its least reduced copy, else `folder` itself."""
+    """Return `wanted`, else images or its least reduced copy, else `folder` itself.
+
+    Raises FileNotFoundError without `wanted`.
+    """
     if wanted is not None:
+        if not (folder / wanted).is_dir():
+            raise FileNotFoundError(f"{folder / wanted} does not exist: correct `images`")
         return folder / wanted
     found = {_COPY.fullmatch(item.name.lower()): item for item in listing(folder)}
     # `images` counts as reduced by 1.

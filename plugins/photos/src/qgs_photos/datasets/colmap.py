@@ -137,7 +137,7 @@ def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
                     break
 
 
-Camera: TypeAlias = tuple[int, tuple[str, int, int, Sequence[float]]]
+Camera: TypeAlias = tuple[int, tuple[str, float, float, Sequence[float]]]
 """Number, and the name of the model, width, height and parameters."""
 Image: TypeAlias = tuple[str, list[float], int]
 """Name, quaternion (w, x, y, z) with translation (x, y, z), number of the camera."""
@@ -146,7 +146,7 @@ Image: TypeAlias = tuple[str, list[float], int]
 def _text_cameras(model: UPath) -> Iterator[Camera]:
     for line in _lines(model / "cameras.txt"):
         number, name, width, height, *parameters = line.split()
-        yield int(number), (name, int(width), int(height), [*map(_number, parameters)])
+        yield int(number), (name, _number(width), _number(height), [*map(_number, parameters)])
 
 
 def _text_images(model: UPath) -> Iterator[Image]:
@@ -218,7 +218,7 @@ def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
     return struct.unpack(format, content)
 
 
-def _camera(model: str, width: int, height: int, values: Sequence[float]) -> dict[str, Any]:
+def _camera(model: str, width: float, height: float, values: Sequence[float]) -> dict[str, Any]:
     """Return the fields of a `PhotoFrame` that the camera took."""
     size, problems = listed_size(height, width)
     try:
