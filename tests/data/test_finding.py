@@ -22,13 +22,13 @@ images/images/N.png: images/N.png: 3 in another folder
 images/cam\\N.png: cam/N.png: 3 in another folder
 images/N.png: images_4/N.png:
 images/N.png: Images/N.png: 3 in another folder
-images/N.jpg: images/N.JPG: 3 in other letters
-Images/viewN.png: images/VIEWN.png: 3 in other letters
-images/zoe\u0301N.png: images/zo\u00e9N.png: 3 in other letters
-images/N: images/N.jpg: 3 with another suffix
-images/N.jpeg: images/N.png: 3 with another suffix
-images/N.0: images/N.0.webp: 3 with another suffix
-D\\a\\N.webp: Images/N.jpg: 3 with another suffix
+images/N.jpg: images/N.JPG: 3 with other letters or suffix
+Images/viewN.png: images/VIEWN.png: 3 with other letters or suffix
+images/zoe\u0301N.png: images/zo\u00e9N.png: 3 with other letters or suffix
+images/N: images/N.jpg: 3 with other letters or suffix
+images/N.jpeg: images/N.png: 3 with other letters or suffix
+images/N.0: images/N.0.webp: 3 with other letters or suffix
+D\\a\\N.webp: Images/N.jpg: 3 with other letters or suffix
 """
 """As listed, as the file is called, and what is told."""
 REFUSED = """

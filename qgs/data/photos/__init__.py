@@ -10,7 +10,6 @@ from qgs.data.photos.reader import (
     Listing,
     PhotoFrame,
     PhotoReader,
-    existing,
     installed_readers,
     sound_frames,
 )
@@ -109,9 +108,8 @@ def present_frames(
             f"{len(found.frames) - count} of {len(found.frames)} frames of {found.file} are "
             "in none of its splits and are left out"
         )
-    there = existing(frame.path for frame in frames)
-    present = [frame for frame in frames if frame.path in there]
-    missing = [str(frame.path) for frame in frames if frame.path not in there]
+    present = [frame for frame in frames if frame.path in found.present]
+    missing = [str(frame.path) for frame in frames if frame.path not in found.present]
     # Before the count: a wrong listing explains missing images.
     sound = sound_frames(found.file, present if len(present) > 1 else frames)
     if len(present) < 2:
@@ -122,7 +120,7 @@ def present_frames(
     if missing:
         warn_once(f"{len(missing)} of {count} images of {folder} are missing: {listed(missing, 3)}")
     masks = [frame.mask for frame in sound if frame.mask is not None]
-    absent = sorted({*map(str, masks)} - {*map(str, existing(masks))})
+    absent = sorted({str(mask) for mask in masks if mask not in found.present})
     if absent:
         raise FileNotFoundError(
             f"{found.file} names {len(masks)} masks, but {len(absent)} do not exist: "

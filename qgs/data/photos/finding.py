@@ -3,16 +3,15 @@
 import os
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import chain, product
-from pathlib import PurePosixPath
+from itertools import product
 
 from PIL import Image
 from upath import UPath
 
-from qgs.data.photos.reader import Listing, PhotoFrame, existing, image_folder
+from qgs.data.photos.reader import Listing, image_folder
 from qgs.paths import listing
 from qgs.wording import listed, name_shown, warn_once
 
@@ -25,64 +24,72 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     where two files may be meant, and for a file outside of `folder`.
     """
     frames = [frame for frame in found.frames if frame.name]
-    maps = [*filter(None, chain.from_iterable((f.mask, f.depth) for f in frames))]
-    where = found_files(folder, (frame.path for frame in frames), images, outside)
-    # A photo is no mask of another one.
-    photos = {*where.values()}
-    others = found_files(folder, (file for file in maps if file not in where), None, outside)
-    where |= {file: real for file, real in others.items() if real not in photos}
+    maps = [file for frame in frames for file in (frame.mask, frame.depth) if file]
+    photos = [frame.path for frame in frames]
+    where = found_files(folder, photos, {*maps}.difference(photos), images, outside)
     ways = Counter[str]()
     for file, real in where.items():
-        # Reduced copies alone are how data sets are shipped.
-        silent = real == file or images or real.parent.name.startswith("images_")
         if real.name != file.name:
-            alike = _key(real.name) == _key(file.name)
-            ways["in other letters" if alike else "with another suffix"] += 1
-        elif not silent:
+            ways["with other letters or suffix"] += 1
+        # Reduced copies alone are how data sets are shipped.
+        elif real != file and not images and not real.parent.name.startswith("images_"):
             ways["in another folder"] += 1
     if ways:
-        file, real = next(pair for pair in where.items() if pair[0] != pair[1])
+        first = next(f"{where[file]} for {file}" for file in where if where[file] != file)
         warn_once(
             f"{ways.total()} of {len(where)} files are not found as {found.file} lists them, but "
-            f"{listed(f'{count} {way}' for way, count in ways.items())}: {real} for "
-            f"{name_shown(str(file))}"
+            f"{listed(f'{count} {way}' for way, count in ways.items())}: {name_shown(first)}"
         )
-
-    def put(frame: PhotoFrame) -> PhotoFrame:
-        path = where.get(frame.path, frame.path)
-        mask, depth = (file and where.get(file, file) for file in (frame.mask, frame.depth))
-        name = frame.name if path == frame.path else "/".join(inside(folder, path))
-        return replace(frame, name=name, path=path, mask=mask, depth=depth)
-
-    frames = [put(frame) if frame.name else frame for frame in found.frames]
-    for file in () if outside else (where.get(f, f) for f in (*maps, *(f.path for f in frames))):
+    for file in () if outside else (*photos, *maps):
         # A listing of a stranger must not name other files of this machine.
-        if not is_inside(folder, file):
+        if not is_inside(folder, where.get(file, file)):
             raise ValueError(
                 f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: move "
                 "it into the folder, or train with data.outside=true"
             )
-    return replace(found, frames=frames)
+    moved = [
+        replace(
+            frame,
+            name=frame.name
+            if where.get(frame.path, frame.path) == frame.path
+            else "/".join(inside(folder, where[frame.path])),
+            path=where.get(frame.path, frame.path),
+            mask=frame.mask and where.get(frame.mask, frame.mask),
+            depth=frame.depth and where.get(frame.depth, frame.depth),
+        )
+        for frame in found.frames
+    ]
+    return replace(found, frames=moved, present={*where.values()})
 
 
 def found_files(
-    folder: UPath, files: Iterable[UPath], images: str | None = None, outside: bool = False
+    folder: UPath,
+    photos: Iterable[UPath],
+    maps: Collection[UPath] = (),
+    images: str | None = None,
+    outside: bool = False,
 ) -> dict[UPath, UPath]:
-    """Return where listed `files` are, of those that are found.
+    """Return where listed photos and maps are, of those that are found.
 
     A file is looked for in `folder`, and in `images` there, without more and more of the folders
     that are listed before its name. images, outside: as of `located`. Raises as that.
     """
-    files = {file: is_inside(folder, file) for file in files}
-    bases = [*([] if images else [folder]), image_folder(folder, images)]
-    allowed = (file for file, within in files.items() if outside or within)
-    found = {} if images else {file: file for file in existing(allowed)}
-    # A file that is listed itself is not meant by another name, too.
-    meant = dict(found)
     indexed = cache(_index)
-    for file in [file for file in files if file not in found]:
-        parts = inside(folder, file) if files[file] else file.parts[1:]
-        for first, base in product(range(len(parts)), bases):
+    bases = [folder, image_folder(folder, images)]
+    found: dict[UPath, UPath] = {}
+    missing: list[UPath] = []
+    for file in dict.fromkeys((*photos, *maps)):
+        reached = (outside or is_inside(folder, file)) and (not images or file in maps)
+        if reached and (0, file.name) in indexed(file.parent):
+            found[file] = file
+        else:
+            missing.append(file)
+    # A file that is found for one listed is not meant by another; a photo is no mask.
+    meant = dict(found)
+    for file in missing:
+        parts = inside(folder, file) if is_inside(folder, file) else file.parts[1:]
+        places = bases[1:] if images and file not in maps else bases
+        for first, base in product(range(len(parts)), places):
             real = _resolved(base, parts[first:], indexed)
             if real and meant.setdefault(real, file) == file:
                 found[file] = real
@@ -95,15 +102,15 @@ def _resolved(
 ) -> UPath | None:
     """Return what lies below `place` under a path of such parts. Raises as `located`."""
     for part in parts:
-        ways = (indexed(place).get(way) for way in _spellings(part))
-        held = next(filter(None, ways), None)
-        if held is None:
-            return None
+        index = indexed(place)
+        held = next((index[way] for way in _spellings(part) if way in index), [])
         if len(held) > 1:
             raise ValueError(
                 f"{name_shown(part)} may be any of {listed(held)}: correct its name in the "
                 "listing, or move the others away"
             )
+        if not held:
+            return None
         place = held[0]
     return place
 
@@ -119,17 +126,14 @@ def _index(folder: UPath) -> Mapping[object, list[UPath]]:
 
 def _spellings(name: str) -> Iterable[tuple[int, str]]:
     """Yield a name, then without letter case and form of Unicode, then without suffix, too."""
-    known = PurePosixPath(name).suffix.lower() in (*Image.registered_extensions(), ".npy")
-    key = _key(name)
-    return enumerate((name, key, key.rpartition(".")[0] if known else key))
-
-
-def _key(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold()
+    key = unicodedata.normalize("NFC", name).casefold()
+    stem, dot, suffix = key.rpartition(".")
+    known = dot + suffix in (*Image.registered_extensions(), ".npy")
+    return enumerate((name, key, stem if known else key))
 
 
 def inside(folder: UPath, path: UPath) -> Sequence[str]:
-    """Return the parts of `path` relative to `folder`; the first is .. where it is not in it."""
+    """Return the parts of `path` relative to `folder`."""
     return os.path.relpath(path.path, folder.path or ".").split(os.sep)
 
 

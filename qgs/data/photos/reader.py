@@ -3,7 +3,7 @@
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Self, TypeAlias
 
@@ -117,12 +117,13 @@ class PhotoFrame:
 class Listing:
     """The photos of a folder. file: what lists them. frames: in the order of the listing.
 
-    folder: what the photos lie in; None for the one that was read.
+    folder: what the photos lie in; None for the one that was read. present: files that are there.
     """
 
     file: UPath
     frames: Sequence[PhotoFrame]
     folder: UPath | None = None
+    present: Collection[UPath] = ()
 
 
 class PhotoReader(ABC):
@@ -184,19 +185,6 @@ def numbers(value: object) -> np.ndarray:
         return np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
-
-
-def existing(paths: Iterable[UPath]) -> set[UPath]:
-    """Return those of `paths` that exist; each folder is listed once, which object stores need."""
-    names: dict[str, set[str]] = {}
-    held: set[UPath] = set()
-    for path in paths:
-        folder = str(path.parent)
-        if folder not in names:
-            names[folder] = {item.name for item in listing(path.parent)}
-        if path.name in names[folder]:
-            held.add(path)
-    return held
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:

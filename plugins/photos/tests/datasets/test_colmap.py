@@ -169,7 +169,7 @@ def test_photos_beside_the_model_are_needed(tmp_path, photos):
 LEFT = (
     ("has no points: 3 lines", r"\n[38]\..*", ""),
     ("no camera 8", "7 view_001", "8 view_001"),
-    ("frame 1 .*NaN", "\n2 ", "\n2 -nan(ind) "),
+    ("frame 1 .*NaN", r"\n2 \S+", "\n2 -nan(ind)"),
 )
 """What is told of images.txt where programs leave something else in place of a pattern."""
 

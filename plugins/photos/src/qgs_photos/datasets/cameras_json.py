@@ -84,7 +84,7 @@ class CamerasJson(PhotoReader):
             raise ValueError(f"{file} lists no cameras: expected {_FORM}")
         if any(names):
             listed = [folder / name for name in names]
-            found = found_files(folder, listed, images)
+            found = found_files(folder, listed, images=images)
         else:
             place = image_folder(folder, images)
             listed = image_files(place)

@@ -227,7 +227,6 @@ def _camera(model: str, width: float, height: float, values: Sequence[float]) ->
         named = dict(zip(parameters(model), values, strict=True))
         # simple models have one focal length for both axes
         focal = [named.pop(key) for key in FOCAL if key in named]
-        # a panorama has none
         intrinsics = (*(focal[:1] + focal[-1:]), named.pop("cx"), named.pop("cy"))
         lens = bending(model, named)
     except (ValueError, KeyError) as error:

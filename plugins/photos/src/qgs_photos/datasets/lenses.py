@@ -90,6 +90,8 @@ def bending(model: str, coefficients: Mapping[str, float]) -> BendingLens | None
     names = parameters(model)
     if model in PINHOLE and not any(coefficients.values()):
         return None
+    if "cx" not in names:
+        raise ValueError(f"the camera model {model} is no lens, but a panorama")
     ideal = dict.fromkeys(FOCAL, 1.0) | dict(coefficients)
     return BendingLens(model, tuple(ideal.get(name, 0.0) for name in names))
 
