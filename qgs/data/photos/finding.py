@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from pathlib import PurePosixPath
 
 from PIL import Image
 from upath import UPath
@@ -26,7 +27,10 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     frames = [frame for frame in found.frames if frame.name]
     maps = [file for frame in frames for file in (frame.mask, frame.depth) if file]
     photos = [frame.path for frame in frames]
-    where = found_files(folder, photos, {*maps}.difference(photos), images, outside)
+    taken = {*photos}
+    where = found_files(
+        folder, photos, dict.fromkeys(file for file in maps if file not in taken), images, outside
+    )
     ways = Counter[str]()
     for file, real in where.items():
         if real.name != file.name:
@@ -88,6 +92,8 @@ def found_files(
     meant = dict(found)
     for file in missing:
         parts = inside(folder, file) if is_inside(folder, file) else file.parts[1:]
+        # Of Windows, as COLMAP writes them there.
+        parts = PurePosixPath("/".join(parts).replace("\\", "/")).parts
         places = bases[1:] if images and file not in maps else bases
         for first, base in product(range(len(parts)), places):
             real = _resolved(base, parts[first:], indexed)
@@ -128,7 +134,7 @@ def _spellings(name: str) -> Iterable[tuple[int, str]]:
     """Yield a name, then without letter case and form of Unicode, then without suffix, too."""
     key = unicodedata.normalize("NFC", name).casefold()
     stem, dot, suffix = key.rpartition(".")
-    known = dot + suffix in (*Image.registered_extensions(), ".npy")
+    known = dot + suffix in (*Image.registered_extensions(), ".npy", ".heic", ".heif", ".dng")
     return enumerate((name, key, stem if known else key))
 
 

@@ -64,7 +64,7 @@ def read_transforms(file: UPath) -> list[PhotoFrame]:
     try:
         # An angle of view needs the image's size; a header is read only where nothing lists one.
         if any(frame.problems and not frame.size for frame in frames):
-            present = found_files(folder, [frame.path for frame in frames])
+            present = found_files(folder, [frame.path for frame in frames if frame.name])
             first = next(iter(present.values()), None)
             size = read_image(first, image_size) if first else None
             frames = [_frame(folder, data, entry, size) for entry in entries]

@@ -100,9 +100,10 @@ def _read(model: UPath, suffix: str) -> Listing:
             f"{name_shown(str(error))}; export it again, or copy it again"
         ) from error
     folder = _project(model)
+    photos = image_folder(folder, None)
     frames = list[PhotoFrame]()
     for name, pose, number in posed:
-        inside = f"images/{name}"
+        inside = name if photos == folder else f"{photos.name}/{name}"
         camera = cameras.get(number) or _faulty(f"there is no camera {number}")
         frames.append(PhotoFrame(inside, folder / inside, _c2w(*pose), **camera))
     return Listing(model, sorted(frames, key=lambda frame: frame.name), folder)
@@ -229,8 +230,9 @@ def _camera(model: str, width: float, height: float, values: Sequence[float]) ->
         focal = [named.pop(key) for key in FOCAL if key in named]
         intrinsics = (*(focal[:1] + focal[-1:]), named.pop("cx"), named.pop("cy"))
         lens = bending(model, named)
-    except (ValueError, KeyError) as error:
-        return _faulty(f"the camera {model} with {len(values)} numbers cannot be used ({error})")
+    except (ValueError, KeyError):
+        numbers = f"{len(values)} numbers: {' '.join(map(str, values))[:80]}"
+        return _faulty(f"the camera is not one that COLMAP knows, {model} of {numbers}")
     return {"size": size, "problems": problems, "intrinsics": intrinsics, "lens": lens}
 
 
