@@ -6,7 +6,6 @@ import pytest
 from photo_formats import row_of_frames
 from photo_formats import scene as read
 from PIL import Image
-from tables import must_refuse
 
 from qgs.wording import warn_once
 
@@ -79,11 +78,13 @@ def test_what_may_be_meant_by_two_names_or_none_is_refused(spoon):
     for number, line in enumerate(REFUSED.strip().splitlines()):
         told, listed, files = line.split(": ")
         folder = spoon(str(number), listed, *files.split())
-        must_refuse(told, read, folder, kind=(FileNotFoundError, ValueError))
+        with pytest.raises((FileNotFoundError, ValueError), match=told):
+            read(folder)
 
 
 def test_masks_are_found_and_are_no_photos(spoon):
     names = ("images/N.jpg", "images/N.jpg", "masks/N.png")
     scene = read(spoon("a", *names, mask_path="C:/b/Masks/N.jpg"))
     assert [photo.mask.parent.name for photo in scene.photos] == ["masks"] * 3
-    must_refuse("masks", read, spoon("b", *names[:2], mask_path="N.png"), kind=FileNotFoundError)
+    with pytest.raises(FileNotFoundError, match="masks"):
+        read(spoon("b", *names[:2], mask_path="N.png"))

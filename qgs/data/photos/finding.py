@@ -1,4 +1,4 @@
-"""Where the files of a listing are: as it says, or in another folder or spelling of its own."""
+"""Files of a listing: where it says that they are, or in another folder or spelling."""
 
 import os
 import unicodedata
