@@ -109,9 +109,9 @@ def _asked(times: Tensor, inputs: int) -> Tensor | None:
 def with_noise(
     cameras: Cameras, inputs: int, views: ViewsConfig, rng: np.random.Generator
 ) -> Cameras:
-    """Return cameras (1, F), the first `inputs` of them, but for the first, with noise.
+    """Return cameras (1, F) with `ViewsConfig.pose_noise` on the inputs.
 
-    They turn and move by `ViewsConfig.pose_noise`; without it nothing is drawn.
+    The inputs are the first `inputs` cameras. The first of them stays exact.
     """
     if not views.pose_noise:
         return cameras

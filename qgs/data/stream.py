@@ -289,7 +289,7 @@ class Feed:
     error: Exception | None = None
 
     def fetch(self) -> None:
-        """Get the `count` batches of the next step; none, and `error`, when that fails."""
+        """Get the `count` batches of the next step; if that fails, set `error` instead."""
         try:
             self.batches = list(islice(self.stream, self.count))
         # Whoever reads `error` raises it, once all processes know.

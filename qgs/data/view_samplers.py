@@ -21,7 +21,7 @@ _T = TypeVar("_T")
 
 
 def held_out_frames(total: int, every: int) -> Frames:
-    """Return every n-th of `total` frames, from n // 2 on, or the middle one; none of 2, by 0."""
+    """Return every n-th of `total` frames, from n // 2 on, or the middle one; none if n is 0."""
     every = min(every, total)
     return tuple(range(every // 2, total, every)) if every and total > 2 else ()
 

@@ -137,9 +137,10 @@ def find_scale(
 
 
 def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
-    """Return at most FURTHER photos in the middle of the inputs, none held out or compared with.
+    """Return at most FURTHER photos from the middle of the inputs, without held-out ones.
 
-    The middle has the smallest largest `pose_distance` from inputs. None of scenes that move.
+    Photos to compare with are left out too. The middle is where the largest `pose_distance` from
+    the inputs is smallest. Scenes that move have no such photos.
     """
     left = [f for f in range(len(scene)) if f not in {*inputs, *compared, *scene.held_out}]
     if scene.times is not None or not left:

@@ -69,7 +69,7 @@ class Splats:
 
 @full_precision
 def splats(gaussians: Gaussians, placement: Placement) -> Splats:
-    """Place the Gaussians (1, G) of one scene; a warning where `sh` is not shown."""
+    """Place the Gaussians (1, G) of one scene; warn that `sh` is not shown."""
     if gaussians.sh is not None:
         warn_once("colours of these Gaussians depend on the direction; those of degree 0 are shown")
     rotated = placement.vectors(quat_to_matrix(gaussians.quats[0]))

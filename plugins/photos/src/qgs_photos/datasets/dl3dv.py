@@ -37,7 +37,7 @@ class Dl3dvConfig(SceneSource.Config):
     """File that names the test scenes, all others being for training: an evaluation index, a JSON
     list or lines of text; null trains on all."""
     holdout: int = Field(default=0, ge=0)
-    """Every n-th frame of a scene is kept for evaluation, from frame n // 2 on; 0 for none."""
+    """Hold out every n-th frame of a scene for evaluation, from frame n // 2 on. 0: none."""
     max_scenes: int = Field(default=0, ge=0)
     """Only the first scenes of each split by name; 0 for all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)

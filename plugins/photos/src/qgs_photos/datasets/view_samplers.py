@@ -191,13 +191,13 @@ def farthest_points(points: Tensor, count: int) -> list[int]:
 
 
 class Overlapping(ViewSampler):
-    """Inputs that see most of a random photo, and overlap; it and those nearest to it are targets.
+    """Sampler for photos in any order: overlapping inputs around a random photo.
 
-    Of photos drawn at random, inputs are those that `qgs demo` takes for the photo, .06 to .25
-    depths of the scene apart, times a factor drawn log-uniformly between the bounds of `apart`. In
-    evaluation the factor is 1: each held-out photo is a target, of inputs among all training
-    photos; of a scene without held-out photos, four of them are. `views.gap` is not read, except
-    where scenes move: those are judged in the order of time, and training refuses them.
+    The inputs are those that `qgs demo` would choose for the random photo. They are .06 to .25 scene
+    depths apart, times a factor drawn log-uniformly between the bounds of `apart`. Targets are the
+    random photo and those nearest to it. In evaluation the factor is 1, and each held-out photo is a
+    target; a scene without held-out photos has four targets. `views.gap` is read only for scenes
+    that move: they are judged in the order of time, and training refuses them.
     """
 
     name = "overlapping"
