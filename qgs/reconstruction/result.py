@@ -64,7 +64,10 @@ class Reconstruction:
 
     @property
     def in_photos_world(self) -> Gaussians:
-        """Gaussians (1, G) in the frame and unit of the photos' cameras, as for `save_ply`."""
+        """Gaussians (1, G) in the frame and unit of the photos' cameras, as for `save_ply`.
+
+        means are in float64 where float32 would lose them, as far from zero.
+        """
         reference, scale = self.sample.world
         return moved(self.gaussians, reference, 1 / float(scale))
 

@@ -1,5 +1,7 @@
 """Photos whose EXIF turns them: their cameras turn with them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,8 @@ from PIL import Image
 from planted import Room
 from qgs_photos.datatools.check import Options, check
 from qgs_photos.datatools.entries import Encoding, encoded_frames
+from qgs_photos.datatools.geometry import Geometry, geometry_findings
+from qgs_photos.datatools.photos import Decoded, DecodedScene
 from textured_room import INTRINSICS, SIZE
 from upath import UPath
 
@@ -96,5 +100,10 @@ def test_of_squares_a_warning_says_whose_cameras_they_have(tmp_path, caplog):
     exif[0x0112] = 6
     path = UPath(tmp_path / "square.png")
     path.write_bytes(encoded(np.zeros((4, 4, 3), np.uint8), exif=exif))
-    assert upright(PhotoFrame("square.png", path, np.eye(4), INTRINSICS)).turns == 1
+    frame = upright(PhotoFrame("square.png", path, np.eye(4), INTRINSICS))
+    assert frame.turns == 1
     assert "poses must be of the stored pixels" in caplog.text
+    photos = [SimpleNamespace(listed=frame, exists=True)] * 2
+    squares = DecodedScene("squares", photos, [Decoded(size=(4, 4))] * 2)
+    (finding,) = geometry_findings(squares, Geometry(pairs=[((0, 1), 0.1)]))
+    assert "turned by EXIF" in finding.fix
