@@ -1,4 +1,4 @@
-"""Memory and cores of this machine: sizes that do not fit, work on all cores."""
+"""Memory and cores of this machine: available bytes, errors for too little, work in threads."""
 
 import os
 import sys
@@ -14,26 +14,26 @@ from rich.filesize import decimal
 
 
 class TooLargeError(ValueError):
-    """A request that does not fit into memory; the message has the numbers."""
+    """Error for a request that does not fit into memory; the message has the numbers."""
 
 
 def refuse_more_than_memory(what: str, needed: int, advice: str) -> None:
-    """Raise TooLargeError when `needed` bytes, a lower bound, are more than the available ones."""
+    """Raise TooLargeError if `needed` bytes, a lower bound, exceed the available memory."""
     limit = available_bytes()
     if needed > limit:
         raise TooLargeError(
-            f"{what} takes {decimal(needed)} of memory at least, and {decimal(limit)} are "
+            f"{what} takes at least {decimal(needed)} of memory, but {decimal(limit)} are "
             f"available. {advice}"
         )
 
 
 def available_bytes() -> int:
-    """Memory that this process can still take, of the machine and of its control group."""
+    """Return the bytes that this process can still use, limited by machine and control group."""
     limits = [sys.maxsize]
-    with suppress(OSError, ValueError, KeyError):  # no Linux
+    with suppress(OSError, ValueError, KeyError):  # not on Linux
         sizes = _numbers(Path("/proc/meminfo"))
         limits.append(1024 * (sizes["MemAvailable:"] + sizes["SwapFree:"]))
-    # A container sees its own group there.
+    # A container sees its own control group at this path.
     group = Path("/sys/fs/cgroup")
     # No group, or none with a limit.
     with suppress(OSError, ValueError, KeyError):
@@ -48,24 +48,24 @@ def _numbers(table: Path) -> dict[str, int]:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether Python, NumPy or torch ran out of memory, on any device."""
+    """Return True if Python, NumPy or torch ran out of memory, on any device."""
     words = str(error).lower()
     from_torch = "can't allocate memory" in words or "out of memory" in words
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and from_torch)
 
 
 def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> None:
-    """Call `unit(*item)` for every item of `work`, and wait.
+    """Call `unit(*item)` for every item of `work` in threads, and wait for all calls.
 
-    Every unit of work writes to its own memory, so their order does not matter. A unit must not
-    call this itself: it would wait for the threads that it holds.
+    Every call must write to its own memory, because their order is undefined. `unit` must not call
+    `in_threads` itself: it could wait forever for threads that are in use.
     """
     items = list(work)
     if len(items) == 1:
         unit(*items[0])
     else:
         futures = [_threads(torch.get_num_threads()).submit(unit, *item) for item in items]
-        # All of them, also where one fails: nobody writes when this returns.
+        # Waits for all even if one fails: no thread writes after this returns.
         wait(futures)
         for future in futures:
             future.result()

@@ -1,4 +1,4 @@
-"""The precision that a model computes in: autocast, and float32 or better for geometry."""
+"""Precision of a model's computation: autocast, and float32 or better for geometry."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -16,28 +16,28 @@ HALF = (torch.float16, torch.bfloat16)
 
 
 Precision: TypeAlias = Literal["float32", "bf16"]
-"""Precision of a model's computation (`training.precision`, `qgs bench`). Weights stay float32."""
+"""Values of `training.precision` and of the precision in `qgs bench`. Weights stay float32."""
 
 
 def autocast(precision: Precision, device: str) -> torch.autocast:
-    """Return the context in which a model computes in `precision`; geometry leaves it by itself.
+    """Return the context that makes a model compute in `precision`; geometry leaves it by itself.
 
-    bfloat16 has float32's exponents, so that no gradients need scaling.
+    bfloat16 has the exponents of float32, so gradients need no scaling.
     """
     return torch.autocast(device, torch.bfloat16, enabled=precision == "bf16")
 
 
 def at_least_float32(x: Tensor) -> Tensor:
-    """`x` in float32 if it is in half precision, else as it is."""
+    """Return `x` in float32 if it is in half precision; otherwise return `x` itself."""
     return x.float() if x.dtype in HALF else x
 
 
 def full_precision(function: F) -> F:
     """Run `function` outside autocast, with half-precision tensor arguments raised to float32.
 
-    Tensors are found wherever `qgs.containers.map_tensors` finds them; what holds no half-precision
-    tensor is passed on itself. A raised ImageMemory is a copy, whose `once` starts empty. float64
-    stays float64, so that gradient checks work.
+    `qgs.containers.map_tensors` finds the tensors. Arguments without a half-precision tensor are
+    passed on unchanged. A raised ImageMemory is a copy, and its `once` starts empty. float64 stays
+    float64, so that gradient checks work.
     """
 
     @wraps(function)
@@ -47,8 +47,8 @@ def full_precision(function: F) -> F:
         device = first[1].device.type if first else None
         if device is None:
             device = "cuda" if torch.is_autocast_enabled("cuda") else "cpu"
-        # Leaving the outermost autocast of a thread empties a cache that all threads share, so
-        # a thread that loads data must not enter one while another trains.
+        # Leaving the outermost autocast of a thread empties a cache that all threads share.
+        # Therefore a thread that loads data must not enter one while another thread trains.
         inside = device != "meta" and torch.is_autocast_enabled(device)
         with torch.autocast(device_type=device, enabled=False) if inside else nullcontext():
             return function(

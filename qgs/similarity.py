@@ -1,4 +1,4 @@
-"""SSIM, structural similarity of images (Wang et al. 2004): a map of it, and its mean."""
+"""SSIM, the structural similarity of images (Wang et al. 2004), as a map and as a mean."""
 
 from typing import Any, Literal, TypeAlias
 
@@ -21,34 +21,35 @@ Padding: TypeAlias = Literal["same", "valid"]
 
 
 def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1.0) -> Tensor:
-    """SSIM around every pixel of images (..., H, W) in [0, 1]: eq. 13 with a Gaussian window.
+    """Return SSIM around every pixel of images (..., H, W) in [0, 1]: eq. 13, Gaussian window.
 
-    padding: "same" pads with zeros, as the releases do; "valid" uses windows inside the image, and
-    raises ValueError for images smaller than one. correction: factor of the (co)variances.
+    padding: "same" pads with zeros, as the releases do; "valid" uses only windows inside the image.
+    "valid" raises ValueError for images smaller than a window. correction: factor of the variances
+    and the covariance.
     """
     height, width = x.shape[-2:]
     if padding == "valid" and min(height, width) < WINDOW:
         size = f"at least {WINDOW} pixels a side, got {height} x {width}"
-        raise ValueError(f"SSIM of whole windows needs images of {size}: raise data.image_size")
+        raise ValueError(f"SSIM without padding needs images of {size}: raise data.image_size")
     moments = torch.stack([x, y, x * x + y * y, x * y])
     planes = moments.reshape(1, -1, height, width)
     edge = WINDOW // 2 if padding == "same" else 0
-    # One group a plane: on a CPU a tenth of the time of planes as a batch.
+    # One group per plane: on a CPU this takes a tenth of the time of a batch of planes.
     kernel = _WEIGHTS.to(planes).expand(planes.shape[1], 1, 1, -1)
     groups = planes.shape[1]
     planes = F.conv2d(planes, kernel, padding=(0, edge), groups=groups)
     planes = F.conv2d(planes, kernel.mT, padding=(edge, 0), groups=groups)
     mean_x, mean_y, squares, product = planes.view(*moments.shape[:-2], *planes.shape[-2:])
     energy = mean_x.square() + mean_y.square()
-    # Variances as differences of squares lose digits: callers run this in float32 at least.
+    # Variances from differences of squares lose digits, so callers use float32 or better.
     similarity = (2 * mean_x * mean_y + _C1) * (2 * correction * (product - mean_x * mean_y) + _C2)
     return similarity / ((energy + _C1) * (correction * (squares - energy) + _C2))
 
 
 @full_precision
 def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
-    """Return the mean of `similarity_map`, 0-d; on a CPU by a kernel, in a tenth of the time."""
-    # A subclass, as torch makes to count or trace without numbers, cannot become an array.
+    """Return the mean of `similarity_map`, 0-d; on a CPU a kernel takes a tenth of the time."""
+    # Subclasses that torch uses to count or trace hold no numbers and cannot become arrays.
     plain = type(images) is type(truth) is Tensor and images.is_cpu
     single = images.dtype == truth.dtype == torch.float32
     if plain and single and padding == "same" and not truth.requires_grad:
@@ -57,7 +58,7 @@ def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
 
 
 class _Mean(torch.autograd.Function):
-    """images, truth (..., H, W) -> the mean over whole images."""
+    """Mean SSIM of images and truth (..., H, W) over whole images, with zero padding."""
 
     @staticmethod
     def forward(ctx: Any, images: Tensor, truth: Tensor) -> Tensor:

@@ -21,19 +21,19 @@ from accelerate.utils import (
 )
 
 TIMEOUT = timedelta(hours=24)
-"""Time that processes wait while one evaluates or saves.
+"""Longest wait of the other processes while one evaluates or saves.
 
-NCCL's default of 10 minutes would end such runs. The launcher notices a process that died, and ends
-the others."""
+NCCL's default of 10 minutes would end such runs. If a process dies, the launcher ends the others.
+"""
 
 _PARALLEL = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
 
 
 def make_accelerator(device: str, unread: bool) -> Accelerator:
-    """Return the processes that a launcher started (DDP), or this one alone.
+    """Return an Accelerator for the processes that a launcher started (DDP), or for this one alone.
 
-    unread: some parameters never get a gradient, which DDP must then search for.
-    Raises ValueError for a launcher's request of anything but DDP.
+    unread: some parameters never get a gradient, so DDP must search for them.
+    Raises ValueError if the launcher asks for anything but DDP.
     """
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
     parallel = DistributedDataParallelKwargs(find_unused_parameters=unread)
@@ -43,7 +43,7 @@ def make_accelerator(device: str, unread: bool) -> Accelerator:
     )
     if accelerator.distributed_type not in _PARALLEL:
         kind = accelerator.distributed_type.value
-        raise ValueError(f"training runs in one process or under DDP: launch it without {kind}")
+        raise ValueError(f"training supports one process or DDP only: launch it without {kind}")
     return accelerator
 
 
@@ -53,39 +53,39 @@ DEVICES = ("auto", "cpu", "cuda")
 def choose_device(wanted: str, say: Callable[[str], None] = print) -> str:
     """Return "cpu" or "cuda" for one of DEVICES.
 
-    "auto" takes CUDA if there is one and gsplat is installed; `say` gets a note if it is missing.
-    Raises ValueError for another name, and for "cuda" where there is none.
+    "auto" chooses CUDA if a CUDA device exists and gsplat is installed. If only gsplat is missing,
+    `say` gets a note. Raises ValueError for another name, and for "cuda" without a CUDA device.
     """
     if wanted not in DEVICES:
         raise ValueError(f"the device must be one of {', '.join(DEVICES)}, got {wanted!r}")
     available = torch.cuda.is_available()
     if wanted == "cuda" and not available:
         raise ValueError(
-            "the device 'cuda' was asked for, but torch finds none: install a torch with CUDA and "
-            "its driver, or choose 'cpu'"
+            "torch finds no CUDA device: install a torch with CUDA and the driver, or choose the "
+            "device 'cpu'"
         )
     if wanted != "auto":
         return wanted
-    # The renderer `qgs/auto` has only gsplat for tensors on a GPU.
+    # On a GPU, the renderer `qgs/auto` can only use gsplat.
     if available and find_spec("gsplat") is None:
         say(
-            "Computing on the CPU although a CUDA device is there: its renderer, gsplat, is not "
-            'installed (`pip install "query-gaussians[gsplat]"`, or --device cuda for recipes with '
-            "another one)"
+            "Computing on the CPU although there is a CUDA device, because gsplat is not "
+            'installed. Run `pip install "query-gaussians[gsplat]"`, or pass --device cuda if the '
+            "recipe has another renderer"
         )
         return "cpu"
     return "cuda" if available else "cpu"
 
 
 StopRequest: TypeAlias = list[signal.Signals]
-"""The signals that asked to stop; empty, thus false, until one does."""
+"""Signals that asked the run to stop. The list is empty, and therefore false, until one arrives."""
 
 
 @contextmanager
 def stop_requests(quiet: bool) -> Iterator[StopRequest]:
-    """Turn SIGINT and SIGTERM inside the block into a request; print so once unless `quiet`.
+    """Collect SIGINT and SIGTERM in a list inside the block; print the first unless `quiet`.
 
-    Does nothing outside the main thread, where Python cannot handle signals.
+    Does nothing outside the main thread, because Python handles signals only there.
     """
     request: StopRequest = []
     if threading.current_thread() is not threading.main_thread():
@@ -95,13 +95,13 @@ def stop_requests(quiet: bool) -> Iterator[StopRequest]:
     def ask(number: int, frame: FrameType | None) -> None:
         asked = signal.Signals(number)
         message = f"\n{asked.name}: finishing the step, then saving (Ctrl-\\ ends at once)\n"
-        # Launchers and terminals each send the signal: repeats mean nothing new.
+        # Launchers and terminals both send the signal, so only the first one is news.
         if not (quiet or request):
-            # Not print, which is not reentrant: a handler may interrupt it.
+            # `print` is not reentrant, and a handler may interrupt it.
             os.write(2, message.encode())
         request.append(asked)
 
-    # Restored afterwards: a notebook goes on with handlers of its own.
+    # Restored afterwards, because a notebook has handlers of its own.
     before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield request

@@ -1,4 +1,4 @@
-"""The folder of one training run: its files, what is saved in it, and how a run is continued."""
+"""Folder of one training run: its files, saving to it, and continuing a run from it."""
 
 import json
 import os
@@ -50,21 +50,22 @@ FREE = (
 )
 """Parts of a recipe that may change when a run is continued.
 
-They decide how long to train, where data lies and what is reported, not what is learnt. With
-another budget the learning rate follows the new one from there. Plugins that the model uses are
-compared by its types. `training.accumulate` may change too: a step sees the same samples.
+They decide how long to train, where the data is and what is reported. They do not change what the
+model learns. If the budget changes, the learning rate follows the new budget from then on. The list
+`plugins` may change because the types of the model's components are compared. The options
+`training.batch_size` and `training.accumulate` are compared by the samples that a step sees.
 """
 
 
 class OtherRunError(ValueError):
-    """Error: a run cannot continue with this recipe, these processes or this data."""
+    """Error: a run cannot be continued with this recipe, these processes or this data."""
 
 
 class RunFolder:
-    """Files of a run, existing or not.
+    """Paths of the files of a run; the files need not exist yet.
 
-    checkpoint: the latest good weights; checkpoint_ema: their moving average, where a recipe asks
-    for it; state: everything that continues the run; evaluation: where `qgs eval` writes.
+    checkpoint: the latest good weights. checkpoint_ema: their moving average, if the recipe asks
+    for one. state: everything needed to continue the run. evaluation: output of `qgs eval`.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -79,7 +80,7 @@ class RunFolder:
 
     @property
     def is_new(self) -> bool:
-        """True where the folder does not exist or holds only what killed processes left."""
+        """True if the folder does not exist or holds only leftovers of killed processes."""
         if not self.path.is_dir():
             return True
         return all(is_leftover(file) or file.name == _LOCK for file in self.path.iterdir())
@@ -92,10 +93,10 @@ class RunFolder:
             return
         if not resume:
             raise FileExistsError(
-                f"{self.path} is not empty and a run never overwrites another; choose another "
-                "folder, delete it yourself, or continue its run with --resume"
+                f"{self.path} is not empty, and a run never overwrites another one; choose another "
+                "folder, delete this one, or continue its run with --resume"
             )
-        # A run that was killed before its first save has a recipe alone, and starts again.
+        # A run that was killed before its first save has only a recipe, and starts again.
         if self.checkpoint.exists() or not self.recipe.is_file():
             raise FileExistsError(
                 f"{self.path} is not empty and holds no run that can be continued: "
@@ -103,31 +104,32 @@ class RunFolder:
             )
 
     def take(self) -> None:
-        """Lock the folder for this process until `close`; delete temporary files of killed ones.
+        """Lock the folder for this process until `close`.
 
-        Raises FileExistsError while another process trains in it.
+        Deletes temporary files of killed processes. Raises FileExistsError while another process
+        trains in the folder.
         """
         self.path.mkdir(parents=True, exist_ok=True)
         try:
-            # The system takes the lock off a dead process.
+            # The operating system releases the lock of a dead process.
             self._lock.acquire()
         except Timeout:
             raise FileExistsError(
-                f"another process is training in {self.path}; wait for its end, or choose "
+                f"another process is training in {self.path}; wait until it ends, or choose "
                 "another folder"
             ) from None
         for leftover in filter(is_leftover, self.path.iterdir()):
             leftover.unlink()
 
     def append(self, *records: Mapping[str, Any], name: str = HISTORY) -> None:
-        """Add a line each to the history, or to another file of records: all of them or none."""
+        """Append one line per record to the history or to the file `name`; all lines or none."""
         path = self.path / name
-        # Opened for each line: readers see every step, and a kill leaves nothing in a buffer.
+        # Opened for each call: readers see every step, and a kill loses no buffered lines.
         with naming_full_disk(path), path.open("a", encoding="utf-8") as file:
             file.write("".join(json.dumps(record) + "\n" for record in records))
 
     def history(self) -> list[dict[str, float]]:
-        """Return all records so far, one per optimiser step."""
+        """Return all records so far, one per optimiser step; skipped steps lack non-finite values."""
         return read_records(self.history_file)
 
     def cut_records(self, step: int) -> None:
@@ -140,7 +142,7 @@ class RunFolder:
     def close(self) -> None:
         """Unlock the folder."""
         if self._lock.is_locked:
-            # While it is held: whoever comes next makes a lock file of its own.
+            # Deleted while the lock is held: the next process creates its own lock file.
             Path(self._lock.lock_file).unlink(missing_ok=True)
             self._lock.release(force=True)
 
@@ -149,9 +151,9 @@ class RunFolder:
 class Saver:
     """Writer of the checkpoint and the state of a run; only the main process writes.
 
-    stateful: what continues the run, beside the weights, by name. Each has `state()`, which returns
-    a State, and `load_state(state)`, which restores it. "ema" has a checkpoint too.
-    Each file appears whole or not at all. All processes must call each method together.
+    stateful: objects to save and restore besides the weights, by name. Each has `state()`, which
+    returns a State, and `load_state(state)`, which restores it. "ema" also gets a checkpoint.
+    Each file is written completely or not at all. All processes must call each method together.
     """
 
     folder: RunFolder
@@ -161,7 +163,8 @@ class Saver:
     def save(self, step: int, good: tuple[int, Mapping[str, Tensor]] | None = None) -> None:
         """Save the run after `step` optimiser steps.
 
-        good: steps and weights of the checkpoint, if not the present ones; averages then stay.
+        good: steps and weights to save as the checkpoint instead of the present ones. The
+        checkpoint of the moving average then stays as it is.
         """
         states: dict[str, State] = {"weights": unique_tensors(self.model)}
         states |= {name: one.state() for name, one in self.stateful.items()}
@@ -173,28 +176,28 @@ class Saver:
             self._write_checkpoint(self.folder.checkpoint, saved, weights)
             if "ema" in states and not good:
                 self._write_checkpoint(self.folder.checkpoint_ema, step, states["ema"])
-            # Last: complete by itself, and never ahead of the weights.
+            # Written last: the state is complete by itself, and must not be ahead of the weights.
             self._write_state(states)
         wait_for_everyone()
 
     def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
-        """Save a checkpoint of other weights than the present ones."""
+        """Save a checkpoint with the given weights instead of the present ones."""
         if PartialState().is_main_process:
             self._write_checkpoint(self.folder.checkpoint, step, weights)
         wait_for_everyone()
 
     def restore(self, states: Mapping[str, State]) -> None:
-        """Restore the weights and all stateful parts; raises CheckpointError."""
+        """Restore the weights and every entry of `stateful`; raises CheckpointError."""
         load_weights(self.model, states.get("weights", {}), self.folder.state)
         for name, one in self.stateful.items():
             try:
                 one.load_state(states[name])
-            except Exception as error:  # a component of a plugin may raise anything
+            except Exception as error:  # a plugin's component may raise anything
                 if isinstance(error, OtherRunError) or is_out_of_memory(error):
                     raise
                 raise CheckpointError(
-                    f"{self.folder.state} is damaged, or another version of qgs wrote it: its part "
-                    f"`{name}` cannot be restored ({type(error).__name__}: {error})"
+                    f"{self.folder.state} is damaged or was written by another version of qgs: its "
+                    f"part `{name}` cannot be restored ({type(error).__name__}: {error})"
                 ) from error
 
     def _write_checkpoint(self, path: Path, step: int, weights: Mapping[str, Tensor]) -> None:
@@ -210,7 +213,7 @@ class Saver:
 
 
 def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, State]) -> None:
-    """Write `states` to `path`, whole or not at all; recipe: the resolved tree."""
+    """Write `states` to `path`, completely or not at all; recipe: the resolved tree."""
     tensors: dict[str, Tensor] = {}
     values: dict[str, dict[str, Any]] = {}
     for name, state in states.items():
@@ -226,7 +229,7 @@ def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, Stat
 
 
 def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
-    """Read what `write_state` wrote; raises FileNotFoundError, CheckpointError, RecipeError."""
+    """Read a file of `write_state`; raises FileNotFoundError, CheckpointError, RecipeError."""
     with TensorFile(path) as file:
         states = file.mapping(_STATES)
         for place, tensor in file.read().items():
@@ -236,15 +239,15 @@ def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
 
 
 def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
-    """Return the states from which the run in `folder` continues; none to start it from step 0.
+    """Return the states to continue the run in `folder` from; empty to start it at step 0.
 
-    Raises OtherRunError unless `recipe` equals the run's outside of FREE, CheckpointError when the
-    state cannot be read.
+    Raises OtherRunError if `recipe` differs from the run's in more than FREE, and CheckpointError
+    if the state cannot be read.
     """
     if folder.state.is_file():
         run, states = read_state(folder.state)
     else:
-        # A run that was killed before its first save has a recipe alone: it starts again.
+        # A run that was killed before its first save has only a recipe, and starts again.
         run = resolve(folder.recipe)
         states = {}
     # `Counters` compares the scenes of a step, which older runs counted by process.
@@ -256,8 +259,8 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
     ]
     if differing:
         raise OtherRunError(
-            f"{folder.path} holds a run with another recipe, which cannot be continued with this "
-            f"one:{''.join(line[:500] for line in differing)}"
+            f"{folder.path} holds a run of another recipe, which this recipe cannot "
+            f"continue:{''.join(line[:500] for line in differing)}"
             f"\nContinue it with its own recipe, {folder.recipe}, or choose another folder. "
             f"Only these may change: {', '.join(FREE)}."
         )

@@ -1,4 +1,4 @@
-"""Automatic ends of a run: collapsed models and steps that are not finite."""
+"""Checks that stop a run: a dead model, NaN or infinite steps, and too little memory."""
 
 import logging
 import math
@@ -28,16 +28,19 @@ EMPTY_ALPHA = 2e-3
 """Mean alpha below which a rendering shows the background alone."""
 
 FLAT = 1 / 255
-"""Mean deviation from the background of a rendering that shows nothing else."""
+"""Mean deviation from the background below which a rendering shows the background alone."""
 
 NO_GRADIENT = 1e-8
 """Gradient norm below which a model no longer learns."""
 
 LOSS_OF_QUALITY = 1.0
-"""Drop below the best running mean of PSNR, in dB, at which weights no longer count as good."""
+"""Largest drop in dB from the best PSNR so far for weights that still count as good.
+
+Both values are running means of about ten steps.
+"""
 
 MAX_SKIPPED = 10
-"""Steps in a row that may be skipped; after them training stops."""
+"""Most steps in a row that may be skipped before training stops."""
 
 _TOO_FAST = (
     "\n  - a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
@@ -46,46 +49,46 @@ _TOO_FAST = (
 
 COLLAPSE_CAUSES = (
     f"{_TOO_FAST}"
-    "\n  - a visibility loss too strong or absent (try losses.visibility.weight 0.1 with "
+    "\n  - a visibility loss that is too strong or missing (try losses.visibility.weight 0.1 with "
     "behind_camera: invisible)"
     "\n  - an initialisation that hides every Gaussian (raise model.head.opacity_bias)"
-    "\n  - a scale of the world that leaves none before the cameras (check views.scale and "
-    "views.scale_factor against the anchors' and the scenes' depth)"
+    "\n  - a scale of the world that leaves no Gaussian in front of the cameras (compare "
+    "views.scale and views.scale_factor with the depths of the anchors and the scenes)"
 )
 
 NONFINITE_CAUSES = (
     f"{_TOO_FAST}"
-    "\n  - a range that bfloat16 does not hold (training.precision: float32)"
-    "\n  - data that is not finite: images, poses or intrinsics (look at it with `qgs data check`; "
-    "with views.scale distance, at input cameras that almost stand on one point)"
+    "\n  - numbers outside the range of bfloat16 (set training.precision to float32)"
+    "\n  - images, poses or intrinsics that are not finite (run `qgs data check`; with views.scale "
+    "distance, look for input cameras at almost the same point)"
 )
 
 
 class TrainingError(RuntimeError):
-    """Error that stops a training; the message says why, what is kept and what to do."""
+    """Error that stops training; the message says why, what is kept and what to do."""
 
 
 class CollapseError(TrainingError):
-    """Error: the model collapsed; the last good weights are kept."""
+    """Error for a model that died; the last good weights are kept."""
 
 
 class NonFiniteError(TrainingError):
-    """Error: a step gave NaN or infinity; the run is saved as it was before that step."""
+    """Error for a step with NaN or infinity; the run is saved as it was before that step."""
 
 
 class OutOfMemoryError(TrainingError):
-    """Error: a step ran out of memory; the message says what is kept and what needs less."""
+    """Error for a step that ran out of memory; the message says what is kept and what helps."""
 
 
 @dataclass
 class Guard:
-    """Guard that stops a collapsed or non-finite run and keeps good weights.
+    """Guard that stops a run that is dead or not finite, and keeps good weights.
 
-    All processes must call each of its methods together; `step` counts finished optimiser steps.
-    What saves raises CollapseError for weights that are not finite.
+    All processes must call each method together. `step` counts finished optimiser steps. Methods
+    that save raise CollapseError if weights are not finite.
 
-    training_pass: not wrapped by accelerate. repeat: computes the gradients of a step again.
-    skipped: the latest steps in a row that were not finite.
+    training_pass: the module, not wrapped by accelerate. repeat: computes the gradients of a step
+    again. skipped: number of latest steps in a row that were not finite.
     """
 
     training_pass: TrainingPass
@@ -106,10 +109,11 @@ class Guard:
         self.signs = SignsOfLife(**state["detector"])
 
     def refuse_nonfinite(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
-        """Raise about the step after `step`, which is not finite, unless it is to be skipped.
+        """Raise an error for the step after `step`, which is not finite, or skip that step.
 
-        It is repeated to name the first bad tensor. Raises NonFiniteError, the run saved as before
-        that step, or CollapseError; logs a warning where the step is skipped.
+        The step is repeated to find the first bad tensor. A skipped step logs a warning. Otherwise
+        the run is saved as it was before the step and NonFiniteError is raised, or CollapseError if
+        the model was already dead.
         """
         self.skipped += 1
         # All processes repeat the step: its collective operations need everyone.
@@ -123,16 +127,16 @@ class Guard:
             self._collapse(step + 1, found)
         self.save(step)
         raise NonFiniteError(
-            f"step {step + 1} is not finite, and the run is saved as it was before this step; "
-            "continue without it by `--resume --set training.on_nonfinite=skip`, which skips at "
+            f"step {step + 1} is not finite; the run is saved as it was before this step. "
+            "Continue without it by `--resume --set training.on_nonfinite=skip`, which skips at "
             f"most {MAX_SKIPPED} steps in a row.\n{found}.\nLikely causes:{NONFINITE_CAUSES}"
         )
 
     def watch(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Record the finite numbers of `step`; copy the weights if they are good and a copy is due.
+        """Record the numbers of `step`, all finite; copy the weights if they are good and due.
 
-        Raises CollapseError when the last steps, a whole window of them, were dead, and for weights
-        to copy that are not finite.
+        Raises CollapseError if all steps of the last window were dead, or if weights to copy are
+        not finite.
         """
         self.skipped = 0
         self.signs.observe(numbers)
@@ -145,9 +149,9 @@ class Guard:
             self.good.refresh(step)
 
     def save(self, step: int, ends: bool = False) -> None:
-        """Save the run; a dead model's checkpoint is the last good one.
+        """Save the run; for a dead model the checkpoint keeps the last good weights.
 
-        ends: the budget is used. Raises CollapseError for a dead model then.
+        ends: the budget is used up; a dead model then raises CollapseError.
         """
         # A run shorter than a window is dead when all of its steps were.
         if self.signs.dead < min(self.config.collapse_window, step):
@@ -161,21 +165,25 @@ class Guard:
 
     @contextmanager
     def memory_explained(self, step: int, saves: bool = False) -> Iterator[None]:
-        """Raise OutOfMemoryError where the block finds no memory; saves: weights are untouched."""
+        """Raise OutOfMemoryError if the block runs out of memory.
+
+        saves: try to save the run before, which a single process can do if the block does not
+        change weights.
+        """
         try:
             yield
         except Exception as error:
             if not is_out_of_memory(error):
                 raise
-            # Saving takes memory too; the files of the last save are whole in any case. With
-            # several processes the others would wait for this one in vain.
+            # Saving may fail too, but the files of the last save stay complete. With several
+            # processes this one would wait for the others forever.
             if saves and step and PartialState().num_processes == 1:
                 with suppress(Exception):
                     self.save(step)
             raise OutOfMemoryError(
                 f"out of memory in step {step + 1}: {str(error).splitlines()[0][:300]}. "
-                "What was saved continues with --resume and a higher training.accumulate, more "
-                "processes, or fewer training.render_views. A new run also takes less when you "
+                "Continue the saved run with --resume and a higher training.accumulate, more "
+                "processes, or fewer training.render_views. A new run also needs less memory with "
                 "lower views.inputs, views.targets, training.batch_size, data.image_size, "
                 "model.queries.count or model.head.gaussians_per_query."
             ) from error
@@ -185,7 +193,10 @@ class Guard:
             self._collapse(step, f"weights are not finite: {listed(names)}")
 
     def _collapse(self, step: int, problem: str = "") -> NoReturn:
-        """Keep good weights and raise. problem: what is not finite; dead steps by default."""
+        """Save the last good weights and raise CollapseError.
+
+        problem: values that are not finite; "" for dead steps.
+        """
         causes = NONFINITE_CAUSES if problem else COLLAPSE_CAUSES
         problem = problem or f"for the last {self.signs.dead} steps {self.signs.symptom}"
         good, weights = self.good.last
@@ -198,10 +209,10 @@ class Guard:
 
 @dataclass
 class SignsOfLife:
-    """Signs of life of the latest steps. dead: steps in a row without any, because of `symptom`.
+    """Counter of dead steps. dead: number of dead steps in a row; symptom: reason for the latest.
 
-    A step is dead when nothing is drawn (mean alpha under EMPTY_ALPHA), when no gradient is left,
-    or when the images have gone back to the plain background after showing more.
+    A step is dead if nothing is drawn (mean alpha under EMPTY_ALPHA), if the gradient has vanished,
+    or if the images show only the background after they once showed more.
     """
 
     dead: int = 0
@@ -209,7 +220,7 @@ class SignsOfLife:
     has_drawn: bool = False
 
     def observe(self, numbers: Mapping[str, float]) -> None:
-        """Record a step: "alpha" and "deviation" of its renderings, "gradient" (norm)."""
+        """Record a step: "alpha" and "deviation" of its renderings, and "gradient" (norm)."""
         self.symptom = ""
         if numbers["alpha"] < EMPTY_ALPHA:
             self.symptom = f"the renderings are empty (mean alpha {numbers['alpha']:.1e})"
@@ -219,20 +230,20 @@ class SignsOfLife:
         elif self.has_drawn and numbers["deviation"] < FLAT:
             self.symptom = "the renderings equal the background"
         self.dead = self.dead + 1 if self.symptom else 0
-        # Well above FLAT, so that noise around the threshold is no image.
+        # Well above FLAT, so that noise around the threshold does not count as an image.
         self.has_drawn |= numbers["deviation"] > 8 * FLAT
 
 
 @dataclass
 class GoodWeights:
-    """Copies in host memory of the weights at the last two times that the model was healthy.
+    """Copies of the weights in host memory from the last two times that the model was healthy.
 
-    A collapse is noticed late, and the newer copy may already be on its way down, so the older one
-    is the last that is surely good. Copies are made every fifth of a window at first and a window
-    in long runs, and none is made while the images are worse than they were.
+    A collapse is noticed late, so the newer copy may already be damaged. The older one is the
+    latest that is certainly good. Copies are made every fifth of a window at first, and every
+    window in long runs. No copy is made while the images are worse than before.
 
-    Of several processes the main one holds them. psnr, best: its running mean, in dB, and the
-    largest one at a copy.
+    Only the main process holds copies. psnr: running mean in dB. best: largest `psnr` so far when
+    a copy was due.
     """
 
     model: nn.Module
@@ -245,12 +256,12 @@ class GoodWeights:
 
     @property
     def last(self) -> tuple[int, Mapping[str, Tensor]]:
-        """Optimiser steps, and the weights that they made."""
+        """Number of optimiser steps and the weights after them, from the older copy."""
         return self.copies[0]
 
     def observe(self, numbers: Mapping[str, float]) -> None:
         """Record a step's "psnr", in dB."""
-        # PSNR of one batch depends on its scenes: compare running means.
+        # The PSNR of one batch depends on its scenes, so running means are compared.
         psnr = numbers["psnr"]
         self.psnr = psnr if self.psnr is None else self.psnr + (psnr - self.psnr) / 10
 
@@ -265,9 +276,9 @@ class GoodWeights:
         return self.psnr >= self.best - LOSS_OF_QUALITY
 
     def refresh(self, step: int) -> None:
-        """Copy the present weights, which `step` optimiser steps made."""
+        """Copy the present weights, after `step` optimiser steps."""
         present = unique_tensors(self.model) if PartialState().is_main_process else {}
-        # Host memory: the device's is needed for the training.
+        # In host memory, because training needs the device's.
         copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
         self.copies = [*self.copies, (step, copy)][-2:]
 
@@ -289,7 +300,7 @@ class GoodWeights:
 
 
 def not_finite(numbers: Mapping[str, float]) -> str:
-    """Name which numbers of a step are NaN or infinite; "" if none is."""
+    """Return text that names the NaN or infinite numbers of a step; "" if there are none."""
     # PSNR is infinite for a perfect image.
     bad = [f"{k} is {n}" for k, n in numbers.items() if k != "psnr" and not math.isfinite(n)]
     return ", ".join(bad)
@@ -298,11 +309,11 @@ def not_finite(numbers: Mapping[str, float]) -> str:
 def first_bad_tensor(
     training_pass: nn.Module, batches: Sequence[Batch], repeat: Callable[[], Any]
 ) -> str:
-    """Name the first tensor that is not finite while `repeat` makes a step of `batches`, if any.
+    """Return text about the first tensor that is not finite while `repeat` computes a step.
 
-    In words, with the samples of its batch; "" for none.
-    Torch's anomaly mode would name an operation, not a module; it misses infinities, and raises in
-    the middle of a step for which other processes wait.
+    The text names the tensor and the samples of its batch; it is "" if all tensors are finite.
+    Torch's anomaly mode would name an operation instead of a module. It also misses infinities, and
+    raises in the middle of a step while other processes wait.
     """
     watch = _Watch(batches)
     for name, tensor in unique_tensors(training_pass).items():
@@ -323,7 +334,7 @@ def first_bad_tensor(
 
 
 class _Watch:
-    """Description of the first tensor that is not finite, in the order of computation."""
+    """Search for the first tensor that is not finite, in the order of computation."""
 
     def __init__(self, batches: Sequence[Batch]) -> None:
         self.found = ""
@@ -331,7 +342,7 @@ class _Watch:
         self._coming = iter(batches)
 
     def see(self, name: str, value: Any) -> None:
-        """Look at `value`: a tensor, or any nest of mappings, sequences and containers of them."""
+        """Check `value`: a tensor, or nested mappings, sequences and containers of tensors."""
         for path, tensor in named_tensors(value, name):
             bad = tensor[~tensor.isfinite()]
             if bad.numel() and not self.found:

@@ -1,4 +1,4 @@
-"""`init_from`: a training that starts from the weights of another one."""
+"""Option `init_from`: training that starts from the weights of another training."""
 
 from collections.abc import Mapping
 
@@ -12,18 +12,19 @@ from qgs.recipe import Recipe
 from qgs.recipe.recipe import differing_predictions
 
 _QUERIES = "queries."
-_KEPT = ", the first are kept, any more are noisy copies"
+_KEPT = ", the first ones are kept, additional ones are noisy copies"
 
 
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     """Give `model`, freshly built from `recipe`, the weights of `recipe.init_from`, if any.
 
-    `init_from` is a name as `CheckpointFile` takes it. Queries grow or shrink by their own rule
-    (`Queries.resized`) with random numbers of the recipe's seed, encoder, feedback and head adapt
-    weights (`ModelComponent.adapted`); everything else must have the same names and shapes.
+    `init_from` is a name that `CheckpointFile` accepts. Queries grow or shrink by `Queries.resized`
+    with random numbers from the recipe's seed. Encoder, feedback and head adapt their weights with
+    `ModelComponent.adapted`. All other weights must have the same names and shapes.
 
-    Returns lines about weights of another size, new ones, and options that make the same weights
-    predict other Gaussians. Raises FileNotFoundError, CheckpointError with every difference.
+    Returns lines that list resized weights, new weights, and options that change the Gaussians
+    predicted from the same weights. Raises FileNotFoundError, or CheckpointError with all
+    differences.
     """
     if recipe.init_from is None:
         return []
@@ -47,9 +48,9 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     if found := differing_tensors(_comparable(weights, count), own):
         first = (
             f"init_from: {path} does not fit this recipe; only the number of queries, sizes that "
-            "encoder and head adapt (of patches, to a multiple) and new feedback may differ:"
+            "encoder and head can adapt (of patches, to a multiple) and new feedback may differ:"
         )
-        trained = "options of the model that the checkpoint was trained with:"
+        trained = "options of the checkpoint's model that differ:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
     generator = torch.Generator().manual_seed(recipe.seed)
     resized = model.queries.resized(_part(_QUERIES, learned), generator)
@@ -66,12 +67,12 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
 
 
 def _part(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the weights of one part of the model, by their names in it."""
+    """Return the weights of one part of the model, by their names inside that part."""
     return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 
 def _comparable(tensors: Mapping[str, Tensor], count: int | None) -> Shapes:
-    """Return shapes by name with -1 for `count`, the number of queries, which may differ."""
+    """Return shapes by name, with -1 for the number of queries `count`, which may differ."""
     return {
         name: (-1, *shape[1:]) if name.startswith(_QUERIES) and shape[:1] == (count,) else shape
         for name, shape in shapes_of(tensors).items()

@@ -1,4 +1,4 @@
-"""Evaluations and pictures while a model trains."""
+"""Evaluations and pictures during training."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ from qgs.train.tracking import Trackers
 from qgs.types import Rendering
 
 SAMPLES = 4
-"""Samples that are drawn, the same ones each time."""
+"""Number of samples that are drawn, the same ones each time."""
 
 
 def judge(
@@ -36,10 +36,11 @@ def judge(
     trackers: Trackers,
     stop: StopRequest,
 ) -> None:
-    """Score the model after `step` steps on the recipe's test views, and its average if it has one.
+    """Score the model, and its moving average if it has one, on the recipe's test views.
 
     Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png. Restores the model's mode.
-    Raises InterruptedError between two scenes where a stop is requested, else as `evaluate`.
+    Raises InterruptedError after a scene if a stop is requested, and the errors of `evaluate`.
+    step: optimiser steps so far.
     """
 
     def between_scenes(done: int, wanted: int) -> None:

@@ -1,4 +1,4 @@
-"""State that a run saves to continue: steps, random states, moments, averaged weights."""
+"""State of a run besides its weights: steps, random states, moments, averaged weights."""
 
 import math
 import time
@@ -21,22 +21,23 @@ from qgs.train.folder import OtherRunError
 def make_optimizer(
     module: nn.Module, optimizer: Optimizer, factors: Mapping[str, float]
 ) -> torch.optim.Optimizer:
-    """Build torch's optimiser, with parameters grouped by decay and factor of the learning rate.
+    """Build torch's optimiser, with parameters grouped by weight decay and learning rate factor.
 
-    The innermost component around a parameter decides whether it decays (`ModelComponent.decays`);
-    outside of components all but 1-d parameters do. A shared parameter goes by its first name.
-    factors: as `Recipe.rate_factors`; one of 0 freezes, ValueError if all are 0.
+    The innermost component around a parameter decides whether it decays (`ModelComponent.decays`).
+    Outside of components, all parameters but 1-d ones decay. A shared parameter counts under its
+    first name. factors: the result of `Recipe.rate_factors`. A factor of 0 freezes a parameter.
+    Raises ValueError if all parameters are frozen.
     """
     groups: defaultdict[tuple[bool, float], list[nn.Parameter]] = defaultdict(list)
     components = {name: m for name, m in module.named_modules() if isinstance(m, ModelComponent)}
     for name, parameter in module.named_parameters():
         factor = factors[name]
-        # Frozen, not only a rate of 0: no gradient, no moments, no weight decay.
+        # Freezing, unlike a rate of 0, also avoids gradients, moments and weight decay.
         if factor == 0:
             parameter.requires_grad_(False)
         if not parameter.requires_grad:
             continue
-        # Biases and gains of norms are 1-d; decay would pull them from where they work.
+        # Biases and gains of norms are 1-d; decay would make them worse.
         decays = parameter.ndim != 1
         # Modules come before those inside them, so the innermost component has the last word.
         for outer, component in components.items():
@@ -45,8 +46,8 @@ def make_optimizer(
                 decays = component.decays(inner, parameter)
         groups[not decays, factor].append(parameter)
     if not groups:
-        raise ValueError("optimizer.parts freezes every parameter, so there is nothing to train")
-    # Sorted: the same groups in every process and after a resume.
+        raise ValueError("optimizer.parts freezes every parameter: leave at least one to train")
+    # Sorted, so that the groups are the same in every process and after a resume.
     return optimizer.build(
         [
             ParameterGroup(params=groups[stays, factor], decays=not stays, factor=factor)
@@ -57,34 +58,34 @@ def make_optimizer(
 
 @dataclass
 class Counters:
-    """Steps and time of a run so far, in all sessions.
+    """Counters of the steps and time of a run so far, over all sessions.
 
-    step, seconds: optimiser steps, and time spent; a session's clock starts after its first step,
-    in which kernels compile.
+    step: optimiser steps. seconds: time spent. The clock of a session starts after its first step,
+    because kernels compile in that step.
     """
 
     config: TrainingConfig
     scenes: str
-    """The `scenes_fingerprint` of the data."""
+    """Result of `scenes_fingerprint` for the data."""
     step: int = 0
     seconds: float = 0.0
     last_tick: float = 0.0
 
     @property
     def used(self) -> float:
-        """Fraction of the budget that is used, the larger of steps and seconds."""
+        """Fraction of the budget that is used: the larger of those for steps and seconds."""
         of_seconds = self.seconds / (self.config.seconds or math.inf)
         return max(self.step / self.config.steps, of_seconds)
 
     def every(self, steps: int) -> bool:
-        """Return whether this step is a multiple of `steps`; never for 0."""
+        """Return True at every `steps`-th step; never if `steps` is 0."""
         return bool(steps) and self.step % steps == 0
 
     def read(self, measured: Mapping[str, Tensor]) -> dict[str, float]:
-        """Return the means of a step's numbers over processes, and read the clock.
+        """Return the means of a step's numbers over processes, and advance the clock.
 
-        The host waits for the device here, so the clock shows what the step took; its mean over
-        processes, so that all use up a budget of time together.
+        The host waits for the device here, so the clock measures the whole step. The time is also a
+        mean over processes, so that all processes use up a time budget together.
         """
         now = time.perf_counter()
         values = torch.stack([value.float() for value in measured.values()])
@@ -96,7 +97,7 @@ class Counters:
         return dict(zip(measured, numbers, strict=True))
 
     def state(self) -> dict[str, Any]:
-        """Return the counts, and the facts on which their meaning depends."""
+        """Return the counts, and the batch size and scenes that they depend on."""
         return {
             "step": self.step,
             "seconds": self.seconds,
@@ -107,26 +108,29 @@ class Counters:
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Continue counting from `state`.
 
-        Raises OtherRunError unless steps see the same data in number and order as before.
+        Raises OtherRunError if the batch size or the training scenes have changed.
         """
-        # Sample k depends on its number alone, so equal step sizes give the same batches.
+        # Sample k depends only on its number, so equal step sizes give the same batches.
         size = state["step_size"]
         if size != self.config.batch_size:
             raise OtherRunError(
-                f"the optimiser steps of this run see {size} samples, here they would see "
+                f"each optimiser step of this run uses {size} samples, but the recipe asks for "
                 f"{self.config.batch_size}: add --set training.batch_size={size}"
             )
         if state["scenes"] != self.scenes:
             raise OtherRunError(
-                "the data lists other training scenes than when this run was saved: bring back "
-                "what was added or removed, or start a new run"
+                "the training scenes have changed since this run was saved: restore the same "
+                "scenes, or start a new run"
             )
         self.step = state["step"]
         self.seconds = state["seconds"]
 
 
 class RandomStates:
-    """Torch's generators, of every process by its rank; components draw from no others."""
+    """States of torch's random generators in every process, by rank.
+
+    Components draw from no other generators.
+    """
 
     def state(self) -> dict[str, Any]:
         """Return the states; all processes must call this."""
@@ -139,9 +143,9 @@ class RandomStates:
         return found
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore this process's generators; a rank that `state` lacks keeps its own."""
+        """Restore this process's generators; a rank without a saved state keeps its own."""
         rank = PartialState().process_index
-        # A run may go on in more processes than it was saved by.
+        # A run may continue with more processes than before.
         if rank and f"{rank}/torch" not in state:
             return
         torch.set_rng_state(state[f"{rank}/torch"])
@@ -151,10 +155,10 @@ class RandomStates:
 
 
 class OptimizerState:
-    """Values that torch's optimiser keeps (moments, steps), by the names of parameters.
+    """State of torch's optimiser (moments, steps), by the names of parameters.
 
-    Torch's own `state_dict` numbers parameters by their place in the groups. `torch.distributed`'s
-    helpers name them too, but give parameters without a gradient moments that they do not have.
+    Torch's own `state_dict` numbers parameters by their place in the groups. The helpers of
+    `torch.distributed` use names too, but they invent moments for parameters without a gradient.
     """
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
@@ -165,21 +169,21 @@ class OptimizerState:
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
-        """Return values by PARAMETER/KEY; under "keys" the keys of every parameter."""
+        """Return values by PARAMETER/KEY, and the keys of every parameter under "keys"."""
         kept = self._optimizer.state_dict()["state"]
         keys: dict[str, list[str]] = {}
         found: dict[str, Any] = {"keys": keys}
         for place, name in enumerate(self._names):
             values = kept.get(place, {})
-            # A parameter without a gradient has no moments: only its lack of keys shows that.
+            # A parameter without a gradient has no moments; its empty list of keys records that.
             keys[name] = list(values)
             found |= {f"{name}/{key}": value for key, value in values.items()}
         return found
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state()` gave; options of the groups stay.
+        """Restore the values from `state()`; the options of the groups stay.
 
-        Raises KeyError with what is missing.
+        Raises KeyError for a missing entry.
         """
         kept: dict[int, dict[str, Any]] = {}
         for place, name in enumerate(self._names):
@@ -190,22 +194,22 @@ class OptimizerState:
 
 
 class MovingAverage(AveragedModel):
-    """A copy of a model, `module`, that `update_parameters` moves towards the present weights.
+    """Moving average of a model, in its copy `module`; `update_parameters` adds present weights.
 
-    average = decay * average + (1 - decay) * weights; buffers are taken as they are.
+    average = decay * average + (1 - decay) * weights. Buffers are copied without averaging.
     """
 
     module: Any
 
     def __init__(self, model: nn.Module, decay: float) -> None:
         super().__init__(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
-        # At 0 torch would drop the initial weights for those of the first step.
+        # At 0, torch would replace the initial weights by those of the first step.
         self.n_averaged += 1
 
     def state(self) -> dict[str, Tensor]:
-        """Return the averages, named as `qgs.checkpoint.model_file.save` takes weights."""
+        """Return the averages, with the names that `qgs.checkpoint.model_file.save` expects."""
         return unique_tensors(self.module)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from the averages in `state`; raises CheckpointError where they do not fit."""
+        """Continue from the averages in `state`; raises CheckpointError if they do not fit."""
         load_weights(self.module, state, "the moving average")

@@ -1,6 +1,6 @@
-"""Experiment trackers, and the progress of a training on the terminal.
+"""Experiment trackers, and the progress bar of training.
 
-A distribution adds a tracker by an entry point in the group `qgs.trackers` that names a `Tracker`.
+A distribution adds a tracker with an entry point in the group `qgs.trackers` for a `Tracker` class.
 """
 
 import logging
@@ -27,44 +27,45 @@ _log = logging.getLogger(__name__)
 
 
 class Tracker(ABC):
-    """A destination of the numbers and pictures of one run, in addition to its folder."""
+    """Additional destination of the numbers and pictures of one run, besides its folder."""
 
     package: ClassVar[str] = ""
-    """The package that it needs, as Python and pip call it; "" for none."""
+    """Package that the tracker needs, by its name for both Python and pip; "" for none."""
 
     @abstractmethod
     def __init__(self, run: Path, options: Mapping[str, Any], step: int):
-        """Start tracking, or continue it after `step` steps of the run in the folder `run`.
+        """Start tracking the run in the folder `run`, or continue after `step` steps.
 
-        options: of its recipe, by dotted path.
+        options: the recipe's options by dotted path.
         """
 
     @abstractmethod
     def log(self, values: Mapping[str, float], step: int) -> None:
-        """Take the numbers of a step, by name."""
+        """Record the numbers of a step, by name."""
 
     def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        """Take a uint8 (H, W, 3) picture; the default ignores it."""
+        """Record a uint8 (H, W, 3) picture; the default ignores it."""
         return
 
     def close(self) -> None:
-        """Finish writing what was logged."""
+        """Finish writing everything that was logged."""
         return
 
 
 class Trackers:
-    """The trackers of a recipe, opened when the run's folder exists; all on the main process.
+    """Trackers of a recipe, opened when the run's folder exists, on the main process only.
 
-    One that fails is logged, closed and left out from then on: training goes on without it.
-    Raises ValueError for one that is not installed, MissingExtraError if its package is missing.
+    A tracker that fails is logged, closed and no longer used; training continues without it.
+    Raises ValueError for a tracker that is not installed, and MissingExtraError if a package that
+    a tracker needs is missing.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         offered = {entry.name: entry for entry in installed("qgs.trackers")}
         if unknown := sorted({*names} - offered.keys()):
             raise ValueError(
-                f"training.trackers names {listed(unknown)}, and installed distributions offer "
-                f"{listed(sorted(offered)) or 'no tracker'}: take it out, or {INSTALL_ALL}"
+                f"training.trackers names {listed(unknown)}, but installed distributions offer "
+                f"{listed(sorted(offered)) or 'no tracker'}: remove it, or {INSTALL_ALL}"
             )
         self._kinds: dict[str, type[Tracker]] = {
             name: load(offered[name], Tracker) for name in names
@@ -73,12 +74,12 @@ class Trackers:
             if kind.package and find_spec(kind.package) is None:
                 raise MissingExtraError(
                     f"training.trackers names {name}, which needs the package {kind.package}: run "
-                    f"`pip install {kind.package}`, or take {name} out of training.trackers"
+                    f"`pip install {kind.package}`, or remove {name} from training.trackers"
                 )
         self._open: dict[str, Tracker] = {}
 
     def open(self, run: Path, options: Mapping[str, Any], step: int = 0) -> None:
-        """Track into the folder `run` from step `step` + 1 on; log the recipe's `options`."""
+        """Start tracking the run in `run` from step `step` + 1 on; log the recipe's `options`."""
         for name, kind in self._kinds.items():
             try:
                 self._open[name] = kind(run, options, step)
@@ -90,7 +91,7 @@ class Trackers:
         self.tell(lambda tracker: tracker.close())
 
     def tell(self, act: Callable[[Tracker], None]) -> None:
-        """Call a method of each tracker."""
+        """Call `act` with each open tracker."""
         for name, tracker in list(self._open.items()):
             # A service may be down, and a distribution may raise anything.
             try:
@@ -104,11 +105,11 @@ class Trackers:
 
 def _warn(name: str, error: Exception) -> None:
     reason = f"{type(error).__name__}: {error}"
-    _log.warning("the tracker %s fails and is left out from now on: %s", name, reason)
+    _log.warning("the tracker %s failed and is no longer used: %s", name, reason)
 
 
 class TrainingProgress(Progress):
-    """A bar with loss, PSNR and time left; a line now and then where no terminal is."""
+    """Progress bar with loss, PSNR and time left; without a terminal, a line now and then."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(
@@ -124,7 +125,7 @@ class TrainingProgress(Progress):
         self._next = 0.0
 
     def show(self, step: int, loss: float, psnr: float, used: float) -> None:
-        """Show a step. used: part of the budget."""
+        """Show a step. used: fraction of the budget used so far."""
         line = f"loss {loss:.4f}  {Psnr.column.heading} {Psnr.column.shown(psnr):>5}"
         self.update(self._task, completed=used, step=step, line=line)
         now = time.monotonic()

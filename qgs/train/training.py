@@ -1,4 +1,4 @@
-"""The training loop."""
+"""Training loop."""
 
 import logging
 import math
@@ -49,15 +49,16 @@ from qgs.wording import one_line, warn_once
 
 _log = logging.getLogger(__name__)
 
-ELSEWHERE = "another process of this training has no next batch; see its own message"
+ELSEWHERE = "another process of this training has no next batch; see the message of that process"
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """The trained model of a run, its folder, optimiser steps, seconds on the clock.
+    """Result of a run: trained model, folder, optimiser steps and seconds on the clock.
 
-    stopped_by: name of the signal that ended it early, else None. main: whether this process writes
-    the files. resumed_at: the step from which a run was continued, None for one that began here.
+    stopped_by: name of the signal that ended the run early; None if no signal did. main: True in
+    the process that writes the files. resumed_at: step from which the run was continued; None for
+    a new run.
     """
 
     model: QueryGaussianModel
@@ -77,21 +78,23 @@ def train(
     device: str = "auto",
     resume: bool = False,
 ) -> TrainingResult:
-    """Train the model of `recipe` on `device` and leave everything in the folder `run`.
+    """Train the model of `recipe` on `device` and save everything in the folder `run`.
 
     Writes recipe.yaml, history.jsonl (one record per optimiser step), checkpoint.safetensors (the
-    model) and state.safetensors (what continues the run): on schedule, at the end, and after SIGINT
-    or SIGTERM, which finish the step and return. A start that fails leaves no folder. Of several
-    processes the main one writes; all of them must see `run`.
+    model) and state.safetensors (everything needed to continue). The run is saved on schedule, at
+    the end, and after SIGINT or SIGTERM. These signals finish the current step and return. A start
+    that fails leaves no folder. Only the main process writes; all processes must see `run`.
 
-    resume: continue the run in `run` as if it had never been interrupted, or start it where there
-    is none yet. A run whose budget is used is left as it is.
+    resume: continue the run in `run` as if it had never been interrupted, or start a run if there
+    is none yet. A run whose budget is used up is left as it is.
 
-    Raises FileExistsError when `run` holds anything (with `resume`, anything but a run), ValueError
-    as `choose_device`, `Recipe.rate_factors`, `make_optimizer` and the optimiser, OtherRunError for
-    another recipe or data than the run's, CollapseError when the model died (the checkpoint then
-    holds the last good weights), NonFiniteError for a step that gave NaN, and what the data source
-    raises; the run is then saved where it stood, and a note of the error says so.
+    Raises:
+    - FileExistsError if `run` is not empty; with `resume`, if it holds anything but a run.
+    - ValueError from `choose_device`, `Recipe.rate_factors`, `make_optimizer` and the optimiser.
+    - OtherRunError if the recipe or the data differ from the run's.
+    - CollapseError if the model died; the checkpoint then holds the last good weights.
+    - NonFiniteError for a step with NaN or infinity.
+    - Errors of the data source; the run is saved first, and a note of the error says so.
     """
     RunFolder(run).refuse_other(resume)  # before the data is opened, which may take minutes
     terminal = console or Console(stderr=True)
@@ -108,10 +111,10 @@ def train(
 
 
 class Trainer:
-    """One run: its parts and its loop.
+    """Parts and loop of one run.
 
-    Making one opens the data and draws the first batch, but touches no file of a new run; its
-    folder is made after the first step, when nothing is missing any more.
+    The constructor opens the data and draws the first batch, but writes no file of a new run. The
+    folder is created after the first step, when everything has proved to work.
     """
 
     def __init__(
@@ -127,9 +130,9 @@ class Trainer:
             resources.callback(self.trackers.close)
             self.optimizer = recipe.build_optimizer()
             self.accelerator = make_accelerator(device, unread=not keys_are_read(recipe.parts))
-            # The order matters: the state is read before memory is taken for the model, the model
-            # draws its random numbers before anything else does, and the data comes last, since
-            # its first batch depends on how many samples the restored run has seen.
+            # The order matters. The state is read before the model takes memory. The model draws
+            # its random numbers before anything else does. The data comes last, because its first
+            # batch depends on how many samples the restored run has seen.
             saved: Mapping[str, State] = {}
             if resume and not self.folder.is_new:
                 if self.accelerator.is_main_process:
@@ -150,20 +153,20 @@ class Trainer:
             self._resources = resources.pop_all()
 
     def close(self) -> None:
-        """Stop reading ahead, end tracking and leave the folder to others."""
+        """Stop reading ahead, end tracking and unlock the folder."""
         self._resources.close()
 
     def _build_model(self, initial: bool) -> None:
-        """Build the model, the training pass, and torch's optimiser.
+        """Build the model, its training pass, torch's optimiser and the moving average.
 
-        Notes what is odd about them. initial: load `init_from`.
+        Collects warnings in `notes`. initial: load pretrained weights and `init_from`.
         """
         recipe = self.recipe
         self.model = recipe.build_model(self.accelerator.device, pretrained=initial).train()
         self.notes = [f"warning: {text}" for text in recipe.warnings]
         if initial:
             self.notes += initialise(self.model, recipe)
-        # A budget of time is often inherited by recipes and options that set only the steps.
+        # Users who set only the steps often inherit a time budget without noticing.
         if self.config.seconds:
             self.notes.append(
                 f"stops after {self.config.seconds:g} s (training.seconds) or "
@@ -177,7 +180,7 @@ class Trainer:
         self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
 
     def _build_watchers(self, source: SceneSource) -> None:
-        """Make the counters, the guard, the saver and the trackers."""
+        """Build the counters, the guard and the saver; check the metrics."""
         recipe = self.recipe
         # Only the main process writes checkpoints, which carry the range of the training views.
         if self.accelerator.is_main_process:
@@ -190,7 +193,7 @@ class Trainer:
         self.guard = Guard(self.training_pass, self.saver, self.config, self._gradients)
         # A metric that is wrong must fail now, not after the training.
         Measures(recipe)
-        # Beside the weights, all that continues the run.
+        # Everything besides the weights that is needed to continue the run.
         stateful = {
             "guard": self.guard,
             "good": self.guard.good,
@@ -205,7 +208,7 @@ class Trainer:
         self.saver.stateful = stateful
 
     def _open_data(self, source: SceneSource) -> Generator[Batch, None, None]:
-        """Return the batches, starting with the first one that the run has not seen."""
+        """Return the batches, starting with the first that the run has not seen yet."""
         processes = self.accelerator.num_processes
         return training_batches(
             source,
@@ -228,7 +231,7 @@ class Trainer:
         follow(scheduled, self.counters.step)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
-        """Train until the budget is used, a stop is asked for, or the model dies."""
+        """Train until the budget is used up, a stop is requested, or the model dies."""
         counters = self.counters
         stopped_by = None
         while counters.used < 1 and not stopped_by:
@@ -250,7 +253,7 @@ class Trainer:
         )
 
     def _one_step(self, progress: TrainingProgress, stop: StopRequest) -> None:
-        """Make one optimiser step and record it; then evaluate and save if due."""
+        """Run one optimiser step, record it, and save and evaluate if due."""
         counters = self.counters
         batches = self.feed.batches
         numbers = self._compute(batches, stop)
@@ -273,7 +276,7 @@ class Trainer:
         self._report(numbers, progress)
         if not symptom:
             self.guard.watch(counters.step, numbers)
-        # Averages are judged at the end in any case: they are what a recipe with them is for.
+        # Averages are always evaluated at the end, because their recipe was written for them.
         evaluates = counters.every(self.config.evaluate_every) or (
             self.average is not None and counters.used >= 1
         )
@@ -285,22 +288,22 @@ class Trainer:
             self._evaluate(stop)
 
     def _compute(self, batches: Sequence[Batch], stop: StopRequest) -> dict[str, float]:
-        """Compute the gradients of `batches` and fetch the next ones; return the step's numbers."""
+        """Compute the gradients of `batches`, fetch the next ones, return the step's numbers."""
         step = self.counters.step
         rate = self.optimizer.learning_rate(step, self.counters.seconds)
         for group in self.torch_optimizer.param_groups:
-            # Torch's own schedulers know no time budget and no factors of parts.
+            # Torch's own schedulers support neither a time budget nor factors of parts.
             group["lr"] = rate * group["factor"]
         self.torch_optimizer.zero_grad(set_to_none=True)
         with self.guard.memory_explained(step, saves=True):
             measured = self._gradients(batches)
-        # Before the numbers are read, so that a GPU computes gradients meanwhile.
+        # Before the numbers are read, so that a GPU computes gradients at the same time.
         if not stop and step + 1 < self.config.steps:
             self.feed.fetch()
         return {"lr": rate, **self.counters.read(measured)}
 
     def _open_folder(self) -> None:
-        """Make the folder, write the recipe, and drop records of steps that were lost."""
+        """Create the folder, write the recipe, and drop records of steps that were lost."""
         if self.accelerator.is_main_process:
             self.folder.refuse_other(self._resumes)
             self.folder.take()
@@ -320,7 +323,7 @@ class Trainer:
         progress.show(counters.step, record["loss"], record["psnr"], counters.used)
 
     def _evaluate(self, stop: StopRequest) -> None:
-        """Evaluate the weights. A failure is logged and does not end the training."""
+        """Evaluate the weights; a failure is logged and does not stop training."""
         started = time.perf_counter()
         step = self.counters.step
         used = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
@@ -341,11 +344,11 @@ class Trainer:
             _log.warning("the evaluation at step %d failed: %s", step, one_line(error))
         # The others wait here, see TIMEOUT in `distributed`.
         self.accelerator.wait_for_everyone()
-        # Not counted. Shifted, not reset: the time since the last step still counts.
+        # An evaluation's time does not count, but the time between it and the last step does.
         self.counters.last_tick += time.perf_counter() - started
 
     def _refuse_missing_batches(self) -> None:
-        """Save the run and raise, in all processes, where one has no next batches."""
+        """Save the run and raise in all processes if one process has no next batches."""
         own = self.feed.error
         if not any(gather_object([own is not None])):
             return

@@ -1,4 +1,4 @@
-"""The forward pass of a training step, an objective with the model and losses; its gradients."""
+"""Forward pass of a training step (objective, model and losses), and its gradients."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -19,29 +19,30 @@ from qgs.recipe import Recipe
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 
 RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
-"""Names in a record of history.jsonl that no loss term may have."""
+"""Names in the records of history.jsonl that a loss term must not use."""
 
 
 class TrainingPass(nn.Module):
-    """The model, its losses and its objective; `forward` hands itself to the objective as `Passes`.
+    """Module with the model, its losses and its objective; it gives the objective its `Passes`.
 
-    forward (a batch) -> objective.forward -> predict (the model) and judge (renderings, losses):
-    one module, so that DDP sees one forward however often the objective runs the model.
+    `forward` passes a batch to `objective.forward`, which calls `predict` (the model) and `judge`
+    (renderings and losses). All of it is one module, so that DDP sees one forward pass even if the
+    objective runs the model several times.
 
-    `judge` computes the losses' gradients with respect to the Gaussians at once, one layer and
-    `render_views` target views at a time (0: all views), and frees each part's graph before the
-    next; the backward pass starts from their sums. Memory thus grows neither with layers nor with
-    views. Where a loss needs all renderings at once, only the renderer's graphs are in parts.
+    `judge` computes the gradients of the losses with respect to the Gaussians immediately. It takes
+    one layer and `render_views` target views at a time (0: all views), and frees each graph before
+    the next one. The backward pass starts from the sums. Memory therefore grows neither with layers
+    nor with views. If a loss needs all renderings at once, only the renderer's graphs are split.
     """
 
     def __init__(self, recipe: Recipe, model: QueryGaussianModel) -> None:
-        """recipe: the one that `model` was built from."""
+        """Build the objective and the losses of `recipe`, which `model` was built from."""
         super().__init__()
         self.model = model
         self.objective = recipe.build_objective()
         losses = recipe.build_losses()
         if not losses:
-            raise ValueError("a recipe needs at least one loss to train; add one under `losses`")
+            raise ValueError("training needs at least one loss; add one under `losses`")
         self.losses = nn.ModuleDict(losses)
         self._of_gaussians = [n for n, loss in losses.items() if loss.renderings == "none"]
         self._of_images = [name for name in losses if name not in self._of_gaussians]
@@ -51,13 +52,13 @@ class TrainingPass(nn.Module):
         self.judge_inputs = recipe.training.judge_inputs
 
     def forward(self, inputs: Views, targets: Views) -> Outcome:
-        """Return what the objective makes of a batch."""
-        # Input views become targets too, the last ones.
+        """Return the objective's outcome for a batch."""
+        # Input views are appended to the targets.
         targets = targets.joined(inputs) if self.judge_inputs else targets
         outcome = self.objective.forward(inputs, targets, self)
         if taken := sorted(outcome.terms.keys() & RECORDED):
             kinds = f"losses or the objective {self.objective.name}"
-            raise ValueError(f"terms of {kinds} are named {taken}, as other numbers of a step are")
+            raise ValueError(f"terms of {kinds} use reserved names: rename {taken}")
         return outcome
 
     def predict(self, inputs: Views) -> Prediction:
@@ -65,16 +66,16 @@ class TrainingPass(nn.Module):
         return self.model(inputs)
 
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
-        """See `Passes`: layers are weighted by the supervision; `signs` are of the last layer.
+        """See `Passes`: the supervision weights the layers; `signs` come from the last layer.
 
-        Raises ValueError when two losses have a term of one name.
+        Raises ValueError if two losses have a term of the same name.
         """
         parameters = dict(self.losses.named_parameters(prefix="losses"))
         total = targets.images.new_zeros(())
         background = constant(self.model.renderer.config.background, targets.images)
         count = targets.images.shape[1]
         parts = [targets]
-        # Whole where a loss compares views.
+        # Not split if a loss compares views.
         if self.render_views and not any(x.renderings == "all" for x in self.losses.values()):
             parts = [targets.select(views) for views in _slices(targets.cameras, self.render_views)]
         terms: dict[str, Tensor] = {}
@@ -82,7 +83,7 @@ class TrainingPass(nn.Module):
         rounds = [number for number in prediction.layers if number > len(self.model.decoder)]
         for number, weight in self.model.supervision.weights(rounds).items():
             layer = DetachedLayer(prediction.layers[number], parameters)
-            # Of this layer: those of the last one remain.
+            # Reset for every layer, so that those of the last layer remain.
             signs = {}
             deviations: list[Tensor] = []
             for part in parts:
@@ -94,11 +95,11 @@ class TrainingPass(nn.Module):
                 found = self._terms(self._of_images, layer.prediction, rendering, part, inputs)
                 layer.add(found, weight * share)
             signs["deviation"] = torch.stack(deviations).amax()
-            # Losses of the Gaussians run once for all parts, with a rendering of no view.
+            # Losses of the Gaussians alone run once for all parts, with a rendering without views.
             no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
             found = self._terms(self._of_gaussians, layer.prediction, no_views, targets, inputs)
             layer.add(found, weight)
-            # Layers meet here: one backward pass through the network serves them all.
+            # The layers are summed here: one backward pass through the network serves all.
             total = total + layer.total()
             _add(layer.terms, terms)
         return Outcome(total, terms, signs)
@@ -122,7 +123,7 @@ class TrainingPass(nn.Module):
         target: Views,
         inputs: Views,
     ) -> dict[str, Tensor]:
-        """Return the terms of the losses `names`; for the rest see `Loss`."""
+        """Return the terms of the losses `names`; see `Loss` for the other arguments."""
         terms: dict[str, Tensor] = {}
         for name in names:
             found = self.losses[name](prediction, rendering, target, inputs)
@@ -145,8 +146,8 @@ def compute_gradients(
 ) -> dict[str, Tensor]:
     """Compute the clipped gradients of the mean loss of `batches`; return 0-d measurements.
 
-    training_pass: as accelerate wraps it. "gradient" is the norm before clipping, over all
-    processes; the rest is of this one. Nothing waits for the device.
+    training_pass: the module wrapped by accelerate. "gradient" is the norm before clipping, over
+    all processes; the other values belong to this process. The host does not wait for the device.
     """
     device = accelerator.device
     sums: dict[str, Tensor] = {}
@@ -167,14 +168,14 @@ def compute_gradients(
 
 
 class DetachedLayer:
-    """A copy of a layer's prediction, detached from the network, and the gradients of its losses.
+    """Detached copy of a layer's prediction, and the gradients of the losses with respect to it.
 
-    gradients: the sums so far, by name, without those of tensors that no loss reads. terms: the
-    sums of the losses' terms, detached.
+    gradients: sums so far by name; tensors that no loss reads are absent. terms: detached sums of
+    the losses' terms.
     """
 
     def __init__(self, layer: LayerPrediction, parameters: Mapping[str, Tensor]) -> None:
-        """parameters: of the losses, by name, whose gradients are taken too."""
+        """Detach `layer`. parameters: the losses' parameters by name, which get gradients too."""
         self.prediction: LayerPrediction = map_tensors(
             lambda x: x.detach().requires_grad_() if x.requires_grad else x, layer
         )
@@ -199,12 +200,12 @@ class DetachedLayer:
         )
 
     def total(self) -> Tensor:
-        """Return the sum of the terms, 0-d, with `gradients` with respect to what was cut off."""
+        """Return the sum of the terms, 0-d, whose backward pass passes `gradients` on."""
         total = _sum(self.terms)
         for name, gradient in self.gradients.items():
-            # The graph of the losses is freed, so their gradient g with respect to a source x
-            # reaches the rest of the model by <x, g>, whose gradient is g. Less its own value, so
-            # that the total stays as it is.
+            # The graph of the losses is freed. Their gradient g with respect to a source x reaches
+            # the rest of the model through <x, g>, whose gradient is g. Its own value is
+            # subtracted, so that the total does not change.
             linear = (self._sources[name] * gradient).sum()
             total = total + (linear - linear.detach())
         return total
@@ -214,7 +215,7 @@ class DetachedLayer:
 def signs_of(rendering: Rendering, target: Views, background: Tensor) -> dict[str, Tensor]:
     """Return mean PSNR and alpha, and the largest of the views' mean |rgb - background|; all 0-d.
 
-    Means over a view's pixels: a stray splat must not count as life.
+    Deviations are means over a view's pixels, so that a stray splat does not count as life.
     """
     deviation = (rendering.rgb - background[:, None, None]).abs().mean((-3, -2, -1))
     return {

@@ -156,7 +156,7 @@ def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, cop
         resumed(copied, "optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
     assert "seed: 4 here, 0 in the run" in str(caught.value)
     assert "training.save_every:" not in str(caught.value)
-    with pytest.raises(OtherRunError, match=r"see 2 samples.*see 3.*batch_size=2"):
+    with pytest.raises(OtherRunError, match=r"uses 2 samples.*asks for 3.*batch_size=2"):
         resumed(copied, "training.batch_size=3")
     folder = RunFolder(copied)
     folder.take()
@@ -166,7 +166,7 @@ def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, cop
     resumed(copied)
     assert files() == before
     change_counters(copied, scenes="others")
-    with pytest.raises(OtherRunError, match="other training scenes"):
+    with pytest.raises(OtherRunError, match="training scenes have changed"):
         resumed(copied)
 
 
