@@ -129,7 +129,7 @@ class RunFolder:
             file.write("".join(json.dumps(record) + "\n" for record in records))
 
     def history(self) -> list[dict[str, float]]:
-        """Return all records so far, one per optimiser step; skipped steps lack non-finite values."""
+        """Return one record per optimiser step so far; skipped steps have only finite numbers."""
         return read_records(self.history_file)
 
     def cut_records(self, step: int) -> None:
