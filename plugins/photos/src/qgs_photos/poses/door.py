@@ -8,7 +8,6 @@ from filelock import FileLock
 from rich.console import Console
 from upath import UPath
 
-from qgs.paths import listing
 from qgs_photos.datasets.colmap import Colmap
 from qgs_photos.image_files import image_files
 from qgs_photos.poses.making import RECORD, Options, fingerprint, make_poses
@@ -26,8 +25,7 @@ class ColmapOrPhotos(Colmap):
         """Return the folder with the poses of `path`, made if need be, beside it in NAME_poses."""
         # anything else is left to the readers of listings, whose errors say what it lacks
         is_video = path.suffix.lower() in VIDEOS and path.is_file()
-        places = (path, path / "images", *filter(UPath.is_dir, listing(path)))
-        if is_video or any(map(image_files, places)):
+        if is_video or any(map(image_files, (path, path / "images"))):
             return UPath(posed_folder(Path(str(path))))
         return None
 
