@@ -12,8 +12,8 @@ from qgs.wording import warn_once
 FOUND = """
 images/N.png: images/N.png:
 C\\Users\\me\\spoon\\images\\N.png: images/N.png: 3 in another folder
-/home/me/spoon/images/N.png: images/N.png: 3 in another folder
-/home/me/N.png: N.png: 3 in another folder
+/data/me/spoon/images/N.png: images/N.png: 3 in another folder
+/data/N.png: N.png: 3 in another folder
 ../spoon/images/N.png: images/N.png: 3 in another folder
 images/N.png: N.png: 3 in another folder
 N.png: images/N.png: 3 in another folder
@@ -33,7 +33,7 @@ D\\a\\N.webp: Images/N.jpg: 3 with other letters or suffix
 REFUSED = """
 names 3 images, but 0 exist: images/N.png: masks/N.png
 names 3 images, but 1 exist: N/0.png: images/0.png
-outside: /home/N.png: masks/N.png
+outside: /data/N.png: masks/N.png
 may be any of: images/N.jpg: images/N.JPG images/N.Jpg
 may be any of: images/N.webp: images/N.jpg images/N.png
 """
