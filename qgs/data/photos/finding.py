@@ -12,7 +12,7 @@ from pathlib import PurePosixPath
 from PIL import Image
 from upath import UPath
 
-from qgs.data.photos.reader import Listing, image_folder
+from qgs.data.photos.reader import Listing, PhotoFrame, image_folder
 from qgs.paths import listing
 from qgs.wording import listed, name_shown, warn_once
 
@@ -31,6 +31,10 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     where = found_files(
         folder, photos, dict.fromkeys(file for file in maps if file not in taken), images, outside
     )
+
+    def there(file: UPath) -> UPath:
+        return where.get(file, file)
+
     ways = Counter[str]()
     for file, real in where.items():
         if real.name != file.name:
@@ -46,24 +50,19 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
         )
     for file in () if outside else (*photos, *maps):
         # A listing of a stranger must not name other files of this machine.
-        if not is_inside(folder, where.get(file, file)):
+        if not is_inside(folder, there(file)):
             raise ValueError(
                 f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: move "
                 "it into the folder, or train with data.outside=true"
             )
-    moved = [
-        replace(
-            frame,
-            name=frame.name
-            if where.get(frame.path, frame.path) == frame.path
-            else "/".join(inside(folder, where[frame.path])),
-            path=where.get(frame.path, frame.path),
-            mask=frame.mask and where.get(frame.mask, frame.mask),
-            depth=frame.depth and where.get(frame.depth, frame.depth),
-        )
-        for frame in found.frames
-    ]
-    return replace(found, frames=moved, present={*where.values()})
+
+    def moved(frame: PhotoFrame) -> PhotoFrame:
+        path, mask, depth = (file and there(file) for file in (frame.path, frame.mask, frame.depth))
+        assert path is not None
+        name = frame.name if path == frame.path else "/".join(inside(folder, path))
+        return replace(frame, name=name, path=path, mask=mask, depth=depth)
+
+    return replace(found, frames=[*map(moved, found.frames)], present={*where.values()})
 
 
 def found_files(

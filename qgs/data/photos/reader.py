@@ -275,14 +275,6 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
     return None, (FrameProblem(reason, "correct the width and height"),)
 
 
-def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:
-    """Yield what is wrong with a frame by itself; readers leave out those with something."""
-    yield from frame.problems or (
-        *pose_problems(frame.c2w),
-        *intrinsics_problems(frame.intrinsics, frame.size),
-    )
-
-
 def sound_frames(listing: object, frames: Sequence[PhotoFrame]) -> list[PhotoFrame]:
     """Return the frames without problems; log the others, and implausible intrinsics.
 
@@ -291,10 +283,14 @@ def sound_frames(listing: object, frames: Sequence[PhotoFrame]) -> list[PhotoFra
     sound: list[PhotoFrame] = []
     faulty: list[str] = []
     for index, frame in enumerate(frames):
-        if (problem := next(frame_problems(frame), None)) is None:
-            sound.append(frame)
+        problems = frame.problems or (
+            *pose_problems(frame.c2w),
+            *intrinsics_problems(frame.intrinsics, frame.size),
+        )
+        if problems:
+            faulty.append(f"frame {numbered(index, frame.name)}: {problems[0]}")
         else:
-            faulty.append(f"frame {numbered(index, frame.name)}: {problem}")
+            sound.append(frame)
     if faulty and len(sound) < 2:
         raise ValueError(f"{listing}: {faulty[0]}")
     if faulty:
