@@ -50,7 +50,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def naming_full_disk(path: Path) -> Iterator[None]:
-    """Raise an OSError about `path` where the block fails for want of space, and what to do."""
+    """Turn an error for lack of disk space into an OSError with `path` and the remedy."""
     try:
         yield
     except OSError as error:
@@ -70,7 +70,7 @@ def is_leftover(path: Path) -> bool:
 
 
 def _synchronise(path: Path) -> None:
-    """Wait until `path`, a file or a folder, is on the disk."""
+    """Wait until the file or folder `path` is written to disk."""
     number = os.open(path, os.O_RDONLY)
     try:
         os.fsync(number)
@@ -116,7 +116,7 @@ def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Pat
 
 
 def refuse_existing(target: Path) -> None:
-    """Raise FileExistsError for a path at which something lies already."""
+    """Raise FileExistsError if `path` exists."""
     if target.exists() or target.is_symlink():
         raise FileExistsError(f"{target} exists and is never overwritten; choose another name")
 

@@ -15,9 +15,9 @@ from upath import UPath
 from qgs.terminal import without_secrets
 
 LARGEST = 500_000_000
-"""Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels."""
+"""Largest file that is read as a whole, in bytes; fits an uncompressed 120-megapixel photo."""
 
-# It may take forty times as much once parsed.
+# Parsed JSON may take forty times as much memory.
 _LARGEST_JSON = 50_000_000
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError)
 
@@ -42,7 +42,7 @@ def is_local(path: Path | UPath) -> bool:
 
 
 def listing(folder: UPath) -> list[UPath]:
-    """List the content of `folder`; nothing where it is no folder."""
+    """List the content of `folder`; an empty list if it is not a folder."""
     try:
         return list(folder.iterdir())
     except (FileNotFoundError, NotADirectoryError):
@@ -50,18 +50,18 @@ def listing(folder: UPath) -> list[UPath]:
 
 
 def open_file(path: Path | UPath) -> IO[bytes]:
-    """Open `path` for reading bytes. Raises OSError, and as `read_file` what is not local."""
+    """Open `path` for reading bytes. Raises OSError. A remote file is read whole by `read_file`."""
     if not is_local(path):
-        # Decoders seek to and fro, and each seek would be a request to a store.
+        # Decoders seek often, and each seek would be a request to the server.
         return io.BytesIO(read_file(path))
-    # Reading them may never end.
+    # Reading a pipe or device may never end.
     if path.is_fifo() or path.is_char_device():
         raise OSError(f"{path} is a pipe or a device")
     return path.open("rb")
 
 
 def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
-    """Return the bytes of `path`. Raises OSError for more than `most` and damaged archives."""
+    """Return the bytes of `path`. Raises OSError for over `most` bytes or a damaged archive."""
     # Held while it is read: a thread that uses `path` at the same moment may replace its archive,
     # which closes once nobody holds it.
     system: Any = getattr(path, "fs", None)
@@ -79,8 +79,8 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
 def read_json(path: UPath, fix: str) -> Any:
     """Return the content of a JSON file.
 
-    fix: the remedy, for messages. Raises ValueError for a file that is no JSON, OSError as
-    `read_file`.
+    fix: the remedy for the error message. Raises ValueError if the file is not JSON, and the
+    OSErrors of `read_file`.
     """
     content = read_file(path, _LARGEST_JSON)
     try:

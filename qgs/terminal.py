@@ -23,7 +23,7 @@ def without_secrets(text: str) -> str:
 
 
 def shown(text: str) -> str:
-    r"""Return `text` `without_secrets`; control and bidirectional characters as \x1b, \u202e."""
+    r"""Return `text` `without_secrets`, with control characters escaped, such as \x1b, \u202e."""
     return re.sub(_RAW, lambda found: ascii(found[0])[1:-1], without_secrets(text))
 
 
@@ -50,10 +50,10 @@ def show_safely() -> None:
     """Pass everything that this process prints from now on through `shown`; Rich still colours."""
     import rich.text
 
-    # Of all texts that it draws.
+    # Rich calls this on all text that it draws.
     rich.text.__dict__["strip_control_codes"] = shown
     for name in ("stdout", "stderr"):
-        # None where the system gave none.
+        # A process without a terminal may have None here.
         if stream := getattr(sys, name):
             setattr(sys, name, _Shown(stream))
 
@@ -61,7 +61,7 @@ def show_safely() -> None:
 def print_table(
     console: Console, title: str, rows: Sequence[Sequence[str]], **options: Any
 ) -> None:
-    """Print rows, headers first; numbers to the right. options: of rich's Table."""
+    """Print a table. rows: headers first; all but the first column align right. options: Rich's."""
     table = Table(title=escape(title) or None, title_justify="left", **options)
     for place, header in enumerate(rows[0]):
         table.add_column(header, justify="right" if place else "left", overflow="fold")

@@ -231,7 +231,7 @@ def refuse_nonfinite(tensors: Mapping[str, Tensor], origin: object) -> None:
 
 
 def refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: object) -> None:
-    """Raise CheckpointError that lists in what `tensors` differ from those of `model`."""
+    """Raise CheckpointError with a list of differences between `tensors` and `model`."""
     own = unique_tensors(model)
     differences = differing_tensors(shapes_of(tensors), shapes_of(own))
     differences += differing_types(tensors, own)

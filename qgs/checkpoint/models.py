@@ -80,7 +80,7 @@ def about(file: Path) -> str:
 
 
 def downloaded(url: str) -> Path:
-    """Return the file of `url`, as downloaded before or now.
+    """Return the local file of `url`; download it if that was not done before.
 
     Only whole safetensors files are kept, in the environment's QGS_CACHE or ~/.cache/qgs; one that
     is damaged there is downloaded again. Raises OSError with the cause of a failure.
@@ -131,7 +131,7 @@ def _download(url: str, file: Path) -> None:
 
 
 def _copy(stream: Any, local: IO[bytes], folder: Path) -> None:
-    """Copy `stream` to `local`. Raises OSError for more than LARGEST, or than fits."""
+    """Copy `stream` to `local`. Raises OSError if it exceeds LARGEST or the free space."""
     announced = getattr(stream, "length", None) or getattr(stream, "size", None) or 0
     # A server may announce less than it sends, or nothing.
     limit = min(LARGEST, shutil.disk_usage(folder).free)

@@ -18,16 +18,16 @@ GROUP = "qgs.commands"
 
 
 class CommandGroup(TyperGroup):
-    """Commands of the core, then those of distributions, which never hide one of the core."""
+    """Commands of the core, then those of plug-ins, which cannot replace a core command."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names, those of the core first."""
-        # In our order, not by the alphabet: what a newcomer needs first stands first.
+        """Return the names of all commands, core commands first."""
+        # Not sorted by the alphabet: a newcomer needs the first commands first.
         own = super().list_commands(ctx)
         return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return our command of that name, or that of a distribution; else ValueError."""
+        """Return the command of the core or of a plug-in. Raises ValueError if neither has it."""
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own
@@ -42,7 +42,7 @@ class CommandGroup(TyperGroup):
 
 
 def offered_command(name: str, offers: list[EntryPoint]) -> Any:
-    """Import the command `name` of a distribution. An unusable one says why when it is called."""
+    """Import the command `name` of a plug-in. If that fails, calling the command says why."""
     try:
         (entry,) = offers
         offered = entry.load()
@@ -60,7 +60,7 @@ def offered_command(name: str, offers: list[EntryPoint]) -> Any:
 
         anything = {"ignore_unknown_options": True, "allow_extra_args": True}
         return TyperCommand(name, help=reason, callback=refuse, context_settings=anything)
-    # What it would install completes no command of qgs.
+    # Its shell completion would not work for `qgs`.
     offered._add_completion = False
     command = typer.main.get_command(offered)
     command.name = name
@@ -89,11 +89,11 @@ for _name, _command in COMMANDS.items():
 
 
 def main() -> None:
-    """Run the command line; a user's mistake is printed without a traceback, exit code 2.
+    """Run the command line. A user's mistake gives a message without traceback, and exit code 2.
 
     The environment variable QGS_DEBUG=1 shows the traceback.
     """
-    # Names of files and messages of servers may hold anything.
+    # File names and messages from servers may contain control characters.
     show_safely()
     try:
         app()

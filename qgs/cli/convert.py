@@ -1,4 +1,4 @@
-"""`qgs convert`: Gaussians in another form."""
+"""`qgs convert`: write Gaussians in another file format."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,17 +8,17 @@ import typer
 
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="IN", help="PLY of any 3DGS program, .splat or .spz.")
+        Path, typer.Argument(metavar="IN", help="File to read: 3DGS .ply, .splat or .spz.")
     ],
     out: Annotated[
         Path,
         typer.Argument(
-            metavar="OUT", help="New file, never overwritten: .ply, .splat or a plugin's format."
+            metavar="OUT", help="New file: .ply, .splat or a plugin's format. Never overwrites."
         ),
     ],
     count: Annotated[
         int | None,
-        typer.Option(min=1, help="Keep only this many, the most opaque. Default: all."),
+        typer.Option(min=1, help="Number of Gaussians to keep, most opaque first. Default: all."),
     ] = None,
 ) -> None:
     """Write Gaussians to another file: PLY, .splat or a plugin's format.

@@ -23,23 +23,27 @@ def evaluate(
     run: Checkpoint,
     overrides: Overrides = None,
     index: Annotated[
-        str | None, typer.Option(help="JSON file of scenes and frames; sets evaluation.index.")
+        str | None,
+        typer.Option(help="JSON file of scenes and frames. Sets evaluation.index."),
     ] = None,
     tune: Tune = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the results. Default: RUN/evaluation, RUN/evaluation-N with changed "
-            "settings, evaluation_NAME for a shipped model or a URL."
+            help="Folder for the results. Default: RUN/evaluation; RUN/evaluation-N if settings "
+            "change; evaluation_NAME for a shipped model or a URL."
         ),
     ] = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Exit with 1 when a scene has no score.")
+        bool, typer.Option("--strict", help="Exit with code 1 if a scene has no score.")
     ] = False,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour."""
+    """Evaluate a checkpoint on unseen views.
+
+    Two baselines are scored too: the nearest input view and the mean colour.
+    """
     console = Console()
     settings = list(overrides or ())
     if index is not None:
@@ -66,13 +70,13 @@ def evaluate(
         model = file.model(choose_device(device))
     if settings:
         recipe = resolve(recipe.tree, settings)
-        # More rounds need no other weights, so a trained model may make more than in training.
+        # All rounds share weights, so a trained model can run more rounds than in training.
         model.feedback.rounds = recipe.build_model("meta", pretrained=False).feedback.rounds
     # Results are written beside a checkpoint of the user's own, not into a cache.
     own = Path(run).expanduser().exists()
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
     evaluation = evaluate_into(model, recipe, step, folder, console)
-    # For scripts: a mean over fewer scenes is another number.
+    # Scripts need this: a mean over fewer scenes is not comparable.
     if strict and evaluation.missing:
         raise typer.Exit(1)
 
@@ -80,8 +84,8 @@ def evaluate(
 def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:
     """Return RUN/evaluation for RUN/checkpoint.safetensors, RUN/evaluation_ema for checkpoint_ema.
 
-    For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ... Of a
-    checkpoint that is not the user's `own`, a new folder in the working directory.
+    other: settings differ from the recipe; return the first unused of RUN/evaluation-2, -3, ...
+    own: the checkpoint is the user's; otherwise return a new folder in the working directory.
     """
     checkpoint = checkpoint if own else Path(checkpoint.name)
     label = checkpoint.stem.removeprefix("checkpoint").removeprefix("_")
@@ -99,7 +103,7 @@ def evaluate_into(
     folder: Path,
     console: Console,
 ) -> Evaluation:
-    """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
+    """Evaluate `model` by `recipe`, write the results into `folder` and print them."""
     from rich.progress import Progress
 
     from qgs.evaluate.evaluation import evaluate as judge

@@ -1,4 +1,4 @@
-"""`qgs compose`, `qgs recipes`: what recipes say."""
+"""`qgs compose` and `qgs recipes`: print recipes."""
 
 from itertools import takewhile
 from pathlib import Path
@@ -24,7 +24,7 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
 
     resolved = resolve(recipe, overrides or ())
     model = resolved.build_model("meta")
-    # Patterns that name no parameter are refused.
+    # This raises an error for a pattern that matches no parameter.
     resolved.rate_factors(model)
     typer.echo(annotated(resolved))
     total = f"{sum(parameter_counts(model).values()):,}"
@@ -45,7 +45,7 @@ def recipes(
 ) -> None:
     """List the recipes that come with qgs, or show one. Every command takes their names.
 
-    A file of that name in the working directory comes first.
+    Commands prefer a file of that name in the working directory.
     """
     from qgs.files import refuse_existing, write_text
     from qgs.recipe.files import files_of, recipe_folder
@@ -69,7 +69,7 @@ def recipes(
         typer.echo(known[name].read_text(encoding="utf-8"), nl=False)
     else:
         copies = {out / path.relative_to(home): path for path in files_of(known[name])}
-        # All of them or, where one lies in the way, none.
+        # If one file exists, copy none.
         for target in copies:
             refuse_existing(target)
         for target, path in copies.items():

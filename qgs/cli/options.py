@@ -27,11 +27,11 @@ Size: TypeAlias = Annotated[
     ),
 ]
 Inputs: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Number of input views. Default: that of the recipe.")
+    int | None, typer.Option(min=1, help="Number of input views. Default: the recipe's.")
 ]
 Frames: TypeAlias = Annotated[
     str | None,
-    typer.Option(help="Input photos by number or name: 0,8,x.jpg. Default: well placed ones."),
+    typer.Option(help="Input photos by number or name: 0,8,x.jpg. Default: chosen by qgs."),
 ]
 SceneName: TypeAlias = Annotated[
     str | None, typer.Option("--scene", help="Scene to use, if there are several.")
@@ -44,7 +44,7 @@ Scale: TypeAlias = Annotated[
     float | None,
     typer.Option(
         help="Scale of the cameras' positions. Default: search for the scale at which the model "
-        "renders the photos best."
+        "renders your photos best."
     ),
 ]
 Tune: TypeAlias = Annotated[

@@ -38,7 +38,7 @@ def reconstruct(
     holdout: Annotated[
         str | None,
         typer.Option(
-            help="Photos to score, or none. Default: held-out ones (every eighth) near the inputs."
+            help="Photos to score, or none. Default: held-out photos (every eighth) near inputs."
         ),
     ] = None,
     tune: Tune = None,
@@ -46,20 +46,20 @@ def reconstruct(
     overrides: ViewsSettings = None,
     overwrite: Annotated[
         bool,
-        typer.Option("--overwrite", help="Write over an earlier result or beside other files."),
+        typer.Option("--overwrite", help="Write into a folder with files, or over a file."),
     ] = False,
     size: Size = None,
     scene_name: SceneName = None,
     threads: options.Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
+    """Reconstruct a scene from photos: PLY, renders beside photos, depth, an orbit, cameras.
 
-    Photos that were held out from training are rendered and scored, if there
-    are some. For photos of your own, the scale of the world is searched.
+    Held-out photos are rendered and scored. For your own photos, qgs searches
+    the scale of the world.
 
-    Then `qgs refine OUT PHOTOS` fits the Gaussians to all photos, and
-    `qgs video OUT` films them.
+    Afterwards, `qgs refine OUT PHOTOS` fits the Gaussians to all photos, and
+    `qgs video OUT` makes a video of them.
     """
     _refuse_unusable(out, overwrite)
 
@@ -88,14 +88,14 @@ def reconstruct(
 
 
 def _refuse_unusable(out: Path, overwrite: bool) -> None:
-    """Raise an error before the work where `out` cannot be written."""
-    # Before anything heavy is imported: the answer is known already.
+    """Raise an error before any work if `out` cannot be written."""
+    # This comes before heavy imports, so that the user need not wait.
     if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
         raise FileExistsError(f"{out} is not empty: choose another --out, or add --overwrite")
 
     from qgs.reconstruction.scene_formats import scene_writers
 
-    # A writer of another distribution may fail to import.
+    # The import of a plug-in's writer may fail.
     if find := scene_writers().get(out.suffix.lower()):
         find()
 

@@ -1,4 +1,4 @@
-"""`qgs train`."""
+"""`qgs train`: train a model and evaluate it."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe file.")],
-    out: Annotated[Path, typer.Option(help="New folder for the run; never overwritten.")],
+    out: Annotated[Path, typer.Option(help="New folder for the run. Never overwrites.")],
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run in --out; start it if there is none.")
+        bool,
+        typer.Option("--resume", help="Continue the run in --out; start it if there is none."),
     ] = False,
     overrides: Overrides = None,
     threads: Threads = None,
@@ -30,9 +31,9 @@ def train(
 ) -> None:
     """Train a model, then evaluate it on views it never saw.
 
-    Ctrl-C and SIGTERM finish the step, save, and exit with 128 + the signal.
-    The same command with --resume continues from there, or from the last save
-    if the process was killed. The result is that of a run without a stop.
+    Ctrl-C or SIGTERM finishes the step, saves, and exits with code 128 + signal.
+    To continue, run the same command with --resume. A killed process continues
+    from its last save. The result equals that of a run without a stop.
 
     On 8 GPUs:
 
@@ -47,20 +48,20 @@ def train(
     use_threads(threads)
     console = Console()
     resolved = with_absolute_path(resolve(recipe, overrides or ()))
-    # A missing index raises now, not after the training.
+    # A missing index must raise now, not after the training.
     read_index(resolved.evaluation.index)
     try:
         result = train_model(resolved, out, console=console, device=device, resume=resume)
-    # It names causes and remedies itself; a traceback would hide them.
+    # The message names causes and remedies; a traceback would hide them.
     except TrainingError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
-    # Of several processes one speaks and evaluates.
+    # Only one of several processes prints and evaluates.
     if result.main:
         _report(result, console)
         finished = result.resumed_at == result.steps
         folder = result.folder.evaluation
-        # The protocol is the last file of a whole evaluation.
+        # The protocol is written last, so the evaluation is complete.
         if finished and (folder / "protocol.json").exists():
             console.print(f"evaluated before, see {folder}")
         elif not result.stopped_by:

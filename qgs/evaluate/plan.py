@@ -174,7 +174,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Fra
 
 
 def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
-    """Return the frames of `scene` that `index` names; raises ValueError where it lacks one."""
+    """Return the frames of `scene` that `index` names. Raises ValueError if one is missing."""
     entry = index[scene.name]
     assert entry is not None
     # frames are positions, which a missing image moves

@@ -27,7 +27,7 @@ METHODS = ("model", *BASELINES)
 
 @dataclass(frozen=True)
 class SceneScore:
-    """One scene. views: input and target frames of each of its samples; names: as in `Sample`.
+    """Scores of one scene. views: input and target frames per sample; names: as in `Sample`.
 
     values: means over the samples of METHOD_METRIC and "gaussians_used", less those whose metric
     needs what the method or the scene lacks.
@@ -208,5 +208,5 @@ def _spread(values: Sequence[float]) -> dict[str, float]:
 
 
 def as_json(value: Mapping[str, Any]) -> str:
-    """Return a file's text; raises ValueError for NaN and infinities."""
+    """Return a file's text. Raises ValueError for NaN and infinities."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -36,7 +36,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct one scene as `qgs reconstruct` does, in the frame of the recipe.
 
-    So is the scale, but a constant one is searched for photos of no training, see `find_scale`.
+    The scale is the recipe's too. If it is constant and the photos are not the training data,
+    `find_scale` searches it.
 
     photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, which all
         become inputs unless `frames` names some. OpenCV cameras, images in [0, 1].
@@ -64,7 +65,7 @@ def reconstruct(
     against = [] if compare == "none" else compare
     against = None if against is None else frame_list(against, "compare", found)
     window = choose_frames(found, recipe.views, inputs, wanted, against, model.trained_on)
-    # A model's own data keep its scale; photos of a user have any unit.
+    # Training data keep the recipe's scale; photos of a user may have any unit.
     views = photo_settings(recipe.views, seen is not None, overrides)
     tuned = None
     tuning = None
@@ -91,7 +92,7 @@ def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | Non
             "this model was built by hand and has no recipe, so the frame and scale of its world "
             "are not known; build it with qgs.compose, or bring cameras into its world yourself"
         )
-    # Weights fit the recipe: another model option would be another model.
+    # The weights fit only the model options of the recipe.
     if foreign := [text for text in overrides if not text.startswith("views.")]:
         raise ValueError(f"only options of `views` can be set here, got {listed(foreign)}")
     return resolve(model.recipe, [*overrides, *tuning_settings(tune)])
@@ -126,12 +127,12 @@ def choose_frames(
         novel = frusta.compared(frames, target)
     elif compare is None:
         novel = Frusta(scene, domain).compared(tuple(frames))
-    # Named photos win over those that were chosen beside the inputs.
+    # Photos that the user names replace the chosen ones.
     return checked_window(len(scene), frames, novel if compare is None else compare)
 
 
 def checked_window(total: int, frames: Sequence[int], compare: Sequence[int] = ()) -> Window:
-    """Return input and compared frames; ValueError for one twice or not of 0 to total - 1."""
+    """Return input and compared frames. Raises ValueError if one repeats or does not exist."""
     every = [*frames, *compare]
     if missing := [frame for frame in every if not 0 <= frame < total]:
         raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
@@ -166,10 +167,10 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
     remarks = (
-        choice(sample, scene),
-        verdict(result.model.trained_on or Domain(), found),
         result.scale.poor if result.scale else "",
         result.worse_than_nearest,
+        verdict(result.model.trained_on or Domain(), found),
+        choice(sample, scene),
     )
     return [*filter(None, remarks)]
 

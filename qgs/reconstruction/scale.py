@@ -30,13 +30,13 @@ STEP = 1.6
 MOST = 16
 """Most factors that are tried before the search refines."""
 BASELINES = (0.06, 0.25)
-"""Baselines where those of the training are unknown."""
+"""Least and largest baseline if the training's are unknown."""
 BELOW = 2.0
 """Factor by which the search goes below the least baseline of the training."""
 ABOVE = 4.0
 """Factor by which the search goes above the largest baseline of the training."""
 NEAREST = 0.8
-"""Least depth that cameras look at where that of the training is unknown."""
+"""Least depth that cameras look at if the training's is unknown."""
 REACH = 6.0
 """The search brings what cameras look at to REACH times the least depth."""
 PENALTY = 5.0
@@ -63,7 +63,7 @@ class FoundScale:
 
     @property
     def poor(self) -> str:
-        """A remark where no factor gave a good result or the inputs alone decide, else ""."""
+        """Remark if no factor gave a good result or only inputs were judged, else ""."""
         # NaN is poor too.
         if not self.psnr >= POOR:
             return (
