@@ -36,8 +36,7 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct one scene as `qgs reconstruct` does, in the frame of the recipe.
 
-    The scale is the recipe's too. If it is constant and the photos are not the training data,
-    `find_scale` searches it.
+    The scale is the recipe's too; `find_scale` searches a constant one for photos not trained on.
 
     photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, which all
         become inputs unless `frames` names some. OpenCV cameras, images in [0, 1].
