@@ -60,7 +60,7 @@ def test_everything_is_written_and_what_a_user_made_is_kept(
     assert PlyData.read(tmp_path / "gaussians.ply")["vertex"].count == 32
     assert kinds(record) == {2: "input", 4: "input", 3: "novel"}
     chosen = "inputs images/2.png, images/4.png, compared with images/3.png; 1 of 7 photos held out"
-    assert record["remarks"][0].startswith(chosen)
+    assert record["remarks"][-1].startswith(chosen)
     back = record["to_photos"]
     assert back["scale"] == pytest.approx(1 / 0.6)
     np.testing.assert_allclose(record["views"][0]["c2w"], np.eye(4), atol=1e-6)
