@@ -272,8 +272,8 @@ def joined(gaussians: Gaussians, others: Gaussians) -> Gaussians:
     for name in ("sh", "features"):
         given = getattr(gaussians, name)
         if given is not None:
-            zeros = given.new_zeros(1, others.count, *given.shape[2:])
-            others = replace(others, **{name: zeros})
+            shape = (1, others.count, *given.shape[2:])
+            others = replace(others, **{name: given.new_zeros(shape)})
     return concatenated([gaussians, others], 1)
 
 

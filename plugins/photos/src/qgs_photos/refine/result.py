@@ -64,15 +64,13 @@ class Result:
 
     def render(self, views: Views) -> Rendering:
         """Render the scene over black from the cameras of `views` (1, V)."""
-        gaussians = replace(self.refined.gaussians, features=None)
-        return RENDERER(gaussians, views.cameras)
+        return RENDERER(self.refined.gaussians, views.cameras)
 
 
 def in_world(gaussians: Gaussians, world: tuple[Tensor, Tensor]) -> Gaussians:
     """Move Gaussians (1, G) from the photos' world into one of its own, see `Result`."""
     reference, scale = world
-    back = scaled(torch.linalg.inv(reference.double()), scale)
-    return moved(gaussians, back, float(scale))
+    return moved(gaussians, scaled(torch.linalg.inv(reference.double()), scale), float(scale))
 
 
 @torch.no_grad()
@@ -91,8 +89,9 @@ def write_scene(
         save_ply(result.in_photos_world(refined.gaussians), fresh / "scene.ply")
         # the file is judged, not what it was made of
         read = in_world(load_ply(fresh / "scene.ply"), result.world)
-        device = result.views.images.device
-        result = replace(result, refined=replace(refined, gaussians=read.to(device)))
+        result = replace(
+            result, refined=replace(refined, gaussians=read.to(refined.gaussians.means.device))
+        )
         record = scores(result)
         save_splat(result.in_photos_world(shown), fresh / "scene.splat")
         if result.photos.held_out:
@@ -130,15 +129,14 @@ def scores(result: Result) -> dict[str, Any]:
     for place, frame in enumerate(result.photos.held_out):
         photo = result.judged.select([place])
         rendering = result.render(photo)
-        rgb = rendering.rgb
         # what no optimisation is needed for
         nearest = nearest_input(result.views, photo.cameras)
         rows.append(
             {
                 "frame": frame,
                 "photo": result.photo(frame),
-                "psnr": float(psnr(rgb, photo.images).mean()),
-                "ssim": float(ssim(rgb, photo.images).mean()),
+                "psnr": float(psnr(rendering.rgb, photo.images).mean()),
+                "ssim": float(ssim(rendering.rgb, photo.images).mean()),
                 "nearest_input": float(psnr(nearest, photo.images).mean()),
                 "alpha": float(rendering.alpha.mean()),
             }
@@ -147,7 +145,6 @@ def scores(result: Result) -> dict[str, Any]:
     return {
         "command": result.command,
         "gaussians": refined.gaussians.count,
-        "background": [0, 0, 0],
         "steps": refined.steps,
         "seconds": round(refined.seconds, 1),
         "stopped_by": refined.stopped_by,

@@ -54,7 +54,8 @@ def make_scene(
     # on this machine, with these options: exposure and harmonics cost time too
     step = seconds_of_step(few, small, renderer, options.extras)
     size, count = affordable(step, small.cameras.size, photos, left(), options)
-    every = views_in(start.world, photos.at(size), photos.every).to(options.device)
+    frames = (*photos.frames, *photos.held_out)
+    every = views_in(start.world, photos.at(size), frames).to(options.device)
     every = masked(every) if options.masks else every
     budget = left()
     command = replace(

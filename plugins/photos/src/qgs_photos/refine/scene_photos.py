@@ -38,7 +38,7 @@ class ScenePhotos:
     """The photos of `qgs scene` at any size.
 
     small: the scene at a small size. held_out: frames that are judged, and frames: those that are
-    optimised on. every: both, the judged ones last.
+    optimised on.
     """
 
     def __init__(self, path: str, options: Options) -> None:
@@ -49,7 +49,6 @@ class ScenePhotos:
         self.small = self.at(sized(found, _SMALL))
         self.held_out = judged_frames(found, options.holdout)
         self.frames = tuple(frame for frame in range(len(found)) if frame not in self.held_out)
-        self.every = (*self.frames, *self.held_out)
         # a model's inputs are chosen among the others
         self.small.held_out = self.held_out
 

@@ -10,10 +10,6 @@ from qgs_photos.refine.sweeping import balls, pixel_rays
 
 # Angle between neighbours, in radians, and their standard deviation.
 _GAP = 0.1
-# Several overlap everywhere: less than 0.001 of what is behind them shows.
-_OPACITY = 0.9
-# Rays of a photo on each side.
-_RAYS = 24
 
 
 @torch.no_grad()
@@ -28,12 +24,13 @@ def surroundings(cameras: Cameras, size: float, color: Sequence[float]) -> Gauss
     centres = centres - middle
     radius = 10 * size + 4 * centres.norm(dim=-1).max()
     # those beside a photo reach into it
-    part = torch.linspace(-0.2, 1.2, _RAYS, device=centres.device)
+    part = torch.linspace(-0.2, 1.2, 24, device=centres.device)
     rows, columns = torch.cartesian_prod(part * cameras.size[0], part * cameras.size[1]).T
-    ways = [F.normalize(pixel_rays(cameras, v, rows, columns), dim=-1) for v in range(len(centres))]
+    ways = [pixel_rays(cameras, v, rows, columns) for v in range(len(centres))]
     seen = F.normalize(centres[:, None] + radius * torch.stack(ways), dim=-1).flatten(0, 1)
     # many photos look the same way: one of each cell
     sphere = F.normalize((seen / _GAP).round().unique(dim=0), dim=-1)[None]
-    means = middle + radius * sphere
-    colors = sphere.new_tensor(color).expand_as(sphere)
-    return balls(means, (radius * _GAP).expand_as(sphere), _OPACITY, colors)
+    # several overlap everywhere: less than 0.002 of what is behind them shows
+    return balls(
+        means, (radius * _GAP).expand_as(sphere), 0.9, sphere.new_tensor(color).expand_as(sphere)
+    )
