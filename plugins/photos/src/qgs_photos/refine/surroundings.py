@@ -32,5 +32,8 @@ def surroundings(cameras: Cameras, size: float, color: Sequence[float]) -> Gauss
     sphere = F.normalize((seen / _GAP).round().unique(dim=0), dim=-1)[None]
     # several overlap everywhere: less than 0.002 of what is behind them shows
     return balls(
-        means, (radius * _GAP).expand_as(sphere), 0.9, sphere.new_tensor(color).expand_as(sphere)
+        middle + radius * sphere,
+        (radius * _GAP).expand_as(sphere),
+        0.9,
+        sphere.new_tensor(color).expand_as(sphere),
     )
