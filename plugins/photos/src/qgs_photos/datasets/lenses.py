@@ -2,9 +2,11 @@
 
 import importlib
 import math
+import signal
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -109,9 +111,15 @@ def model_name(number: int) -> str:
     return _pycolmap().CameraModelId(number).name
 
 
+@cache
 def _pycolmap() -> Any:
     # it takes a while to load, and most photos are of pinholes
-    return importlib.import_module("pycolmap")
+    handler = signal.getsignal(signal.SIGTERM)
+    module = importlib.import_module("pycolmap")
+    # its own prints a trace, and ends a training that would be kept; threads cannot set one
+    with suppress(ValueError):
+        signal.signal(signal.SIGTERM, handler)
+    return module
 
 
 @lru_cache(maxsize=4096)
