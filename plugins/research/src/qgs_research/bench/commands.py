@@ -43,9 +43,8 @@ def bench(
 ) -> None:
     """Measure size, latency and memory of models, for any number of recipes.
 
-    Ratios are to the first recipe. Weights, photos and poses are random, so no data is
-    needed. Latency and FLOPs are from photos to Gaussians. Memory is the peak of a
-    process on a CPU, and the most that torch allocated on a GPU.
+    Weights, photos and poses are random, so no data is needed. Latency and FLOPs
+    go from photos to Gaussians. Memory is a peak: of a process, or of a GPU.
     """
     from rich.console import Console
 

@@ -51,8 +51,7 @@ def measure_recipes(
         say: called with a description of the next measurement.
 
     Returns the report as plain values for JSON: seconds with every sample, bytes, and ratios to the
-    first recipe. Ratios of latencies are taken round by round. Raises the errors of the models and
-    of `peak_memory`.
+    first recipe, round by round. Raises the errors of the models and of `peak_memory`.
     """
     recipes = [resolve(name, overrides) for name in names]
     works = [workload_of(recipe, **work) for recipe in recipes]
