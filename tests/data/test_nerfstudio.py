@@ -130,15 +130,3 @@ def test_images_of_another_size_are_told_when_decoded(folder):
     Image.new("RGB", (40, 40)).save(folder / NAMES[3])
     scene = read(folder)
     must_refuse(r"view_003\.png", scene.images, [3])
-
-
-def test_a_matrix_of_intrinsics_and_numbers_as_text_are_read(folder):
-    expected = read(folder).cameras
-    change(folder, w="40", h="30", fl_x="50.0", fl_y=None, cx=None, cy=None)
-    for frame, key in enumerate(("K", "intrinsic_matrix")):
-        change(folder, frame, **{key: [["50", 0, 19], [0, 52, 16], [0, 0, 1]]})
-    changed = read(folder).cameras
-    assert torch.equal(changed.intrinsics[:2], expected.intrinsics[:2])
-    assert changed.intrinsics[2].tolist() == [50, 50, 20, 15]
-    change(folder, 2, transform_matrix=None)
-    assert len(read(folder)) == 5

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from upath import UPath
 
-from qgs.data.photos.finding import located
 from qgs.data.photos.nerfstudio import Nerfstudio
 from qgs.data.photos.reader import (
     Listing,
     PhotoFrame,
     PhotoReader,
+    existing,
     installed_readers,
-    sound_frames,
+    refuse_outside,
+    refuse_problems,
 )
 from qgs.paths import is_local, listing
 from qgs.wording import listed, warn_once
@@ -47,14 +48,11 @@ def with_cameras(path: UPath) -> UPath:
     return next(filter(None, made), path)
 
 
-def read_listing(
-    folder: UPath, format: str = "auto", images: str | None = None, outside: bool = False
-) -> Listing:
+def read_listing(folder: UPath, format: str = "auto", images: str | None = None) -> Listing:
     """Read the photos that `folder` lists in `format`, or in the first of `readers` that it holds.
 
-    images: another folder of photos, such as images_4. Files are where they are found, see
-    `located`. Raises FileNotFoundError for no folder or no listing, ValueError for a listing that
-    cannot be read, and for files outside of the folder but where `outside` allows them.
+    images: another folder of photos, such as images_4. Raises FileNotFoundError for no folder or no
+    listing, ValueError for a listing that cannot be read.
     """
     known = readers()
     listings = ", ".join(f"{reader.listing} ({name})" for name, reader in known.items())
@@ -82,7 +80,6 @@ def read_listing(
             f"{held[0]}; in a recipe, data.format: {held[1]} reads the other"
         )
     found = known[held[0] if format == "auto" else format].read(folder, images)
-    found = located(found, found.folder or folder, images, outside)
     still = [frame.name for frame in found.frames if frame.time is None and not frame.problems]
     if still and len({frame.time is None for frame in found.frames}) > 1:
         raise ValueError(
@@ -100,7 +97,10 @@ def present_frames(
     What is left out is logged. Raises FileNotFoundError when fewer than two images or a mask do not
     exist, ValueError for poses and intrinsics that cannot be right.
     """
-    found = read_listing(folder, format, images, outside)
+    found = read_listing(folder, format, images)
+    # A listing of a stranger must not name other files of this machine.
+    if not outside:
+        refuse_outside(folder, found)
     frames = [frame for frame in found.frames if frame.split != "unused"]
     count = len(frames)
     if count < len(found.frames):
@@ -108,22 +108,23 @@ def present_frames(
             f"{len(found.frames) - count} of {len(found.frames)} frames of {found.file} are "
             "in none of its splits and are left out"
         )
-    present = [frame for frame in frames if frame.path in found.present]
-    missing = [str(frame.path) for frame in frames if frame.path not in found.present]
+    there = existing(frame.path for frame in frames)
+    present = [frame for frame in frames if frame.path in there]
+    missing = [str(frame.path) for frame in frames if frame.path not in there]
     # Before the count: a wrong listing explains missing images.
-    sound = sound_frames(found.file, present if len(present) > 1 else frames)
+    refuse_problems(found.file, present if len(present) > 1 else frames)
     if len(present) < 2:
         raise FileNotFoundError(
             f"{found.file} names {count} images, but {len(present)} exist and 2 are needed: add "
-            f"{listed(missing, 3) or 'photos'}, or name the folder that they are in as `images`"
+            f"{listed(missing, 3) or 'photos'}"
         )
     if missing:
         warn_once(f"{len(missing)} of {count} images of {folder} are missing: {listed(missing, 3)}")
-    masks = [frame.mask for frame in sound if frame.mask is not None]
-    absent = sorted({str(mask) for mask in masks if mask not in found.present})
+    masks = [frame.mask for frame in present if frame.mask is not None]
+    absent = sorted({*map(str, masks)} - {*map(str, existing(masks))})
     if absent:
         raise FileNotFoundError(
             f"{found.file} names {len(masks)} masks, but {len(absent)} do not exist: "
             f"{listed(absent, 3)}. Add them, or remove their 'mask_path'"
         )
-    return sound, missing
+    return present, missing

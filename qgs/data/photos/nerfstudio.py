@@ -11,7 +11,6 @@ from PIL import Image
 from upath import UPath
 
 from qgs.data.images import image_size, read_image
-from qgs.data.photos.finding import found_files
 from qgs.data.photos.reader import (
     FrameProblem,
     Intrinsics,
@@ -20,21 +19,20 @@ from qgs.data.photos.reader import (
     PhotoFrame,
     PhotoReader,
     Size,
+    existing,
     installed_readers,
     listed_size,
     numbers,
+    with_images,
 )
 from qgs.paths import read_json
 
-PINHOLE = (
-    "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV",
-)  # fmt: skip
+PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 """Camera models that are a pinhole where no coefficient bends rays."""
 _COEFFICIENTS = (
     "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
     "sx1", "sy1", "b1", "b2",
 )  # fmt: skip
-_MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_matrix")
 _NO_POSE = np.full((4, 4), np.nan)
 _NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
 # Of a pose's columns: the camera's y and z axes change sign.
@@ -50,7 +48,13 @@ class Nerfstudio(PhotoReader):
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """See `PhotoReader`: the frames in the file's order."""
         file = folder / cls.listing
-        return Listing(file, read_transforms(file))
+        frames = read_transforms(file)
+        top = {PurePosixPath(frame.name).parts[:1] for frame in frames}
+        # DL3DV ships reduced copies alone, under the listing of the full size.
+        reduced = top == {("images",)} and not (folder / "images").is_dir()
+        if images is not None or reduced:
+            frames = with_images(frames, folder, images)
+        return Listing(file, frames)
 
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
@@ -64,9 +68,9 @@ def read_transforms(file: UPath) -> list[PhotoFrame]:
     try:
         # An angle of view needs the image's size; a header is read only where nothing lists one.
         if any(frame.problems and not frame.size for frame in frames):
-            present = found_files(folder, [frame.path for frame in frames if frame.name])
-            first = next(iter(present.values()), None)
-            size = read_image(first, image_size) if first else None
+            present = existing(frame.path for frame in frames)
+            first = [frame.path for frame in frames if frame.path in present][:1]
+            size = read_image(first[0], image_size) if first else None
             frames = [_frame(folder, data, entry, size) for entry in entries]
         return _with_splits(frames, data)
     except ValueError as error:
@@ -82,7 +86,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
     if not isinstance(path, str) or not PurePosixPath(path).name or "://" in path:
         problem = FrameProblem("its 'file_path' names no file", "correct or remove it")
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
-    values = _Values({**_flat(data), **_flat(entry)})
+    values = _Values({**data, **entry})
     height = values.number("h")
     width = values.number("w")
     if height is not None and width is not None:
@@ -107,15 +111,6 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
     )
 
 
-def _flat(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return `values` with the entries of a matrix of intrinsics under their own names."""
-    matrix = numbers(next((values[key] for key in _MATRICES if key in values), None))
-    if matrix.shape != (3, 3):
-        return values
-    names = ("fl_x", "fl_y", "cx", "cy")
-    return {**dict(zip(names, matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)), **values}
-
-
 class _Values(dict[str, Any]):
     """Values of a frame, or of all frames, and the problems of those that cannot be read."""
 
@@ -130,8 +125,6 @@ class _Values(dict[str, Any]):
     def number(self, key: str) -> float | None:
         """Return a finite number; None where it is absent or null, or a problem."""
         value = self.get(key)
-        if isinstance(value, str) and value:
-            value = (*numbers([value]).tolist(), value)[0]
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
         if value is not None:

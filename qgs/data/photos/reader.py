@@ -1,10 +1,12 @@
 """Base of readers of photos, the frames that they give, and the problems of these."""
 
 import math
+import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 from typing import ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
@@ -12,7 +14,7 @@ from upath import UPath
 
 from qgs.extensions import ExtensionError, installed, load
 from qgs.paths import listing
-from qgs.wording import listed, numbered, warn_once
+from qgs.wording import listed, name_shown, numbered, warn_once
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 Size: TypeAlias = tuple[int, int]
@@ -22,7 +24,7 @@ UNLESS = (
     "correct them, unless the photo is cut from a larger one; fx and cx go with the width, fy and "
     "cy with the height"
 )
-_COPY = re.compile(r"images(?:_(\d+))?")
+_COPY = re.compile(r"images(_\d+)?")
 # Pixels of a listed photo.
 LARGEST_SIDE = 10**6
 # Largest coordinate of a camera: the square of larger ones overflows float32.
@@ -115,15 +117,10 @@ class PhotoFrame:
 
 @dataclass(frozen=True)
 class Listing:
-    """The photos of a folder. file: what lists them. frames: in the order of the listing.
-
-    folder: what the photos lie in; None for the one that was read. present: files that are there.
-    """
+    """The photos of a folder. file: what lists them. frames: in the order of the listing."""
 
     file: UPath
     frames: Sequence[PhotoFrame]
-    folder: UPath | None = None
-    present: Collection[UPath] = ()
 
 
 class PhotoReader(ABC):
@@ -187,19 +184,61 @@ def numbers(value: object) -> np.ndarray:
         return np.zeros(0)
 
 
-def image_folder(folder: UPath, wanted: str | None) -> UPath:
-    """Return `wanted`, else images or its least reduced copy, else `folder` itself.
+def existing(paths: Iterable[UPath]) -> set[UPath]:
+    """Return those of `paths` that exist; each folder is listed once, which object stores need."""
+    names: dict[str, set[str]] = {}
+    held: set[UPath] = set()
+    for path in paths:
+        folder = str(path.parent)
+        if folder not in names:
+            names[folder] = {item.name for item in listing(path.parent)}
+        if path.name in names[folder]:
+            held.add(path)
+    return held
 
-    Raises FileNotFoundError without `wanted`.
-    """
+
+def image_folder(folder: UPath, wanted: str | None) -> UPath:
+    """Return `wanted`, else images, else its least reduced copy. Raises FileNotFoundError."""
     if wanted is not None:
-        if not (folder / wanted).is_dir():
-            raise FileNotFoundError(f"{folder / wanted} does not exist: correct `images`")
-        return folder / wanted
-    found = {_COPY.fullmatch(item.name.lower()): item for item in listing(folder)}
+        chosen = folder / wanted
+        if not chosen.is_dir():
+            raise FileNotFoundError(f"{chosen} does not exist: correct `images`")
+        return chosen
+    copies = [item for item in folder.iterdir() if _COPY.fullmatch(item.name) and item.is_dir()]
+    if not copies:
+        raise FileNotFoundError(
+            f"{folder} has neither a folder `images` nor a scaled copy such as images_4: name the "
+            "folder of photos as `images`"
+        )
     # `images` counts as reduced by 1.
-    copies = {int(match[1] or 1): item for match, item in found.items() if match and item.is_dir()}
-    return copies[min(copies)] if copies else folder
+    return min(copies, key=lambda item: int(item.name.partition("_")[2] or 1))
+
+
+def with_images(
+    frames: Sequence[PhotoFrame], folder: UPath, wanted: str | None
+) -> list[PhotoFrame]:
+    """Return `frames` with photos from the `image_folder`. Raises as that."""
+    photos = image_folder(folder, wanted)
+    inside = wanted or photos.name
+
+    def moved(frame: PhotoFrame) -> PhotoFrame:
+        parts = PurePosixPath(frame.name).parts
+        name = str(PurePosixPath(inside, *(parts[1:] or parts)))
+        mask = folder / name if frame.mask == frame.path else frame.mask
+        return replace(frame, name=name, path=folder / name, mask=mask)
+
+    return [moved(frame) if frame.name else frame for frame in frames]
+
+
+def refuse_outside(folder: UPath, found: Listing) -> None:
+    """Raise ValueError for a listed file that is not in `folder`; a link there is."""
+    for frame in found.frames:
+        for file in filter(None, (frame.path, frame.mask, frame.depth)):
+            if os.path.relpath(file.path, folder.path or ".").split(os.sep)[0] == "..":
+                raise ValueError(
+                    f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: "
+                    "move it into the folder, or train with data.outside=true"
+                )
 
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
@@ -275,30 +314,16 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
     return None, (FrameProblem(reason, "correct the width and height"),)
 
 
-def sound_frames(listing: object, frames: Sequence[PhotoFrame]) -> list[PhotoFrame]:
-    """Return the frames without problems; log the others, and implausible intrinsics.
-
-    Raises ValueError for the first problem where fewer than two are without.
-    """
-    sound: list[PhotoFrame] = []
-    faulty: list[str] = []
+def refuse_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:
+    """Raise ValueError for the first problem, with its frame; log implausible intrinsics."""
     for index, frame in enumerate(frames):
-        problems = frame.problems or (
+        for problem in frame.problems or (
             *pose_problems(frame.c2w),
             *intrinsics_problems(frame.intrinsics, frame.size),
-        )
-        if problems:
-            faulty.append(f"frame {numbered(index, frame.name)}: {problems[0]}")
-        else:
-            sound.append(frame)
-    if faulty and len(sound) < 2:
-        raise ValueError(f"{listing}: {faulty[0]}")
-    if faulty:
-        count = f"{len(faulty)} of {len(frames)} frames"
-        warn_once(f"{listing}: {count} are left out: {listed(faulty, 3, '; ')}")
-    doubtful = [f.name for f in sound if f.size and not are_plausible(f.intrinsics, f.size)]
+        ):
+            raise ValueError(f"{listing}: frame {numbered(index, frame.name)}: {problem}")
+    doubtful = [f.name for f in frames if f.size and not are_plausible(f.intrinsics, f.size)]
     if doubtful:
         count = f"{len(doubtful)} of {len(frames)}"
         what = f"{count} frames have intrinsics that are implausible for the size"
         warn_once(f"{listing}: {what}: {listed(doubtful, 3)}; {UNLESS}")
-    return sound

@@ -30,7 +30,6 @@ from qgs_photos.poses.photos import (
     PosesError,
     camera_groups,
     left_out_formats,
-    names_of,
     photo_files,
     prepare,
 )
@@ -87,9 +86,8 @@ class Poses:
 def fingerprint(source: Path) -> dict[str, Any]:
     """Return what poses are made of: size and time of the video or of every photo, by name."""
     files = [source] if source.is_file() else photo_files(source)
-    stats = [file.stat() for file in files]
-    times = ([stat.st_size, stat.st_mtime_ns] for stat in stats)
-    return dict(zip(names_of(files), times, strict=True))
+    stats = {file.name: file.stat() for file in files}
+    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
 
 def make_poses(source: Path, out: Path, options: Options, console: Console) -> Poses:
