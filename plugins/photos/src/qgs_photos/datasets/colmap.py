@@ -95,7 +95,7 @@ class Colmap(PhotoReader):
 
 
 def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
-    """The models in `folder` and the suffix of their files, in the order of preference."""
+    """Yield the models in `folder` and the suffix of their files, in the order of preference."""
     for place in _PLACES:
         # binary keeps all digits of a pose
         for suffix in ("bin", "txt"):

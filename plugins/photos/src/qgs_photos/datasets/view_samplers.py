@@ -193,11 +193,11 @@ def farthest_points(points: Tensor, count: int) -> list[int]:
 class Overlapping(ViewSampler):
     """Sampler for photos in any order: overlapping inputs around a random photo.
 
-    The inputs are those that `qgs demo` would choose for the random photo. They are .06 to .25 scene
-    depths apart, times a factor drawn log-uniformly between the bounds of `apart`. Targets are the
-    random photo and those nearest to it. In evaluation the factor is 1, and each held-out photo is a
-    target; a scene without held-out photos has four targets. `views.gap` is read only for scenes
-    that move: they are judged in the order of time, and training refuses them.
+    The inputs are those that `qgs demo` would choose for the random photo. They are .06 to .25
+    scene depths apart, times a factor drawn log-uniformly between the bounds of `apart`. Targets
+    are the random photo and those nearest to it. In evaluation the factor is 1, and each held-out
+    photo is a target; a scene without held-out photos has four targets. `views.gap` is read only
+    for scenes that move: they are judged in the order of time, and training refuses them.
     """
 
     name = "overlapping"

@@ -1,4 +1,4 @@
-"""What is filmed, from where, how large and how long; rendered pictures as mp4 or WebP."""
+"""Films of Gaussians: path, size and length; rendered pictures as mp4 or WebP."""
 
 import math
 from collections.abc import Iterator

@@ -17,7 +17,7 @@ from qgs_photos.poses.photos import LEAST, PosesError
 # 120 at even steps of time are too few where the camera turns fast: of a walk through an office as
 # a video, 42 of 120 frames got poses, and 143 of the 143 that follow the motion.
 FEWEST, MOST, PER_SECOND = 40, 240, 2.0
-"""How many frames are taken of a video, and the least rate of them."""
+"""Number of frames to take from a video, and their least rate."""
 STEP = 0.06
 """Shift of the picture, in parts of its width, after which another frame is taken."""
 # Frames of an interval that are compared.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Job:
-    """What the process does.
+    """Function that the process runs.
 
     images: folder of photos, upright RGB. database, models: of COLMAP. groups: names of photos that
     share a camera. sizes: (H, W) of each photo for which the result is. sequential: match

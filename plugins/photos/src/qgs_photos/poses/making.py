@@ -1,4 +1,4 @@
-"""From photos or a video to a folder with their poses."""
+"""Folders with the poses of photos or a video."""
 
 import json
 import os

@@ -27,7 +27,7 @@ FEW_MATCHES = 15
 # Of a model; photos from one place give models of next to no points.
 FEW_POINTS = 30
 SMALL = {"init_min_tri_angle": 4.0, "init_min_num_inliers": 50}
-"""Of the first two photos where COLMAP finds none by its own limits, 16 degrees and 100 points."""
+"""Limits for the first two photos if COLMAP finds none by its own, 16 degrees and 100 points."""
 SMALL_SIDE = 1000
 """Longer side in pixels up to which photos are doubled first, which finds more and takes longer."""
 # Of the error in pixels: what a refined principal point must reach.

@@ -1,4 +1,4 @@
-"""What is optimised of each photo beside the Gaussians: its pose, and its exposure."""
+"""Adjustment of each photo beside the Gaussians: its pose and its exposure."""
 
 import torch
 import torch.nn.functional as F

@@ -1,4 +1,4 @@
-"""Where the optimisation of `qgs scene` begins: a model's Gaussians, or some at the photos."""
+"""Start of the optimisation of `qgs scene`: a model's Gaussians, or some placed by the photos."""
 
 import struct
 from dataclasses import dataclass

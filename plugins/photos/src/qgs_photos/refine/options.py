@@ -7,7 +7,7 @@ from qgs.reconstruction.scenes import Size
 from qgs_photos.refine.refining import NO_EXTRAS, Extras
 
 NONE = "none"
-"""As a model: the start is made of the photos alone; as a holdout: all are optimised on."""
+"""Word of two options. --model none: start from the photos alone. --holdout none: optimise on all."""
 
 
 @dataclass(frozen=True)

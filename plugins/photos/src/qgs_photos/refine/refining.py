@@ -78,7 +78,7 @@ class RefinedScene:
 
 @dataclass(frozen=True)
 class Extras:
-    """What is optimised beside means, shapes, opacities and colours.
+    """Parts to optimise beside means, shapes, opacities and colours.
 
     degree: spherical harmonics up to this degree, 0 to 3, grow with time where the start has none.
     exposure: an affine map of the colours of each photo. poses: the camera of each photo.
