@@ -20,17 +20,17 @@ from qgs.machine import is_out_of_memory
 from qgs.paths import LARGEST, open_file
 from qgs.wording import name_shown
 
-TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
-TURN = "poses must be of the stored pixels; `mogrify -auto-orient` turns pixels for good"
+TURNED = "have an EXIF orientation, which is ignored: they are read as stored"
+TURN = "poses must belong to the stored pixels; `mogrify -auto-orient` rotates the stored pixels"
 
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV")
-# Of photos; others, such as EPS, would start programs.
+# Formats of photos; other formats, such as EPS, would start programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "TGA", "AVIF")
-# They take 2 GB with transparency; the largest phones make 108 million.
+# An image of this size takes 2 GB with transparency; the largest phone photos have 108 million.
 _MOST_PIXELS = 120_000_000
-# A tag of EXIF.
+# EXIF tag.
 _ORIENTATION = 0x0112
-# The first bytes of a file of NumPy's.
+# First bytes of a .npy file.
 _NPY = b"\x93NUMPY"
 
 Decoded = TypeVar("Decoded")
@@ -38,9 +38,9 @@ Decoded = TypeVar("Decoded")
 
 @dataclass(frozen=True)
 class CropResize:
-    """A centre crop to the target's aspect ratio, then a resize; (H, W) in pixels.
+    """Centre crop to the target's aspect ratio, then resize; sizes are (H, W) in pixels.
 
-    zoom: a crop smaller than the largest one by this factor.
+    zoom: factor by which the crop is smaller than the largest possible one.
     """
 
     source: tuple[int, int]
@@ -60,7 +60,7 @@ class CropResize:
         across = self.target[1] / self.scale
         left = (width - across) / 2
         top = (height - down) / 2
-        # Rounding must not leave the image.
+        # Clamped, because rounding could move an edge outside the image.
         return max(left, 0.0), max(top, 0.0), min(left + across, width), min(top + down, height)
 
     def intrinsics(self, source: Tensor) -> Tensor:
@@ -71,17 +71,17 @@ class CropResize:
     def image(
         self, image: Image.Image, kernel: Image.Resampling = Image.Resampling.LANCZOS
     ) -> np.ndarray:
-        """Return `image`, of the source's size, as (H, W, 3) uint8; (H, W) for one channel."""
+        """Return `image` cropped and resized: (H, W, 3) uint8, or (H, W) for one channel."""
         return np.array(image.resize((self.target[1], self.target[0]), kernel, box=self.box))
 
 
 def read_image(path: Path | UPath, decode: Callable[[IO[bytes]], Decoded]) -> Decoded:
-    """Return what `decode` makes of the file at `path`. Raises ValueError for what that raises."""
+    """Return the result of `decode` for the file at `path`; raises ValueError if that fails."""
     try:
         with open_file(path) as file:
             return decode(file)
     except Exception as error:
-        # No fault of the file.
+        # The file is not at fault.
         if is_out_of_memory(error):
             raise
         reason = str(error) or type(error).__name__
@@ -92,35 +92,35 @@ def read_image(path: Path | UPath, decode: Callable[[IO[bytes]], Decoded]) -> De
 
 
 def image_size(file: IO[bytes]) -> tuple[int, int]:
-    """Return (H, W) in the header of an image file. Raises OSError for no image."""
+    """Return (H, W) from the header of an image file; raises OSError if it is not an image."""
     with opened_image(file) as image:
         return image.height, image.width
 
 
 def orientation(image: Image.Image) -> int:
-    """Return how EXIF would turn a decoded image; 1 for not at all."""
+    """Return the EXIF orientation of an image; 1 means not turned."""
     try:
         return image.getexif().get(_ORIENTATION, 1)
-    # Pillow raises anything for damaged EXIF, which does not matter.
+    # Pillow raises any kind of error for damaged EXIF, which is ignored.
     except Exception:
         return 1
 
 
 def decode_alpha(file: IO[bytes]) -> np.ndarray:
-    """Decode the alpha channel of a photo as (H, W) uint8; 255 for none. Raises OSError."""
+    """Decode the alpha channel of a photo as (H, W) uint8; 255 if it has none. Raises OSError."""
     return np.array(eight_bits(_decoded(file)).convert("RGBA").getchannel("A"))
 
 
 def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
-    """Decode a depth map, .npy too, as (H, W) float32, 0 where unknown. Raises OSError, ValueError.
+    """Decode a depth map, an image or .npy file, as (H, W) float32; 0 means unknown.
 
-    unit: world units per number of the file.
+    unit: world units per number in the file. Raises OSError and ValueError.
     """
     plain = file.read(len(_NPY)) == _NPY
     file.seek(0)
     depth = load_array(file).squeeze() if plain else np.array(_decoded(file))
     if depth.ndim != 2 or depth.dtype.kind not in "fiu":
-        wanted = "a depth map must hold one number for each pixel, as 16-bit images do"
+        wanted = "a depth map must have one number per pixel, such as a 16-bit image"
         raise OSError(f"{wanted}, got {depth.dtype} {depth.shape}")
     with np.errstate(over="ignore", invalid="ignore"):
         metric = (depth * unit).astype(np.float32)
@@ -128,8 +128,8 @@ def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
 
 
 def load_array(file: IO[bytes]) -> np.ndarray:
-    """Read the array of a .npy file. Raises ValueError for objects and what is too large."""
-    # NumPy allocates what the header promises, so that a few bytes could ask for all memory.
+    """Read the array of a .npy file; raises ValueError for objects and for too large arrays."""
+    # NumPy allocates the size in the header, so a tiny damaged file could ask for all memory.
     if np.lib.format.read_magic(file) == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
     else:
@@ -144,9 +144,9 @@ def load_array(file: IO[bytes]) -> np.ndarray:
 def decode_rgb(
     file: IO[bytes], background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> Image.Image:
-    """Decode as RGB, over `background` in [0, 1]. Raises OSError for no readable image.
+    """Decode as RGB, over `background` in [0, 1]; raises OSError if the image cannot be read.
 
-    Pixels stay where they are stored; `PhotoScene` follows EXIF.
+    Pixels stay where they are stored. `PhotoScene` applies the EXIF orientation.
     """
     image = eight_bits(_decoded(file))
     if image.has_transparency_data:
@@ -157,28 +157,28 @@ def decode_rgb(
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """Return `image` with 8 bits a channel.
+    """Return `image` with 8 bits per channel.
 
-    Raises OSError where no number is known to be white: float, 32-bit and LAB files.
+    Raises OSError for kinds without a known value of white: float, 32-bit and LAB files.
     """
     if image.mode.startswith("I;16"):
         numbers = np.array(image).astype(np.uint32)
-        # Rounded: 65535 is 255.
+        # Rounded, so that 65535 becomes 255.
         return Image.fromarray(((numbers + 128) // 257).astype(np.uint8))
     if image.mode not in _EIGHT_BITS:
-        raise OSError(f"its pixels are of the kind {image.mode!r}: give 8 or 16 bits a channel")
+        raise OSError(f"its pixels have the mode {image.mode!r}: use 8 or 16 bits per channel")
     return image
 
 
 def decode_mask(file: IO[bytes]) -> np.ndarray:
-    """Decode a mask as (H, W) uint8, 255 for what is modelled; files of 0 and 1 too.
+    """Decode a mask as (H, W) uint8, 255 for pixels to model; files of 0 and 1 work too.
 
-    Raises OSError for no image, or one with colours.
+    Raises OSError if the file is not an image, or has colours or transparency.
     """
     rgba = np.array(eight_bits(_decoded(file)).convert("RGBA"))
     grey = rgba[..., 0]
     if (rgba[..., 1:3] != rgba[..., :1]).any() or (rgba[..., 3] != 255).any():
-        raise OSError("it has colours or transparency: give a grey image, white on the object")
+        raise OSError("it has colours or transparency: use a grey image, white on the object")
     # Some tools write 0 and 1.
     return grey * np.uint8(255) if grey.max() == 1 else grey
 
@@ -191,7 +191,7 @@ def _decoded(file: IO[bytes]) -> Image.Image:
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Return _FORMATS, and HEIC where pillow-heif is installed."""
+    """Return _FORMATS, plus HEIC if pillow-heif is installed."""
     try:
         import_module("pillow_heif").register_heif_opener()
     except ImportError:
@@ -201,7 +201,7 @@ def _formats() -> tuple[str, ...]:
 
 @contextmanager
 def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
-    """Open an image of a format of photos, not yet decoded. Raises OSError, in the block too."""
+    """Open an image in a photo format without decoding it; raises OSError, also in the block."""
     try:
         with Image.open(file, formats=_formats()) as image:
             if image.width * image.height > _MOST_PIXELS:
@@ -209,11 +209,11 @@ def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
             yield image
     except UnidentifiedImageError as error:
         raise OSError(
-            "its header is none of a known image format; HEIC needs `pip install pillow-heif`"
+            "its header has no known image format; HEIC needs `pip install pillow-heif`"
         ) from error
     except (OSError, MemoryError):
         raise
-    # Decoders raise anything on damaged files.
+    # Decoders raise any kind of error for damaged files.
     except Exception as error:
         raise OSError(str(error) or type(error).__name__) from error
 

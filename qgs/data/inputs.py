@@ -1,8 +1,8 @@
 """Choice of input photos: photos that overlap, as far apart as in training.
 
-Distances are compared with the depth of what the photos show, from cameras alone or by matching
-photos. Source: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996), with planes
-parallel to each photo.
+Distances are divided by the depth of the scene, which comes from the cameras alone or from matching
+photos. Source of the matching: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996),
+with planes parallel to each photo.
 """
 
 import math
@@ -28,44 +28,45 @@ Window: TypeAlias = tuple[Frames, Frames]
 NOVEL = 6
 """Most views to compare with by default."""
 BASELINE = (0.06, 0.25)
-"""Range of baselines per depth where those of the training are unknown."""
+"""Range of baselines per depth if those of training are unknown."""
 TURN = 20.0
-"""Largest turn in degrees where that of the training is unknown."""
+"""Largest turn in degrees if that of training is unknown."""
 VARIED = 20.0
-"""Factor of a training's baselines above which they say nothing about the best one."""
+"""Factor between largest and least baseline of training above which its range is ignored."""
 
-# Time grows with the square of the number of frames that are considered.
+# Most frames to consider, because time grows with the square of their number.
 _MOST = 300
-# Frames around a target that its inputs are chosen from.
+# Number of frames around a target from which its inputs are chosen.
 _NEAR = 48
-# Points of a frustum, per side of the image.
+# Points of a frustum along each side of the image.
 _POINTS = 6
-# Least share of a compared photo that the inputs see.
+# Least part of a compared photo that the inputs must see.
 _SEEN = 0.7
-# Photos that are swept, and the ranks by distance of those that each is matched with.
+# Number of photos to sweep, and the ranks by distance of the photos matched with each.
 _PHOTOS = 4
 _OTHERS = (0, 1, 4)
 # Planes at depths from 1/64 to 4 times the extent of the cameras.
 _PLANES = 28
-# Degrees between the axes of matched photos, at most.
+# Largest angle between the axes of matched photos, in degrees.
 _MATCHED_TURN = 20.0
-# Cosine to the axis from which on a motion counts as forward: it shows no depth.
+# A motion whose cosine to the axis is larger counts as forward, which shows no depth.
 _ALONG = 0.8
-# Truncation of a difference of colours, against occlusions.
+# Largest difference of colours that counts, against occlusions.
 _MOST_COST = 0.3
-# A depth counts where its cost is this far below the median: walls of one colour do not.
+# A depth counts if its cost is this far below the median, which excludes walls of one colour.
 _MARGIN = 0.03
 
 
 def ranked_windows(
     frusta: "Frusta", inputs: int, held_out: Sequence[int] | None = None
 ) -> list[tuple[float, Frames, int]]:
-    """Return cost, `inputs` input frames and compared frame of windows of a scene, the best first.
+    """Return (cost, input frames, compared frame) for each window of a scene, the best first.
 
-    A window is made for each photo to compare with, a held-out one where there are: of the photos
-    near it those that together see most of it, overlap, and stand as far apart as in training. None
-    where all photos are inputs. Deterministic; the order of the frames does not matter. held_out:
-    by default the scene's. ValueError for fewer photos than inputs.
+    Each photo to compare with gets one window; these are the held-out photos if there are any. Its
+    `inputs` photos are near it, see most of it together, overlap, and are as far apart as in
+    training. The list is empty if all photos are inputs. The result is deterministic and does not
+    depend on the order of the frames. held_out: default is the scene's. Raises ValueError if there
+    are fewer photos than inputs.
     """
     scene = frusta.scene
     held = sorted(scene.held_out if held_out is None else held_out)
@@ -74,7 +75,7 @@ def ranked_windows(
         besides = f" beside {len(held)} held-out ones" if held else ""
         raise ValueError(
             f"there are {len(usable)} photos{besides}, too few for {inputs} input views: add "
-            "photos, take fewer inputs, or hold no photos out"
+            "photos, use fewer inputs, or hold out no photos"
         )
     targets = held or (usable if len(usable) > inputs else [])
     usable = evenly(usable, _MOST)
@@ -82,19 +83,22 @@ def ranked_windows(
 
 
 def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
-    """Return least and most baseline per depth, and the largest turn in degrees, of training."""
+    """Return training's least and largest baseline per depth, and its largest turn in degrees."""
     ranges = trained_on.ranges
     least, most = ranges.get("baseline", (0.0, math.inf))
     if most > VARIED * least:
         return *BASELINE, TURN
     near, far = ranges.get("depth", (1.0, 1.0))
-    # Parallel axes meet at infinity; what they show has a depth of the order of the nearest.
+    # Parallel axes meet at infinity, but the scene's depth is of the order of the nearest one.
     depth = math.sqrt(near * min(far, 3 * near)) if math.isfinite(near) else 1.0
     return least / depth, most / depth, ranges.get("turn", (0.0, TURN))[1]
 
 
 class Frusta:
-    """Cameras in units of a depth, by default `scene_depth`; what each sees of others' views."""
+    """Cameras of a scene in units of a depth, and the overlap of their views.
+
+    depth: default is `scene_depth`.
+    """
 
     def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:
         self.scene = scene
@@ -107,11 +111,11 @@ class Frusta:
         self.low, self.high, self.most_turn = trained_ratios(trained_on)
         self.apart = np.linalg.norm(self.centres[:, None] - self.centres, axis=-1)
         self.turns = np.degrees(np.arccos((axes @ axes.T).clip(-1, 1)))
-        # A turn by the trained largest one counts as the largest distance does.
+        # The largest turn of training counts as much as its largest distance.
         self.far = self.apart / self.high + self.turns / max(self.most_turn, 1.0)
 
     def seen(self, frame: int, others: Sequence[int]) -> np.ndarray:
-        """Tell which points of a frame's view at depth 1 others see, (points, others)."""
+        """Return which points of a frame's view at depth 1 the others see, (points, others)."""
         height, width = self.cameras.size
         own = self.cameras[frame]
         scale = own.intrinsics.new_tensor([_POINTS / width, _POINTS / height] * 2)
@@ -119,29 +123,29 @@ class Frusta:
         points = rays @ own.c2w[:3, :3].T + own.c2w[:3, 3]
         cameras = self.cameras[None, list(others)]
         local = to_camera(points, cameras)[0]
-        # NaN compares as not seen.
+        # Comparisons with NaN are false, so the point counts as not seen.
         local[local[..., 2] <= 1e-6] = torch.nan
         pixels = to_pixels(local, cameras.intrinsics[0])
         inside = (pixels >= 0) & (pixels <= pixels.new_tensor([width, height]))
         return inside.all(-1).T.numpy()
 
     def window(self, target: int, usable: Sequence[int], inputs: int) -> tuple[float, Frames]:
-        """Return cost and frames of the best `inputs` of `usable` for a target.
+        """Return the cost and the frames of the best `inputs` of `usable` for a target.
 
-        Weights are those of a regression of novel-view PSNR on 580 windows of three scenes, in
+        The weights come from a regression of novel-view PSNR on 580 windows of three scenes, in
         units of 2 dB.
         """
         near = self._near(target, usable)
         seen = self.seen(target, near)
         frames = np.array(near)
-        # Pairs of inputs, the ends of the window; one input is both.
+        # Pairs of inputs are the ends of a window; a single input is both ends.
         first = np.arange(len(near))
         second = first
         if inputs > 1:
             first, second = np.triu_indices(len(near), 1)
         a = frames[first]
         b = frames[second]
-        # A photo that is almost one of the inputs compares little.
+        # Comparing with a photo that is almost an input says little.
         close = np.minimum(self.apart[target, a], self.apart[target, b])
         cost = 4 * (1 - (seen[:, first] | seen[:, second]).mean(0)) + _excess(self.high / 2, close)
         cost += self._beside(target, a, b) / self.high
@@ -155,13 +159,13 @@ class Frusta:
         return float(cost[best]), self._filled(start, end, near, inputs)
 
     def _near(self, target: int, usable: Sequence[int]) -> list[int]:
-        """Return _NEAR frames around a target: evenly spaced ones of a slow video, else nearest."""
+        """Return _NEAR frames around a target: the nearest, or evenly spaced in a slow video."""
         others = sorted((f for f in usable if f != target), key=lambda f: self.far[target, f])
         inside = [f for f in others if self.apart[target, f] <= 2 * self.high]
         return evenly(inside, _NEAR) if len(inside) > _NEAR else others[:_NEAR]
 
     def _beside(self, frame: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the distance of a camera from the lines between cameras a and b, (n,)."""
+        """Return the distances (n,) of a camera from the segments between cameras a and b."""
         start = self.centres[frame] - self.centres[a]
         way = self.centres[b] - self.centres[a]
         along = (start * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-12)
@@ -179,9 +183,10 @@ class Frusta:
         return (*chosen, last)
 
     def compared(self, window: Frames, target: int | None = None) -> Frames:
-        """Return the target and the frames nearest to it, or to the inputs, that the inputs see.
+        """Return frames to compare with: the target and the nearest frames that the inputs see.
 
-        At most NOVEL; held-out ones where there are.
+        Without a target, the frames nearest to the inputs. At most NOVEL frames, and only held-out
+        ones besides the target if there are any.
         """
         inputs = list(window)
         first = [] if target is None else [target]
@@ -198,15 +203,16 @@ class Frusta:
 
 
 def _excess(value: np.ndarray | float, limit: np.ndarray | float) -> np.ndarray:
-    """Return the logarithm of the factor by which a value exceeds its limit; 0 below."""
+    """Return the logarithm of value / limit; 0 if the value is below its limit."""
     return np.log(np.maximum(value / np.maximum(limit, 1e-9), 1))
 
 
 def scene_depth(scene: Scene) -> float:
-    """Return the depth of what the cameras of `scene` see, in the scene's unit; above 0.
+    """Return the depth of the scene in front of its cameras, in the scene's unit; above 0.
 
-    It is that of the point that all cameras look at (`look_at_depth`), else the median of a plane
-    sweep over some photos, else the largest distance of the cameras. Deterministic.
+    The first of these that exists: the depth of the point that all cameras look at
+    (`look_at_depth`), the median of a plane sweep over some photos, the largest distance of the
+    cameras, 1. Deterministic.
     """
     c2w = scene.cameras.c2w.double()
     extent = float(largest_distance(c2w))
@@ -220,7 +226,7 @@ def scene_depth(scene: Scene) -> float:
 
 
 def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
-    """Return depths (n,) of those pixels of a photo for which one of the planes is clearly best."""
+    """Return the depths (n,) of pixels of a photo for which one of the planes is clearly best."""
     others = _matched(scene, frame, extent)
     if not others:
         return planes[:0]
@@ -238,7 +244,7 @@ def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
         grid = grid.nan_to_num(9.0).float().reshape(*points_DHW3.shape[:3], 2)
         shown = F.grid_sample(image.expand(len(planes), -1, -1, -1), grid, align_corners=False)
         cost = (shown - photo).abs().mean(1, keepdim=True).clamp(max=_MOST_COST)
-        # What another photo does not show speaks neither for a depth nor against it.
+        # Points outside another photo count neither for a depth nor against it.
         cost = cost.where((grid.abs() <= 1).all(-1)[:, None], torch.nan)
         costs.append(F.avg_pool2d(cost, 5, 1, 2, count_include_pad=False)[:, 0])
     total = torch.stack(costs).nanmean(0)
@@ -247,7 +253,7 @@ def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
 
 
 def _matched(scene: Scene, frame: int, extent: float) -> list[int]:
-    """Return frames to match a photo with: near, turned little, and not ahead or behind."""
+    """Return frames to match a photo with: near, little turned, and neither ahead nor behind."""
     c2w = scene.cameras.c2w.double()
     axes = c2w[:, :3, 2]
     ways = c2w[:, :3, 3] - c2w[frame, :3, 3]

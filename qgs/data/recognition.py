@@ -1,4 +1,4 @@
-"""Choice of the source that opens a path, also for a trained model."""
+"""Choice of the source that opens a path, and opening of data for a trained model."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,15 +12,15 @@ from qgs.wording import one_line, warn_once
 
 
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
-    """Return PLUGIN/NAME of the first of `sources` that recognises `path`, else qgs/photos.
+    """Return PLUGIN/NAME of the first source that recognises `path`; otherwise qgs/photos.
 
-    A warning names all if several do. Raises FileNotFoundError when `path` does not exist.
+    If several do, a warning names all. Raises FileNotFoundError if `path` does not exist.
     """
     if not path.exists():
         raise FileNotFoundError(
             f"{path} (from {UPath.cwd()}) does not exist: give the folder of a data set"
         )
-    # Plugins first: photos lie in many a layout that only a plugin reads in full.
+    # Plug-ins come first: many layouts hold photos, but only a plug-in reads all of the layout.
     asked = sorted(sources, key=lambda kind: kind.startswith("qgs/"))
     found: list[str] = []
     for kind in asked:
@@ -28,15 +28,15 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
         try:
             if source.recognises(path):
                 found.append(kind)
-        # One of a plugin must not hinder the others.
+        # A failing plug-in must not stop the others.
         except Exception as error:
-            warn_once(f"{kind} is not asked whether it reads {path}: it raises {one_line(error)}")
+            warn_once(f"{kind} cannot tell whether it reads {path}: {one_line(error)}")
     if len(found) > 1:
         warn_once(
             f"{path} looks like data of {' and of '.join(found)}, and is read as {found[0]}; to "
-            "choose another, name it as `data.type` of a recipe"
+            "choose another one, set `data.type` in a recipe"
         )
-    # The errors of photos say best what a folder lacks.
+    # The errors of `qgs/photos` explain best what a folder lacks.
     return found[0] if found else "qgs/photos"
 
 
@@ -55,11 +55,12 @@ def open_for(
     trained: SceneSourceConfig | None,
     sources: Mapping[str, type[Component]],
 ) -> tuple[SceneSource, bool]:
-    """Open the data at `path`; return too whether a model with data `trained` was trained on it.
+    """Open the data at `path`; also return whether a model with data `trained` was trained on it.
 
-    Then it has the same options, held-out frames included; else it is opened as `recognised`, and
-    photos without cameras get some (`with_cameras`).
-    image_size: (H, W), by default that of `trained`. Raises as `recognised` and the source do.
+    Data of the training opens with the same options, including held-out frames. Other data opens
+    with the source from `recognised`, and `with_cameras` adds cameras to photos without them.
+    image_size: (H, W); default is that of `trained`. Raises the errors of `recognised` and of the
+    source.
     """
     size = image_size or (trained or SceneSourceConfig()).image_size
     source: Any

@@ -1,8 +1,8 @@
 """Samples of scenes as a model sees them: views, coordinates, mirroring.
 
 Source: TokenGS release (pose normalisation, mirroring).
-Everything here is a pure function of its arguments and of the random generator it is given.
-Images are moved by NumPy, on one thread: torch's would wait for cores that training holds.
+Everything here is a pure function of its arguments, including the random generator. NumPy copies
+the images on one thread, because threads of torch would wait for cores that training uses.
 """
 
 import math
@@ -33,8 +33,8 @@ from qgs.wording import listed, numbered, warn_once
 class Sample:
     """Input and target Views (1, V) of one scene, in the frame of the inputs.
 
-    world: of the frame, reference pose (4, 4) and scale, as of `own_world`. names: of frames that
-    are known by more than their number, such as by a file.
+    world: reference pose (4, 4) and scale of that frame, from `own_world`. names: names of frames
+    that have one besides their number, such as a file.
     """
 
     scene: str
@@ -52,7 +52,10 @@ class Sample:
 
 @dataclass(frozen=True)
 class Batch:
-    """B samples: inputs (B, V_in) and targets (B, V_out), float32, contiguous; what they show."""
+    """Batch of B samples: inputs (B, V_in), targets (B, V_out), their scenes and frames.
+
+    Tensors are float32 and contiguous.
+    """
 
     inputs: Views
     targets: Views
@@ -72,10 +75,11 @@ def make_sample(
     noise: np.random.Generator | None = None,
     depths: bool = False,
 ) -> Sample:
-    """Decode frames, normalise poses in the scene's precision, mirror if asked; float32.
+    """Decode frames, normalise their poses, and mirror them if asked; returns float32.
 
-    noise: draws `views.pose_noise`, if given. depths: whether views have depth maps where the scene
-    has them; 0 in views whose pose is noisy, which the surface was not seen from.
+    Poses are normalised in the scene's precision. noise: generator for `views.pose_noise`; None
+    adds no noise. depths: read depth maps if the scene has them; they are 0 in views with noisy
+    poses, because the noisy camera did not see that surface.
     """
     world = own_world(scene, input_frames, views)
     both = views_in(world, scene, (*input_frames, *target_frames), depths)
@@ -84,7 +88,7 @@ def make_sample(
         both = replace(both, target_time=_asked(both.times, count))
     if noise is not None and views.pose_noise:
         both = replace(both, cameras=with_noise(both.cameras, count, views, noise))
-        # The first camera is exact, and with it its depth map.
+        # The first camera is exact, so its depth map is valid.
         if both.depths is not None:
             both.depths[:, 1:count] = 0
     both = mirrored_views(both) if mirror else both
@@ -101,7 +105,10 @@ def make_sample(
 
 
 def _asked(times: Tensor, inputs: int) -> Tensor | None:
-    """Return the time (1, 1) of targets, or the inputs' median, of all (1, V); None for several."""
+    """Return the time (1, 1) of the targets, or the median of the inputs without targets.
+
+    times: of inputs and targets, (1, V). None if the targets have several times.
+    """
     asked = times[:, inputs:].unique() if times.shape[1] > inputs else times.median()
     return asked.reshape(1, 1) if asked.numel() == 1 else None
 
@@ -109,19 +116,20 @@ def _asked(times: Tensor, inputs: int) -> Tensor | None:
 def with_noise(
     cameras: Cameras, inputs: int, views: ViewsConfig, rng: np.random.Generator
 ) -> Cameras:
-    """Return cameras (1, F) with `ViewsConfig.pose_noise` on the inputs.
+    """Return cameras (1, F) with noise on the poses of all inputs but the first.
 
-    The inputs are the first `inputs` cameras. The first of them stays exact.
+    The first `inputs` cameras are the inputs. They turn and move by `ViewsConfig.pose_noise`. If it
+    is 0, no random numbers are drawn.
     """
     if not views.pose_noise:
         return cameras
     c2w = cameras.c2w[0, :inputs]
     angle = math.radians(views.pose_noise)
     turns, moves = torch.from_numpy(rng.normal(0, angle, (2, inputs, 3))).to(c2w)
-    # The matrix of the cross product with a turn; its exponential is the rotation.
+    # The exponential of the cross product's matrix is the rotation.
     cross = torch.linalg.cross(turns[:, None], torch.eye(3).to(c2w)[None]).mT
     distances = (c2w[:, :3, 3] - c2w[0, :3, 3]).norm(dim=-1, keepdim=True)
-    # The first pose sets the world and stays exact; farther cameras are off by more.
+    # The first pose sets the world and stays exact; noise grows with the distance from it.
     off = cameras.c2w.clone()
     off[0, 1:inputs, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
     off[0, 1:inputs, :3, 3] += (moves * distances)[1:]
@@ -131,7 +139,7 @@ def with_noise(
 def views_in(
     world: tuple[Tensor, Tensor], scene: Scene, frames: Frames, depths: bool = False
 ) -> Views:
-    """Read views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1."""
+    """Read float32 views (1, F) of these frames in a world of `own_world`; times are 0 to 1."""
     refuse_too_many(len(frames), scene)
     wanted = list(frames)
     masks = scene.masks(wanted)
@@ -142,22 +150,22 @@ def views_in(
         cameras=cameras_in(world, scene, frames),
         masks=None if masks is None else masks[None],
         times=None if times is None else times[None].float(),
-        # The z of cameras scales with their translations.
+        # Depths scale with the translations of cameras.
         depths=None if surface is None else (surface * world[1].float())[None],
     )
 
 
 def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Cameras:
-    """Return cameras (1, F) of these frames in a world as of `own_world`; decodes no image."""
+    """Return cameras (1, F) of these frames in a world of `own_world`; decodes no image."""
     reference, scale = world
     cameras = scene.cameras[list(frames)]
-    # float32 only now: coordinates of maps have seven digits before the point.
+    # float32 only now, because map coordinates have seven digits before the point.
     c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
     return Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size)
 
 
 def from_0_to_1(times: Tensor) -> Tensor:
-    """Return times (F,) as parts of the way from first to last (TokenGS 2026.6); 0 for equal."""
+    """Return times (F,) scaled to [0, 1] (TokenGS 2026.6); 0 if all are equal."""
     first, last = times.aminmax()
     return (times - first) / (last - first) if last > first else torch.zeros_like(times)
 
@@ -165,18 +173,18 @@ def from_0_to_1(times: Tensor) -> Tensor:
 def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[Tensor, Tensor]:
     """Return the world in which a model sees these inputs of `scene`: reference pose and scale.
 
-    A point p of it is, in the scene's world, the reference (4, 4) applied to p / scale (0-d).
-    `scale: auto` brings what all cameras of the scene look at to depth 1; where that is nothing in
-    common (see `look_at_depth`), it warns, and the largest distance from the first one becomes 1.
-    Raises ValueError where a scale is asked of cameras that stand on one point, and for `search`,
-    which needs a model.
+    A point p of this world is at reference (4, 4) applied to p / scale (0-d) in the scene's world.
+    `scale: auto` puts the point that all cameras of the scene look at to depth 1. Without such a
+    point (see `look_at_depth`) it warns, and makes the largest distance from the first camera 1.
+    Raises ValueError if a scale is needed but the cameras are at one point, and for `search`, which
+    needs a model.
     """
     if views.scale == "search":
         raise ValueError(
-            "views.scale: search finds the scale at which a trained model renders photos best, so "
-            "it is for photos of a user alone; write auto, distance or constant"
+            "views.scale: search needs a trained model, so it works only for a user's own photos; "
+            "write auto, distance or constant"
         )
-    # Of all cameras: the scale of a scene does not depend on which inputs are drawn.
+    # From all cameras, so that a scene's scale does not depend on the drawn inputs.
     every = scene.cameras.c2w
     c2w = every[list(input_frames)]
     reference = reference_pose(views.frame, c2w)
@@ -190,21 +198,21 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
     if not distance > 0:
         which = "all" if auto else "the input"
         raise ValueError(
-            f"views.scale is {views.scale!r}, but {which} cameras of scene {scene.name!r} stand on "
-            "one point: use `scale: constant`, or photos that were taken from several places"
+            f"views.scale is {views.scale!r}, but {which} cameras of scene {scene.name!r} are at "
+            "one point: use `scale: constant`, or photos from several places"
         )
     if not auto:
         return reference, factor / distance
     warn_once(
         f"the cameras of scene {scene.name!r} look at no common point, so views.scale: auto makes "
-        f"the largest distance from the first one 1, a factor of {1 / float(distance):.4g}; if "
-        "what they see comes out too near or too far, give `scale: constant` and a scale_factor"
+        f"the largest distance from the first camera 1, a factor of {1 / float(distance):.4g}; if "
+        "the scene is too near or too far, set `scale: constant` and a scale_factor"
     )
     return reference, 1 / distance
 
 
 def mirrored_views(views: Views) -> Views:
-    """Return the same scene in a mirror that flips x: images, poses and principal point."""
+    """Return the views mirrored in x: images, masks, depths, poses and principal point."""
     cameras = views.cameras
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
@@ -218,13 +226,13 @@ def _flipped(images: Tensor) -> Tensor:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Stack samples of equal view counts and image size; ValueError where only some have times."""
+    """Stack samples of equal view counts and image size; ValueError if only some have times."""
     # Models that read times need them in every sample of a batch.
     still = [sample.scene for sample in samples if sample.inputs.times is None]
     if 0 < len(still) < len(samples):
         raise ValueError(
-            f"scenes without times, {listed(still)}, are in a batch with others that have some: "
-            "write 'time' for the frames of all scenes, or of none"
+            f"a batch mixes scenes with times and scenes without ({listed(still)}): write 'time' "
+            "for the frames of all scenes, or of none"
         )
     return Batch(
         inputs=stack_views([sample.inputs for sample in samples]),
@@ -236,9 +244,9 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 
 def stack_views(views: Sequence[Views]) -> Views:
-    """Join views (b, V) to (B, V), on the CPU. Raises ValueError where only some have times.
+    """Join views (b, V) to (B, V), on the CPU. Raises ValueError if only some have times.
 
-    Masks of 1 and depths of 0 (unknown) where only others have some.
+    If only some have masks or depths, the others get masks of 1 and depths of 0 (unknown).
     """
     others: list[dict[str, Any]] = [
         {"cameras": v.cameras, "times": v.times, "target_time": v.target_time} for v in views
@@ -252,7 +260,7 @@ def stack_views(views: Sequence[Views]) -> Views:
 def _stacked(
     maps: Sequence[Tensor | None], views: Sequence[Views], missing: Callable[[Tensor], Tensor]
 ) -> Tensor | None:
-    """Join maps (b, V, 1, H, W), with `missing` ones in place of None; None for none at all."""
+    """Join maps (b, V, 1, H, W); `missing` replaces None. Return None if all are None."""
     if all(part is None for part in maps):
         return None
     whole = [

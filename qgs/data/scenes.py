@@ -11,7 +11,10 @@ Value = TypeVar("Value")
 
 
 class BoundedCache(Generic[Value]):
-    """LRU cache, safe for threads, empty after pickling. limit: of the values' summed `cost`."""
+    """Thread-safe LRU cache, empty after pickling.
+
+    limit: largest sum of the values' costs. cost: cost of a value; default is 1 each.
+    """
 
     def __init__(self, limit: int, cost: Callable[[Value], int] | None = None) -> None:
         self._limit = limit
@@ -20,22 +23,22 @@ class BoundedCache(Generic[Value]):
         self._total = 0
         self._lock = Lock()
 
-    # Copies in workers start empty: locks cannot be pickled, and images would be sent for nothing.
+    # Copies in workers start empty: locks cannot be pickled, and sending images would be wasteful.
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self._limit, self._cost)
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """Return the value kept for `key`, or what `make` returns, which is kept if it fits."""
+        """Return the value kept for `key`; otherwise call `make` and keep its value if it fits."""
         with self._lock:
             if key in self._kept:
                 # The front is the least recently used.
                 self._kept.move_to_end(key)
                 return self._kept[key][0]
-        # Made outside of the lock, so that threads decode side by side; two may make the same.
+        # Made outside of the lock, so that threads decode in parallel; two may make the same value.
         value = make()
         cost = self._cost(value) if self._cost else 1
         with self._lock:
-            # Another thread may have kept its own meanwhile.
+            # Another thread may have kept its own value in the meantime.
             if key not in self._kept:
                 self._kept[key] = (value, cost)
                 self._total += cost
@@ -45,7 +48,7 @@ class BoundedCache(Generic[Value]):
 
 
 class LazyScenes(Sequence[Scene]):
-    """Scenes of `places` by name, opened when indexed; 64 stay open."""
+    """Sequence of scenes, opened when indexed; at most 64 stay open. places: by scene name."""
 
     def __init__(self, places: Mapping[str, Any], open: Callable[[str, Any], Scene]) -> None:
         self.names = list(places)
@@ -59,14 +62,14 @@ class LazyScenes(Sequence[Scene]):
     def __getitem__(self, index: Any) -> Any:
         """Return the scene at an index, or the scenes at a slice."""
         name = self.names[index]
-        # Of a slice.
+        # The index is a slice.
         if isinstance(name, list):
             return [self[place] for place in range(len(self))[index]]
         return self._opened.get(name, lambda: self._open(name, self.places[name]))
 
 
 class LazySource(SceneSource):
-    """A source of `LazyScenes`. splits: both of them, set by `__init__`."""
+    """Source of `LazyScenes`. splits: scenes of both splits, which `__init__` must set."""
 
     splits: Mapping[Split, LazyScenes]
 

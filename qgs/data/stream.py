@@ -1,4 +1,4 @@
-"""Endless training batches by number: order of scenes, samples, processes that decode."""
+"""Endless numbered training batches: order of scenes, samples, decoding processes."""
 
 import atexit
 import hashlib
@@ -29,9 +29,9 @@ from qgs.types import Cameras
 from qgs.wording import one_line
 
 MEASURED = 512
-"""Samples whose cameras `trained_domain` measures."""
+"""Number of samples whose cameras `trained_domain` measures."""
 MAX_REPLACED = 10
-"""Most scenes that are tried instead of a failing one; after them training stops."""
+"""Most scenes to try in place of a failing one before training stops."""
 
 
 class SampleError(ValueError):
@@ -57,14 +57,15 @@ def training_batches(
     accumulate: int = 1,
     depths: bool = False,
 ) -> Generator[Batch, None, None]:
-    """Batches start, start + 1, ... of an endless sequence, of `batch_size` samples each.
+    """Return batches start, start + 1, ... of an endless sequence, `batch_size` samples each.
 
-    Sample k depends on (seed, k) alone. Global batch n is the samples from n * batch_size *
-    processes on; every process gets the slice of its `rank`. `start` resumes exactly, and
-    processes and workers change nothing. workers: processes that decode; 0 decodes in a thread.
-    Closing ends them. skips, sampler, depths: see `SampleStream`. accumulate: batches of an
-    optimiser step.
-    Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.
+    Sample k depends only on (seed, k). Global batch n has the samples from n * batch_size *
+    processes on, and every process gets the slice of its `rank`. `start` resumes exactly. The
+    numbers of processes and workers do not change the samples.
+
+    workers: number of decoding processes; 0 decodes in a thread. Closing the generator ends them.
+    skips, sampler, depths: see `SampleStream`. accumulate: batches per optimiser step.
+    Raises ValueError for no training scenes or too few frames, SampleError, and WorkerError.
     """
     every = batch_size * processes
     stream = SampleStream(source, views, seed, skips, sampler, every * accumulate, depths)
@@ -82,21 +83,21 @@ def trained_domain(
 ) -> Domain:
     """Measure the cameras of MEASURED training samples; no image is decoded.
 
-    The scenes are the first ones of the training, and the samples those of steps spread evenly
-    from 0 to `steps`, since the options of `sampler` may follow them. A scene that fails is left
-    out: training itself reports it.
+    The samples are the first ones of training, drawn as at steps spread evenly from 0 to `steps`,
+    because the options of `sampler` may depend on the step. A scene that fails is left out here;
+    training itself reports it.
     """
     stream = SampleStream(source, views, seed, sampler=sampler)
     domain = Domain()
     for number in range(MEASURED):
-        # A reader may raise anything.
+        # A reader may raise any kind of error.
         with suppress(Exception):
             domain.see(*stream.cameras(number, round(number / (MEASURED - 1) * steps)))
     return domain
 
 
 def scenes_fingerprint(source: SceneSource) -> str:
-    """Return a hash of the number of training scenes and of their groups."""
+    """Return a hash of the indices of training scenes in their groups."""
     digest = hashlib.sha256()
     for group in filter(len, source.groups("train")):
         digest.update(len(group).to_bytes(8, "little") + np.asarray(group, "<i8").tobytes())
@@ -105,16 +106,15 @@ def scenes_fingerprint(source: SceneSource) -> str:
 
 @dataclass(eq=False)
 class SampleStream(Dataset[Batch | Exception]):
-    """Samples by number, each a function of (seed, number) alone. Raises ValueError without scenes.
+    """Samples by number, each a function of (seed, number) alone.
 
-    A copy in a worker opens the data itself on first use.
-
-    Each epoch visits the groups (see `SceneSource.groups`) in a random order, and the scenes of
-    each at random.
+    Each epoch visits the groups (see `SceneSource.groups`) in random order, and the scenes of a
+    group in random order. A copy in a worker opens the data itself on first use. Raises ValueError
+    without training scenes.
 
     skips: replace a failing sample by one of the next scene, at most MAX_REPLACED times. sampler:
-    `Span` by default. per_step: samples of an optimiser step, by which the sampler knows the step
-    of a sample. depths: whether views have them, see `make_sample`.
+    default is `Span`. per_step: samples per optimiser step, which give the step of a sample to the
+    sampler. depths: read depth maps, see `make_sample`.
     """
 
     source: InitVar[SceneSource]
@@ -134,7 +134,7 @@ class SampleStream(Dataset[Batch | Exception]):
         self._groups = [np.asarray(group, np.int64) for group in source.groups("train")]
         self._orders: BoundedCache[np.ndarray] = BoundedCache(2)
 
-    # Open scenes hold files and caches, which cannot be sent to a worker.
+    # Open scenes hold files and caches that cannot be sent to a worker.
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "_scenes"}
 
@@ -150,12 +150,12 @@ class SampleStream(Dataset[Batch | Exception]):
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self.seed, 0, epoch])
         groups = [group for group in self._groups if len(group)]
-        # Groups in turn, such as files of scenes: each is opened once an epoch.
+        # One group after another: each, such as a file of scenes, is opened once per epoch.
         shuffled = rng.permutation(len(groups))
         return np.concatenate([rng.permutation(groups[index]) for index in shuffled])
 
     def batch(self, numbers: Sequence[int]) -> Batch:
-        """Make samples by number. Raises ValueError for too few frames, else SampleError."""
+        """Make samples by number; raises ValueError for too few frames, else SampleError."""
         left_out: list[str] = []
         batch = collate([self._sample(number, left_out) for number in numbers])
         return replace(batch, left_out=tuple(left_out))
@@ -165,7 +165,7 @@ class SampleStream(Dataset[Batch | Exception]):
         try:
             return self.batch(numbers)
         except Exception as error:
-            # Exceptions with arguments of their own cannot be pickled.
+            # Exceptions with extra arguments cannot be pickled.
             kind = MemoryError if is_out_of_memory(error) else SampleError
             failure = kind(str(error) or one_line(error))
             failure.add_note(f"In a process that decodes data:\n{traceback.format_exc()}")
@@ -181,11 +181,11 @@ class SampleStream(Dataset[Batch | Exception]):
                     raise
                 left_out.append(one_line(error))
         raise SampleError(
-            f"{MAX_REPLACED + 1} samples in a row cannot be made, the last: {left_out[-1]}"
+            f"{MAX_REPLACED + 1} samples in a row failed, the last one: {left_out[-1]}"
         )
 
     def cameras(self, number: int, step: int) -> tuple[Cameras, Cameras]:
-        """Draw the cameras (1, V) of inputs and targets as after `step` optimiser steps."""
+        """Return drawn cameras (1, V) of inputs and targets as after `step` optimiser steps."""
         rng = np.random.default_rng([self.seed, 1, number])
         scene = self._scene(number)
         _, inputs, targets = self._drawn(scene, rng, step)
@@ -197,13 +197,13 @@ class SampleStream(Dataset[Batch | Exception]):
     def _drawn(
         self, scene: Scene, rng: np.random.Generator, step: int
     ) -> tuple[bool, Frames, Frames]:
-        """Draw whether a sample is mirrored, and its input and target frames."""
+        """Return whether a sample is mirrored, and its input and target frames, at random."""
         mirror = bool(rng.random() < self.views.mirror)
         return mirror, *self._sampler.draw(scene, self.views, rng, step)
 
     def _sample_after(self, number: int, attempt: int) -> Sample:
         """Make sample `number`, or its replacement after `attempt` failures."""
-        # The first attempt draws from (seed, 1, number), whether others were replaced or not.
+        # The first attempt always draws from (seed, 1, number), also if other samples failed.
         key = [self.seed, 1, number]
         rng = np.random.default_rng([*key, attempt] if attempt else key)
         scene = self._scene(number + attempt)
@@ -223,7 +223,7 @@ def _from_thread(
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
         pending = pool.submit(stream.batch, next(numbers))
         for following in numbers:
-            # Taken before the next is begun: one thread reads, as files and caches expect.
+            # Taken before the next one starts: files and caches expect one reading thread.
             ready = pending.result()
             pending = pool.submit(stream.batch, following)
             yield ready
@@ -232,7 +232,7 @@ def _from_thread(
 def _from_workers(
     stream: SampleStream, numbers: Iterator[Sequence[int]], workers: int
 ) -> Generator[Batch, None, None]:
-    """Yield batches of these samples, of spawned processes: numba and torch survive no fork."""
+    """Yield batches of these samples from processes, spawned as numba and torch survive no fork."""
     loader = DataLoader(
         stream,
         batch_size=None,
@@ -240,47 +240,47 @@ def _from_workers(
         num_workers=workers,
         multiprocessing_context="spawn",
         worker_init_fn=_prepare_worker,
-        # Its own, so that no random number of the training is used up.
+        # A generator of its own, so that no random number of training is used up.
         generator=torch.Generator(),
     )
     handler = signal.getsignal(signal.SIGCHLD)
     made = iter(loader)
     if threading.current_thread() is threading.main_thread():
-        # torch's handler raises wherever training is when a worker dies. Asking for a batch raises
-        # too, within seconds, between two steps.
+        # When a worker dies, torch's handler raises at any point of training. Asking for a batch
+        # also raises within seconds, but between two steps.
         signal.signal(signal.SIGCHLD, handler)
     try:
         while True:
             try:
                 batch = next(made)
-            # Torch raises the first for a worker's sudden end, a broken connection the others.
+            # Torch raises RuntimeError when a worker dies; a broken connection raises the others.
             except (RuntimeError, OSError, EOFError) as error:
                 raise WorkerError(
-                    f"a process that decodes data ended suddenly ({error}): often the system was "
-                    "out of memory; lower training.workers, or views and image sizes"
+                    f"a process that decodes data ended suddenly ({error}), often because memory "
+                    "ran out: lower training.workers, or use fewer views or smaller images"
                 ) from error
             if isinstance(batch, Exception):
                 raise batch
             yield batch
     finally:
-        # The iterator of torch ends its workers when it goes.
+        # Torch's iterator ends its workers when it is deleted.
         del made
 
 
 def _prepare_worker(number: int) -> None:
-    """Ignore signals, which go to all processes of a job; the training process ends workers."""
+    """Ignore SIGINT and SIGTERM in a worker, because the training process ends its workers."""
     show_safely()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    # Python's own end aborts where the thread that sends batches is inside torch at that moment.
+    # Python's normal exit aborts if the thread that sends batches is inside torch.
     atexit.register(os._exit, 0)
 
 
 @dataclass
 class Feed:
-    """The batches of the next optimiser step, or the error that fetching them raised.
+    """Batches of the next optimiser step, or the error from fetching them.
 
-    Fetched during a step, `count` at a time, so that processes can agree on failures at its end.
+    `count` batches are fetched during a step, so that processes can agree on failures at its end.
     """
 
     stream: Iterator[Batch]
@@ -289,10 +289,10 @@ class Feed:
     error: Exception | None = None
 
     def fetch(self) -> None:
-        """Get the `count` batches of the next step; if that fails, set `error` instead."""
+        """Fetch the `count` batches of the next step; on failure store the error in `error`."""
         try:
             self.batches = list(islice(self.stream, self.count))
-        # Whoever reads `error` raises it, once all processes know.
+        # The trainer raises it when all processes know of it.
         except Exception as error:
             self.batches = ()
             self.error = error

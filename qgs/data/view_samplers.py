@@ -21,7 +21,10 @@ _T = TypeVar("_T")
 
 
 def held_out_frames(total: int, every: int) -> Frames:
-    """Return every n-th of `total` frames, from n // 2 on, or the middle one; none if n is 0."""
+    """Return every n-th frame, from n // 2 on, for n = `every`; with fewer frames, the middle one.
+
+    Empty if `every` is 0 or `total` is at most 2.
+    """
     every = min(every, total)
     return tuple(range(every // 2, total, every)) if every and total > 2 else ()
 
@@ -32,7 +35,10 @@ def training_frames(scene: Scene) -> list[int]:
 
 
 def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
-    """Group frames, by default those of training, by time; a static scene gives groups of one."""
+    """Group frames by time; a static scene gives groups of one.
+
+    frames: default is the frames of training.
+    """
     frames = training_frames(scene) if frames is None else frames
     if scene.times is None:
         return [(frame,) for frame in frames]
@@ -43,7 +49,7 @@ def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
 
 
 def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
-    """Return the least and largest gap that `count` `moments` allow. ValueError for too few."""
+    """Return the least and largest gap for `count` moments; raises ValueError for too few."""
     low, high = views.gap
     what = "frames" if scene.times is None else "times"
     if views.inputs - 1 > high:
@@ -64,17 +70,17 @@ def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
             f"[{low}, {high}] asks for: its gap is {count - 1}"
         )
     high = min(high, count - 1)
-    # Each input takes a frame of its own.
+    # Each input needs its own frame.
     return max(min(low, high), views.inputs - 1), high
 
 
 def refuse_too_many(frames: int, scene: Scene) -> None:
-    """Raise TooLargeError when that many images of `scene` do not fit into memory."""
+    """Raise TooLargeError if that many images of `scene` do not fit into memory."""
     height, width = scene.cameras.size
     refuse_more_than_memory(
         f"a sample of {frames} images of {height} x {width}",
         frames * 3 * height * width * torch.float32.itemsize,
-        "Ask for fewer views (views.inputs, views.targets) or smaller images (data.image_size).",
+        "Use fewer views (views.inputs, views.targets) or smaller images (data.image_size).",
     )
 
 
@@ -85,7 +91,7 @@ def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
 
 
 def evenly(items: Sequence[_T], count: int) -> list[_T]:
-    """Return at most `count` of `items`, evenly spaced from first to last; one: the middle."""
+    """Return at most `count` of `items`, evenly spaced from first to last; one is the middle."""
     last = len(items) - 1
     count = min(count, len(items))
     places = np.linspace(0, last, count) if count > 1 else np.full(count, last // 2)
@@ -98,12 +104,12 @@ def spread(span: Sequence[Frames], count: int) -> Frames:
 
 
 class Span(ViewSampler):
-    """Inputs at both ends of a random span and within it, targets from the span (TokenGS release).
+    """Sampler of inputs at both ends of a random span and in it, and targets from the span.
 
-    The span has min_gap to max_gap frames from its first to its last. Targets are no inputs, where
-    there are enough frames; then inputs join, then frames repeat. Where times are known, the span
-    is of times, each input is of another one and of another camera, as far as there are, and all
-    targets are of one (TokenGS 2026.6).
+    Source: TokenGS release. The last frame of the span is min_gap to max_gap frames after the
+    first. Targets are frames other than the inputs. If there are too few, inputs are added, and
+    then frames repeat. If times are known, the span counts times. Each input then has its own time,
+    and its own camera if there are enough. All targets have one time (TokenGS 2026.6).
     """
 
     name = "span"
@@ -111,9 +117,9 @@ class Span(ViewSampler):
 
     class Config(ComponentConfig):
         min_gap: int | None = Field(default=None, ge=1)
-        """Least gap; null for that of `views.gap`."""
+        """Least gap from the first to the last input, in frames. null uses `views.gap`."""
         max_gap: int | None = Field(default=None, ge=1)
-        """Largest gap; null for that of `views.gap`. A schedule lets it grow with training."""
+        """Largest gap, in frames. null uses `views.gap`. A schedule lets it grow with training."""
 
     config: Config
 
@@ -129,14 +135,14 @@ class Span(ViewSampler):
         """See `ViewSampler`."""
         options = self.options(step)
         high = options.max_gap or views.gap[1]
-        # A schedule may bring the largest gap below the least one of the recipe.
+        # A schedule may lower the largest gap below the least one of the recipe.
         low = min(options.min_gap or views.gap[0], high)
         views = views.model_copy(update={"gap": (low, high)})
         refuse_too_many(views.inputs + views.targets, scene)
         usable = moments(scene)
         low, high = gap_range(len(usable), views, scene)
         gap = int(rng.integers(low, high + 1))
-        # The order of draws is that of the release: another one would change all trainings.
+        # The draws follow the order of the release; another order would change all trainings.
         first = int(rng.integers(0, len(usable) - gap))
         span = usable[first : first + gap + 1]
         if views.inputs == 1:
@@ -145,14 +151,14 @@ class Span(ViewSampler):
             more = views.inputs - 2
             between = rng.choice(range(1, gap), more, replace=False) if more else ()
             places = [0, *sorted(map(int, between)), gap]
-        # Permuting one camera draws nothing: static scenes have the same numbers after it.
+        # Permuting one camera draws no random number, so static scenes are unaffected.
         cameras = rng.permutation(max(map(len, span))).tolist()
         inputs = one_of_each([span[place] for place in places], cameras)
         pool = [frame for moment in span for frame in moment]
         if scene.times is not None:
             novel = [moment for moment in span if {*moment} - {*inputs}] or span
             pool = novel[rng.integers(len(novel))]
-        # New views first, then inputs, then repetitions, so that short scenes can be used too.
+        # New views come first, then inputs, then repetitions, so that short scenes work too.
         targets = [*rng.permutation([frame for frame in pool if frame not in inputs])]
         targets += [*rng.permutation([frame for frame in inputs if frame in pool])]
         targets += list(rng.choice(pool, max(views.targets - len(targets), 0)))

@@ -1,4 +1,4 @@
-"""`qgs/photos`: a folder of photos with their cameras, or a folder of such folders."""
+"""Source `qgs/photos`: a folder of photos with their cameras, or a folder of such folders."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -40,25 +40,26 @@ from qgs.wording import listed, warn_once
 _CACHED = 512 * 2**20
 """Bytes of decoded images that a split keeps."""
 _TURNS = {3: 2, 6: 1, 8: 3}
-"""EXIF orientation to quarter turns clockwise; the others mirror, which no camera does."""
+"""Clockwise quarter turns by EXIF orientation. The others mirror, which no camera does."""
 _QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""Axes of a camera turned clockwise, in those of the camera before: its x was -y, its y was x."""
+"""Axes of a camera turned clockwise, in its axes before: the new x was -y, the new y was x."""
 
 
 class PhotosConfig(SceneSource.Config):
     """Options of `qgs/photos`."""
 
     path: str
-    """Folder of one scene, of folders of scenes, or with such folders in train and test: absolute,
-    relative to the working directory, or an fsspec URL. Photos without cameras and videos need
-    `qgs poses` first."""
+    """Folder of one scene, folder of scenes, or folder with scenes in train and test. It may be
+    absolute, relative to the working directory, or an fsspec URL. For videos and photos without
+    cameras, run `qgs poses` first."""
     format: str = "auto"
     """Format of the camera listing: nerfstudio, or a format of a plug-in, such as colmap. auto uses
     the first format that the folder has."""
     images: str | None = None
     """Folder of photos to read, such as images_4. null reads the listed photos."""
     outside: bool = False
-    """Read photos outside of the folder too, by absolute paths or `..`; links are followed."""
+    """Also read photos outside of the folder, by absolute paths or `..`. Links are always
+    followed."""
     holdout: int = Field(default=8, ge=0)
     """Hold out every n-th frame for evaluation, from frame n // 2 on; with fewer frames, the middle
     one. 0 holds out none. A split in the listing replaces this."""
@@ -67,7 +68,7 @@ class PhotosConfig(SceneSource.Config):
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1] behind transparent pixels."""
     depth_unit: float = Field(default=1e-3, gt=0)
-    """World units per number of a depth map; nerfstudio writes millimetres (0.001)."""
+    """World units per number in a depth map. The default reads millimetres, as of nerfstudio."""
 
     @field_validator("format")
     @classmethod
@@ -79,7 +80,10 @@ class PhotosConfig(SceneSource.Config):
 
 
 class PhotoScene(Scene):
-    """A listing's photos, in its world and order. cache: shared. Raises as `present_frames`."""
+    """Scene of a listing's photos, in the listing's world and order.
+
+    cache: decoded images, shared by scenes. Raises the errors of `present_frames`.
+    """
 
     def __init__(
         self, name: str, folder: UPath, config: PhotosConfig, cache: BoundedCache[np.ndarray]
@@ -92,7 +96,7 @@ class PhotoScene(Scene):
         self.photos = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
-        # What a listing says of its splits goes before the option.
+        # Splits in a listing override the option.
         if any(frame.split for frame in frames):
             self.held_out = tuple(i for i, frame in enumerate(frames) if frame.split == "test")
         else:
@@ -103,9 +107,9 @@ class PhotoScene(Scene):
 
     @cached_property
     def cameras(self) -> Cameras:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """See `Scene`; float64. Raises ValueError where a photo and its listed size disagree.
+        """See `Scene`; float64. Raises ValueError if a photo and its listed size disagree.
 
-        The header of one photo stands for those of its folder that are listed with the same size.
+        Only one header is read for all photos of a folder with the same listed size.
         """
         sizes: dict[object, Size] = {}
         intrinsics: list[Tensor] = []
@@ -123,14 +127,14 @@ class PhotoScene(Scene):
         return to_tensor(self._stacked(self._image, frames))
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`; 1 everywhere for a photo without a mask in a scene that has some."""
+        """See `Scene`; photos without a mask get 1 everywhere if other photos have masks."""
         if all(frame.mask is None for frame in self.photos):
             return None
         masks = self._stacked(self._mask, frames)
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`; 0 in frames without a map. None where none of `frames` has one."""
+        """See `Scene`; 0 in frames without a depth map, and None if none of `frames` has one."""
         if all(self.photos[i].depth is None for i in frames):
             return None
         return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
@@ -147,7 +151,7 @@ class PhotoScene(Scene):
     def _stacked(
         self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
     ) -> np.ndarray:
-        """Return (F, H, W, ...) of what `read` makes of the frames, or made before."""
+        """Return the results of `read` for the frames, (F, H, W, ...), from the cache if there."""
 
         def cached(frame: int) -> np.ndarray:
             key = (self.name, read.__name__, frame)
@@ -156,7 +160,7 @@ class PhotoScene(Scene):
         paths = [self.photos[frame].path for frame in frames]
         if all(is_local(path) or path.protocol == "zip" for path in paths):
             return np.stack([*map(cached, frames)])
-        # A store answers slowly, but several requests at a time.
+        # An object store answers slowly, but takes several requests at a time.
         with ThreadPoolExecutor(8) as pool:
             return np.stack([*pool.map(cached, frames)])
 
@@ -180,7 +184,7 @@ class PhotoScene(Scene):
     def _delivered(
         self, image: Image.Image, frame: PhotoFrame, file: UPath, nearest: bool = False
     ) -> np.ndarray:
-        """Return the content of `file`, upright without distortion, at the delivered size."""
+        """Return the content of `file`, upright and undistorted, at `image_size`."""
         # A mask or depth map follows the photo.
         if file != frame.path and frame.size is None:
             frame = replace(frame, size=read_image(frame.path, image_size))
@@ -189,12 +193,12 @@ class PhotoScene(Scene):
         if frame.lens is not None:
             pixels = frame.lens.undistorted(np.array(image), frame.at_size(size), nearest)
             image = Image.fromarray(pixels)
-        # A mean of depths at an edge would be a surface that is not there.
+        # Averaging depths at an edge would create a surface that does not exist.
         kernel = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
         return self._crop(frame, size).image(image, kernel)
 
     def _crop(self, frame: PhotoFrame, size: Size) -> CropResize:
-        """Return the crop of a photo of `size` without what the lens did not see."""
+        """Return the crop of a photo of `size`, without the parts that the lens did not see."""
         target = self.config.image_size
         lens = frame.lens
         zoom = 1.0 if lens is None else lens.whole_zoom(frame.at_size(size), size, target)
@@ -202,14 +206,14 @@ class PhotoScene(Scene):
 
 
 def whole_mask(frame: PhotoFrame) -> Image.Image:
-    """Return the mask of a photo that has one, as it is stored. Raises ValueError."""
+    """Return the mask of a photo that has one, as stored; raises ValueError if unreadable."""
     assert frame.mask is not None
     decode = decode_alpha if frame.mask == frame.path else decode_mask
     return Image.fromarray(read_image(frame.mask, decode))
 
 
 def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
-    """Return (H, W) of a frame's `file`, upright; ValueError where the listing says otherwise."""
+    """Return upright (H, W) of a frame's `file`; ValueError if the listing has another size."""
     size = turned_size(size, frame)
     for problem in size_problems(size, frame.size):
         raise ValueError(f"{file}: {problem}")
@@ -217,10 +221,11 @@ def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
 
 
 class PhotosSource(LazySource):
-    """Photos of one scene or of many; both splits are the same scenes, with held-out frames.
+    """Source of photos of one or many scenes; both splits have the same scenes.
 
-    Only where the folder has scenes in `train` and `test`, the splits are those. A single scene is
-    opened at once; of many, each is when it is asked for. Raises as `present_frames`.
+    Held-out frames separate the splits. If the folder has scenes in `train` and in `test`, these
+    are the splits instead. A single scene is opened immediately; many scenes are opened on demand.
+    Raises the errors of `present_frames`.
     """
 
     name = "photos"
@@ -248,20 +253,20 @@ class PhotosSource(LazySource):
         both = scenes(folders)
         self.splits = {"train": both, "test": both}
         if len(both) == 1:
-            # Raises at once what is wrong.
+            # Raises errors now, before training starts.
             _ = both[0].cameras
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
         """Return whether the folder lists cameras.
 
-        Any other folder, of scenes too, is opened as photos for want of another source.
+        Other folders, such as a folder of scenes, open as photos if no other source reads them.
         """
         return bool(formats_of(path))
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
-        """See `SceneSource`: also a scene in a folder of scenes, or in its train."""
+        """See `SceneSource`: also True for a scene in a folder of scenes, or in its `train`."""
         inside = path in (root / path.name, root / "train" / path.name)
         return path == root or (inside and bool(formats_of(path)))
 
@@ -275,7 +280,7 @@ class PhotosSource(LazySource):
 
 
 def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
-    """Return the folders in `root` that hold a scene in the wanted format, by name."""
+    """Return the folders in `root` with a scene in the wanted format, by name."""
     wanted: dict[str, UPath] = {}
     others: list[str] = []
     for folder in sorted(filter(UPath.is_dir, listing(root)), key=lambda item: item.name):
@@ -286,8 +291,8 @@ def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
             others.append(folder.name)
     if wanted and others:
         warn_once(
-            f"{len(others)} of {len(wanted) + len(others)} folders in {root} hold no photos with "
-            f"cameras and are left out: {listed(others)}"
+            f"{len(others)} of {len(wanted) + len(others)} folders in {root} are left out, because "
+            f"they have no photos with cameras: {listed(others)}"
         )
     return wanted
 
@@ -298,12 +303,13 @@ def folder_name(folder: UPath) -> str:
 
 
 def upright(frame: PhotoFrame) -> PhotoFrame:
-    """Return `frame` as EXIF turns its photo, camera and lens included; of a store as it is.
+    """Return `frame` turned upright by EXIF, with its camera and lens.
 
-    Where the listed size is the upright one, so are the listed cameras; where size does not tell,
-    as of squares and half turns, they are those of the stored pixels.
+    If the listed size is the upright one, the listed camera is upright too. If the size cannot
+    tell, as for squares and half turns, the camera belongs to the stored pixels. Frames of an
+    object store stay as they are.
     """
-    # Of a store each header would be a request.
+    # In an object store, each header would be a request.
     if not is_local(frame.path) or not frame.path.is_file():
         return frame
     size, turns = _header(str(frame.path), frame.path.stat().st_mtime_ns)
@@ -321,12 +327,12 @@ def upright(frame: PhotoFrame) -> PhotoFrame:
 
 
 def turned_size(size: Size, frame: PhotoFrame) -> Size:
-    """Return (H, W) of a stored photo of `frame`, its mask or depth map, when it is upright."""
+    """Return upright (H, W) of a file of `frame` with stored `size`: photo, mask or depth map."""
     return _swapped(size) if _quarters(size, frame) % 2 else size
 
 
 def turned(image: Image.Image, frame: PhotoFrame) -> Image.Image:
-    """Return the stored photo, mask or depth map, upright; one that was drawn upright stays."""
+    """Return a photo, mask or depth map turned upright; one that is upright stays as it is."""
     quarters = _quarters((image.height, image.width), frame)
     # Pixels are moved, not interpolated; the angle is counterclockwise.
     return image.rotate(-90 * quarters, expand=True) if quarters else image
@@ -337,14 +343,14 @@ def _swapped(size: Size) -> Size:
 
 
 def _quarters(size: Size, frame: PhotoFrame) -> int:
-    """Return the turns of a file of `size` (H, W); 0 where the listing says that it is upright."""
+    """Return the turns of a file of `size` (H, W); 0 if the listed size shows it is upright."""
     fits, fits_turned = (not any(size_problems(own, frame.size)) for own in (size, _swapped(size)))
     return 0 if frame.turns % 2 and fits and not fits_turned else frame.turns
 
 
 @lru_cache(maxsize=2**16)
 def _header(path: str, changed: int) -> tuple[Size, int]:
-    """Return (H, W) as stored and quarter turns; none of a file that is no image."""
+    """Return the stored (H, W) and the quarter turns; (1, 1) and 0 if it is not an image."""
     try:
         with open(path, "rb") as file, opened_image(file) as image:
             return (image.height, image.width), _TURNS.get(orientation(image), 0)

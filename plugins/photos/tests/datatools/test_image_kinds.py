@@ -157,6 +157,6 @@ def test_a_photo_mirrored_by_exif_keeps_its_stored_pixels_and_a_warning_names_it
     data = encoded(RGB, exif=exif)
     read, (finding,) = photos(tmp_path, {"a.png": data, "b.png": data})
     np.testing.assert_allclose(read.images([0])[0].movedim(0, -1) * 255, RGB, 1e-6)
-    assert "EXIF orientation, which is not followed" in caplog.text
+    assert "EXIF orientation, which is ignored" in caplog.text
     assert finding.severity == "warning"
     assert "EXIF" in str(finding)
