@@ -7,7 +7,7 @@ from qgs.reconstruction.scenes import Size
 from qgs_photos.refine.refining import NO_EXTRAS, Extras
 
 NONE = "none"
-"""Word of two options. --model none: start from the photos alone. --holdout none: optimise on all."""
+"""Value of --model (start from the photos alone) and of --holdout (optimise on all photos)."""
 
 
 @dataclass(frozen=True)
