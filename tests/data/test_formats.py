@@ -97,7 +97,7 @@ def test_a_folder_of_scenes(tmp_path, caplog):
     (tmp_path / "notes").mkdir()
     source = opened(tmp_path)
     assert [s.name for s in source.scenes("train")] == ["a", "b"]
-    assert "left out: notes, photos" in caplog.text
+    assert "no photos with cameras: notes, photos" in caplog.text
     assert source.scenes("test")[0].held_out == (3,)
     assert not torch.equal(*(s.images([0]) for s in source.scenes("train")))
 

@@ -102,7 +102,7 @@ def test_of_squares_a_warning_says_whose_cameras_they_have(tmp_path, caplog):
     path.write_bytes(encoded(np.zeros((4, 4, 3), np.uint8), exif=exif))
     frame = upright(PhotoFrame("square.png", path, np.eye(4), INTRINSICS))
     assert frame.turns == 1
-    assert "poses must be of the stored pixels" in caplog.text
+    assert "poses must belong to the stored pixels" in caplog.text
     photos = [SimpleNamespace(listed=frame, exists=True)] * 2
     squares = DecodedScene("squares", photos, [Decoded(size=(4, 4))] * 2)
     (finding,) = geometry_findings(squares, Geometry(pairs=[((0, 1), 0.1)]))
