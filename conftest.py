@@ -24,7 +24,7 @@ def pytest_collection_finish():
 
 @pytest.fixture(autouse=True)
 def _seeded_on_one_thread():
-    """The models are so small that a second thread only waits."""
+    """Use one thread: the models are so small that a second one only waits."""
     import torch  # the controller of several processes needs none
 
     torch.set_num_threads(1)
@@ -33,7 +33,7 @@ def _seeded_on_one_thread():
 
 @pytest.fixture(autouse=True)
 def few_samples_measured(monkeypatch):
-    """A training measures the ranges of its views in .1 s, not in a second."""
+    """Measure the ranges of a training's views in .1 s, not in a second."""
     monkeypatch.setattr("qgs.data.stream.MEASURED", 48)
 
 

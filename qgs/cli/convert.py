@@ -7,9 +7,7 @@ import typer
 
 
 def convert(
-    source: Annotated[
-        Path, typer.Argument(metavar="IN", help="File to read: 3DGS .ply, .splat or .spz.")
-    ],
+    source: Annotated[Path, typer.Argument(metavar="IN", help="PLY file of any 3DGS program.")],
     out: Annotated[
         Path,
         typer.Argument(

@@ -1,34 +1,22 @@
-"""Gaussians as files: PLY of the 3DGS release, .splat, and formats that distributions add.
+"""Gaussians as files: PLY of the 3DGS release, .splat, and formats that distributions add."""
 
-Files hold float32. Worlds that are too far from zero for it are written about a local origin, which
-PLY files name in a comment; read again, Gaussians are in their world, their means in float64.
-"""
-
-import gzip
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
-from plyfile import PlyData, PlyElement
-from rich.filesize import decimal
+from plyfile import PlyData, PlyElement, PlyElementParseError, PlyHeaderParseError
 from torch import Tensor
 
 from qgs.containers import map_tensors, named_tensors
 from qgs.extensions import imported, installed
 from qgs.files import replacing
 from qgs.geometry.harmonics import SH_C0
-from qgs.geometry.transforms import moved, narrowed
-from qgs.paths import LARGEST
 from qgs.types import SH_COUNTS, Gaussians
-from qgs.wording import listed, one_line, warn_once
+from qgs.wording import listed, warn_once
 
 WRITER_GROUP = "qgs.scene_writers"
 """Entry points of functions (gaussians, path): the name is the suffix that they write, undotted."""
@@ -38,13 +26,18 @@ OPACITY_EPS = 1e-6
 SCALE_MIN = 1e-12
 """Smallest scale stored, world units: the logarithm of 0 is infinite."""
 
-_MEANS = ["x", "y", "z"]
-_COLORS = ["f_dc_0", "f_dc_1", "f_dc_2"]
-_OTHERS = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-REST = [f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1])]
+_MEANS = ("x", "y", "z")
+_COLORS = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+NEEDED = (*_MEANS, *_COLORS, "opacity", *_SCALES, *_QUATS)
+REST = tuple(f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1]))
 """Spherical harmonics of degrees 1 to 3, all of red first, then green, then blue; always written,
 as zeros too: the viewer of the 3DGS release and plugins of game engines need all of them."""
-PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, *_OTHERS)
+PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, "opacity", *_SCALES, *_QUATS)
+
+SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+"""A Gaussian of a .splat file, 32 bytes. Source: github.com/antimatter15/splat, convert.py."""
 
 # Bytes of a header, at most: that of the 3DGS release has 1,500.
 _HEADER = 2**16
@@ -81,162 +74,121 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), as binary little-endian float32.
 
     Colours become f_dc, spherical harmonics f_rest, opacities logits, scales logarithms;
-    quaternions stay w x y z; normals are zero. Warns that `features` are left out, and of a local
-    origin, which the comment `local origin X Y Z` names. Raises ValueError for several scenes or
-    for numbers that are not finite.
+    quaternions stay w x y z; normals are zero. Warns that `features` are left out.
+    Raises ValueError for several scenes or for numbers that are not finite.
     """
-    scene, origin = one_scene(gaussians, "PLY", "features")
+    scene = one_scene(gaussians, "PLY", "features")
     sh = scene.means.new_zeros(scene.count, SH_COUNTS[-1], 3) if scene.sh is None else scene.sh
-    columns = [
-        scene.means,
-        torch.zeros_like(scene.means),
-        (scene.colors - 0.5) / SH_C0,
+    rest = F.pad(sh, (0, 0, 0, SH_COUNTS[-1] - sh.shape[1]))
+    columns = {
+        _MEANS: scene.means,
+        _COLORS: (scene.colors - 0.5) / SH_C0,
+        ("opacity",): scene.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
+        _SCALES: scene.scales.clamp_min(SCALE_MIN).log(),
+        _QUATS: scene.quats,
         # Channel by channel.
-        F.pad(sh, (0, 0, 0, SH_COUNTS[-1] - sh.shape[1])).mT.flatten(1),
-        scene.opacities.logit(OPACITY_EPS)[:, None],
-        scene.scales.clamp_min(SCALE_MIN).log(),
-        scene.quats,
-    ]
-    vertices = unstructured_to_structured(torch.cat(columns, 1).numpy(), names=PROPERTIES)
-    comments = [f"local origin {origin}"] if origin else []
-    whole = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
+        REST: rest.mT.flatten(1),
+    }
+    vertices = np.zeros(scene.count, dtype=[(name, "<f4") for name in PROPERTIES])
+    for names, values in columns.items():
+        for name, column in zip(names, values.unbind(-1), strict=True):
+            vertices[name] = column
     with replacing(path) as temporary, temporary.open("wb") as file:
-        whole.write(file)
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
 
 
 def save_splat(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), the largest and most opaque Gaussians first.
 
     Colours, opacities and quaternions, w x y z, get 8 bits. Warns that spherical harmonics and
-    `features` are left out, and of a local origin. Raises as `save_ply`.
+    `features` are left out. Raises as `save_ply`.
     """
-    scene, _ = one_scene(gaussians, ".splat", "sh", "features")
+    scene = one_scene(gaussians, ".splat", "sh", "features")
     # Viewers draw a file while it loads, so what covers most comes first.
     covering = scene.scales.prod(-1) * scene.opacities
     scene = scene[covering.argsort(descending=True, stable=True)]
 
-    # Source: github.com/antimatter15/splat, convert.py.
-    numbers = torch.cat([scene.means, scene.scales], 1).view(torch.uint8)
-    rgba = torch.cat([scene.colors, scene.opacities[:, None]], 1) * 255
-    rest = torch.cat([rgba, F.normalize(scene.quats, dim=-1) * 128 + 128], 1)
-    rows = torch.cat([numbers, rest.round().clamp(0, 255).byte()], 1)
+    def as_bytes(values: Tensor) -> Tensor:
+        return values.round().clamp(0, 255).byte()
+
+    records = np.empty(scene.count, SPLAT)
+    records["mean"] = scene.means
+    records["scale"] = scene.scales
+    records["rgba"] = as_bytes(torch.cat([scene.colors, scene.opacities[:, None]], -1) * 255)
+    records["quat"] = as_bytes(F.normalize(scene.quats, dim=-1) * 128 + 128)
     with replacing(path) as temporary:
-        temporary.write_bytes(rows.numpy().tobytes())
+        temporary.write_bytes(records.tobytes())
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Return the Gaussians (1, G) of a PLY file in the layout of the 3DGS release, in its world.
+    """Return the Gaussians (1, G) of a PLY file in the layout of the 3DGS release.
 
-    Or of a .splat file, or a compressed PLY or .spz file, which gsply reads. Gaussians that are not
-    finite are left out, with a warning; those of Mip-Splatting get their filter. `sh` ends with the
-    last degree that is not all zeros, None without one; means are in float64 where float32 would
-    lose them. Raises FileNotFoundError, and ValueError for another file, or without gsply.
+    `sh` ends with the last degree of f_rest that is not all zeros, None without one. Raises
+    FileNotFoundError, and ValueError for another kind of file or of PLY, such as a compressed one,
+    and for numbers that are not finite.
     """
-    path = Path(path)
+    vertices, names = _vertices(Path(path))
+    count = sum(name.startswith("f_rest_") for name in names)
+    rest = REST[:count]
+    if count not in (0, *(3 * n for n in SH_COUNTS)) or not names.issuperset(rest):
+        raise ValueError(
+            f"{path} has {count} properties f_rest_*; spherical harmonics of degrees 1, 2 or 3 "
+            "are f_rest_0 to f_rest_8, f_rest_23 or f_rest_44: write the file anew, or without them"
+        )
+
+    def columns(*names: str) -> Tensor:
+        return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
+
+    # In float64 norms are finite; a quaternion of 0 becomes NaN, which is refused below.
+    quats = columns(*_QUATS).double()
+    scene = Gaussians(
+        means=columns(*_MEANS),
+        scales=columns(*_SCALES).exp(),
+        quats=(quats / quats.norm(dim=-1, keepdim=True)).float(),
+        opacities=columns("opacity")[:, 0].sigmoid(),
+        colors=columns(*_COLORS) * SH_C0 + 0.5,
+        sh=_used_degrees(columns(*rest).unflatten(-1, (3, -1)).mT) if rest else None,
+    )
+    try:
+        return one_scene(scene, "PLY")[None]
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _vertices(path: Path) -> tuple[np.ndarray, set[str]]:
+    """Return the vertices of a PLY file of Gaussians, and the names of their numbers."""
     if not path.is_file():
         raise FileNotFoundError(f"no file at {path}")
-    readers = {".splat": _of_splat, ".spz": _of_spz}
     try:
-        scene = readers.get(path.suffix.lower(), _of_ply)(path)
-    # Readers raise anything of a damaged file.
-    except Exception as error:
+        with path.open("rb") as start:
+            header, end, _ = start.read(_HEADER).partition(b"end_header")
+        counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))
+        # plyfile takes the memory that a header promises.
+        if not end or max(counts, default=0) > path.stat().st_size:
+            raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
+        elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
+    except (PlyHeaderParseError, PlyElementParseError, ValueError, MemoryError) as error:
+        raise ValueError(f"{path} is no whole PLY file ({error}): copy it again") from error
+    vertices = elements.get("vertex", np.empty(0))
+    kinds = vertices.dtype.fields or {}
+    # Lists are objects to NumPy.
+    names = {name for name, kind in kinds.items() if not kind[0].hasobject}
+    if missing := [name for name in NEEDED if name not in names]:
+        kind = "a compressed PLY" if "chunk" in elements else "no PLY of Gaussians"
         raise ValueError(
-            f"{path} cannot be read as Gaussians ({one_line(error)}): copy it again if it is a PLY "
-            "or .splat; compressed PLY and .spz need `pip install gsply[spz]`; .sog and others "
-            "become PLY by `npx @playcanvas/splat-transform IN OUT.ply`"
-        ) from error
-    # In float64 norms are finite; a quaternion of 0 becomes NaN, which is left out.
-    quats = scene.quats.double()
-    scene = replace(scene, quats=(quats / quats.norm(dim=-1, keepdim=True)).float())
-    whole = _finite(scene)
-    count = int(whole.sum())
-    if not count:
-        raise ValueError(f"{path} holds no Gaussians, or none with finite numbers")
-    if count < scene.count:
-        left = f"{scene.count - count} of {scene.count}"
-        warn_once(f"{path}: left out {left} Gaussians that are not finite, or too large")
-    return narrowed(scene[whole][None])
+            f"{path} is {kind}: it lacks {listed(missing)}; give one with the properties of the "
+            "3DGS release, as SuperSplat's uncompressed export writes it"
+        )
+    if not len(vertices):
+        raise ValueError(f"{path} holds no Gaussians")
+    return vertices, names
 
 
-def _finite(scene: Gaussians) -> Tensor:
-    """Return which of Gaussians (G,) have numbers whose squares are finite in float32."""
-    squares = [part.float().square()[..., None].flatten(1) for _, part in named_tensors(scene)]
-    return torch.cat(squares, -1).isfinite().all(-1)
-
-
-def _of_splat(path: Path) -> Gaussians:
-    rows = np.frombuffer(path.read_bytes(), "3f4,3f4,4u1,4u1")
-    means, scales, rgba, quats = (torch.tensor(rows[f"f{part}"]).float() for part in range(4))
-    return Gaussians(means, scales, quats - 128, rgba[:, 3] / 255, rgba[:, :3] / 255)
-
-
-def _of_spz(path: Path) -> Gaussians:
-    with path.open("rb") as file:
-        head = file.read(12)
-    # gsply takes the memory that a file asks for, 20 bytes or more for each Gaussian.
-    size = 20 * int.from_bytes(head[8:], "little")
-    if head[:2] == b"\x1f\x8b":
-        with gzip.open(path) as file:
-            size = file.seek(LARGEST)
-    if size >= LARGEST:
-        raise ValueError(f"it has {decimal(LARGEST)} or more, unpacked")
-    # SPZ has y up and z back.
-    return moved(_by_gsply("read_spz", path), torch.diag(torch.tensor([1.0, -1, -1, 1])), 1.0)
-
-
-def _by_gsply(reader: str, path: Path) -> Gaussians:
-    gsply = import_module("gsply")
-    with TemporaryDirectory() as folder:
-        plain = Path(folder) / "plain.ply"
-        gsply.plywrite(plain, getattr(gsply, reader)(path))
-        return _of_ply(plain)
-
-
-def _of_ply(path: Path) -> Gaussians:
-    with path.open("rb") as file:
-        header, end, _ = file.read(_HEADER).partition(b"end_header")
-    counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))
-    # plyfile takes the memory that a header promises.
-    if not end or max(counts, default=0) > path.stat().st_size:
-        raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
-    elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
-    vertices = elements["vertex"]
-    # gsply looks for the chunk of 256 without a check.
-    if len(elements.get("chunk", ())) * 256 >= len(vertices) > 0:
-        return _by_gsply("plyread", path)
-
-    names = vertices.dtype.names or ()
-    count = sum(name.startswith("f_rest_") for name in names)
-    if count not in (0, *(3 * n for n in SH_COUNTS)):
-        raise ValueError(f"it has {count} properties f_rest_*, not 0, 9, 24 or 45")
-
-    def columns(names: list[str], kind: type = np.float32) -> Tensor:
-        return torch.from_numpy(structured_to_unstructured(vertices[names], kind, copy=True))
-
-    parts = columns([*_COLORS, *_OTHERS, *REST[:count]]).split((3, 1, 3, 4, count), 1)
-    colors, opacities, scales, quats, rest = parts
-    means = columns(_MEANS, np.float64)
-    if origin := re.search(rb"comment local origin (\S+) (\S+) (\S+)\s", header):
-        means += torch.tensor([*map(float, origin.groups())], dtype=torch.float64)
-    scales = scales.exp()
-    opacities = opacities.sigmoid()
-    if "filter_3D" in names:
-        # Source: github.com/autonomousvision/mip-splatting, create_fused_ply.
-        wide = torch.hypot(scales, columns(["filter_3D"]))
-        opacities = opacities * (scales / wide).prod(-1, keepdim=True)
-        scales = wide
-    sh = rest.unflatten(-1, (3, count // 3)).mT
-    used = sh.any(0).any(-1).nonzero().flatten().tolist()
-    kept = next(kept for kept in (0, *SH_COUNTS) if kept > max(used, default=-1))
-    colors = colors * SH_C0 + 0.5
-    return Gaussians(means, scales, quats, opacities[:, 0], colors, sh[:, :kept] if kept else None)
-
-
-def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, str]:
+def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
     """Return the Gaussians (G, ...) of (G, ...) or (1, G, ...), float32 on the CPU, for a file.
 
-    And the origin that they are about, see `about_origin`. Warns about the parts in `lost`. Raises
-    ValueError for several scenes or for numbers whose squares are not finite. kind: of the file.
+    Warns about the parts in `lost`. Raises ValueError for several scenes or for numbers whose
+    squares are not finite. kind: of the file.
     """
     batch = gaussians.means.shape[:-2]
     if batch not in ((), (1,)):
@@ -247,21 +199,15 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, s
     if names := [f"`{name}`" for name in lost if getattr(gaussians, name) is not None]:
         warn_once(f"{kind} files have no place for {listed(names)}: left out")
     scene = gaussians[0] if batch else gaussians
-    scene = map_tensors(Tensor.detach, scene).to("cpu")
-    if broken := int((~_finite(scene)).sum()):
+    scene = map_tensors(Tensor.detach, scene).to("cpu", torch.float32)
+    squares = [part.square()[..., None].flatten(1) for _, part in named_tensors(scene)]
+    if broken := int((~torch.cat(squares, -1).isfinite().all(-1)).sum()):
         raise ValueError(f"{broken} of {scene.count} Gaussians are not finite, or too large")
-    return about_origin(replace(scene.to(torch.float32), means=scene.means))
+    return scene
 
 
-def about_origin(gaussians: Gaussians) -> tuple[Gaussians, str]:
-    """Return Gaussians (..., G) with float32 means about a local origin, and this origin, "X Y Z".
-
-    It is empty where float32 holds the world. Warns of another origin.
-    """
-    scene = narrowed(gaussians)
-    if scene.means.dtype == scene.scales.dtype:
-        return scene, ""
-    middle = scene.means.flatten(0, -2).median(0).values.round()
-    origin = " ".join(map(str, middle.tolist()))
-    warn_once(f"too far from zero for float32: positions are from the local origin {origin} on")
-    return replace(scene, means=(scene.means - middle).float()), origin
+def _used_degrees(sh: Tensor) -> Tensor | None:
+    """Return the coefficients (G, C, 3) without degrees that are zeros; None without any."""
+    used = sh.any(0).any(-1).nonzero().flatten().tolist()
+    count = next(count for count in (0, *SH_COUNTS) if count > max(used, default=-1))
+    return sh[:, :count] if count else None

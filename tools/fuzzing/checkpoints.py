@@ -1,4 +1,4 @@
-"""Checkpoints, PLY and .splat files, damaged in many ways: each is used, or refused by its name.
+"""Checkpoints and PLY files, damaged in many ways: each is used, or refused by its name.
 
 Half of the checkpoints are sealed anew, as by somebody who means harm. Metadata that are not, and
 are used, must give the numbers of the undamaged file; nothing seals the tensors.
@@ -22,7 +22,6 @@ from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.tensors import SEAL, seal
 from qgs.contracts import LearnedQueries
 from qgs.recipe import resolve
-from qgs.reconstruction.scene_formats import save_splat
 from qgs.train.initial import initialise
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
@@ -128,7 +127,7 @@ def start_from(file: Path) -> bytes:
 
 
 def convert(file: Path) -> None:
-    """Read Gaussians and write them again."""
+    """Read a PLY and write it again."""
     qgs.save_ply(qgs.load_ply(file), file.with_name("again.ply"))
 
 
@@ -146,21 +145,20 @@ def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None)
 
 
 def prepare(scratch: Path) -> None:
-    """Write a checkpoint, a PLY and a .splat file."""
+    """Write a checkpoint and a PLY file."""
     model = qgs.compose(RECIPE, SMALL)
     qgs.save(model, scratch / "a.safetensors", extra={"step": "3"})
     decode(scratch / "a.safetensors")
-    save_splat(qgs.load_ply(scratch / "a.ply"), scratch / "a.splat")
 
 
 def case_in(scratch: Path, folder: Path) -> tuple[str, Use]:
     """Damage a copy of one of the files."""
     use = choice((decode, start_from, convert))
-    original = scratch / (choice(("a.ply", "a.splat")) if use is convert else "a.safetensors")
+    original = scratch / ("a.ply" if use is convert else "a.safetensors")
     path = folder / original.name
     path.write_bytes(original.read_bytes())
     damage = damage_ply if use is convert else damage_checkpoint
-    if random.random() < 0.15 or original.suffix == ".splat":
+    if random.random() < 0.15:
         damage = other_bytes
     what = damage(path)
     whole = use(original) if what == other_metadata.__name__ else None

@@ -16,7 +16,6 @@ from qgs_photos.refine.growth import FreeGaussians
 from qgs_photos.refine.refining import Extras, resized
 from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
-from qgs_photos.refine.surroundings import surroundings
 from qgs_photos.refine.sweeping import swept
 from tables import must_refuse
 from textured_room import INTRINSICS, SIZE, walk
@@ -250,22 +249,11 @@ def test_what_masks_leave_out_is_background():
     views = photos(2)
     masks = torch.zeros(1, 2, 1, 24, 24)
     masks[..., :12] = 1
-    found = masked(replace(views, masks=masks)).images
+    background = torch.tensor([0.1, 0.2, 0.3])
+    found = masked(replace(views, masks=masks), background.tolist()).images
     assert torch.equal(found[..., :12], views.images[..., :12])
-    assert not found[..., 12:].any()
-    must_refuse("--masks", masked, views)
-
-
-def test_surroundings_are_opaque_wherever_photos_look():
-    cameras = ring(3)
-    for angle in (0.4, 1.0, 4.0):
-        lens = cameras.intrinsics * torch.tensor([angle, angle, 1, 1])
-        seen = replace(cameras, intrinsics=lens)
-        found = surroundings(seen, 1.0, [0.2, 0.4, 0.6])
-        rendered = RENDERER(found, seen)
-        assert found.count < 1200
-        assert rendered.alpha.min() > 0.99
-        assert rendered.depth.min() > 2
+    assert torch.allclose(found[..., 12:], background[:, None, None])
+    must_refuse("--masks", masked, views, background.tolist())
 
 
 def coloured():

@@ -44,9 +44,7 @@ class FigureName(StrEnum):
 
 SourceName = Annotated[
     str,
-    typer.Argument(
-        help="Run folder, checkpoint, PLUGIN/NAME, .ply, .splat, or what qgs reconstruct wrote."
-    ),
+    typer.Argument(help="Run folder, checkpoint, PLUGIN/NAME, PLY, or what qgs reconstruct wrote."),
 ]
 ModelPhotos = Annotated[
     str | None,

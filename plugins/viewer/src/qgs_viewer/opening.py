@@ -20,7 +20,7 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import checked_window, choose_frames
 from qgs.reconstruction.scale import FoundScale, constant_scale, find_scale, photo_settings
-from qgs.reconstruction.scene_formats import about_origin, load_ply
+from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene
 from qgs.types import Cameras
 from qgs.wording import listed
@@ -28,7 +28,6 @@ from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 
 PLY = "gaussians.ply"
-_SCENES = (".ply", ".splat", ".spz", ".sog", ".ksplat")
 CAMERAS = "cameras.json"
 """Files in the folder of a finished reconstruction, as `qgs reconstruct --out` writes it."""
 REFINED = "refined"
@@ -93,14 +92,14 @@ class ModelSource(Source):
 
 
 def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
-    """Open Gaussians, a reconstruction's folder, or a run folder or a model with `options`.
+    """Open a PLY, a reconstruction's folder, or a run folder or a model with `options`.
 
     options: see `open_model`. Raises ValueError for options that do not apply to it, and as the
     readers do.
     """
     path = Path(name).expanduser()
     finished = is_finished(path)
-    if not finished and path.suffix.lower() not in _SCENES:
+    if not finished and path.suffix.lower() != ".ply":
         return open_model(name, device, **options)
     if given := [option for option, value in options.items() if value]:
         raise ValueError(
@@ -108,10 +107,8 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
         )
     if finished:
         return open_finished(path, device)
-    note = "A file of Gaussians has neither queries nor photos; name the model to see them."
-    # the browser gets float32
-    gaussians, _ = about_origin(load_ply(path))
-    return Source(path.name, (note,), QueryScene(gaussians))
+    note = "A PLY file holds neither queries nor photos; name the model to see them."
+    return Source(path.name, (note,), QueryScene(load_ply(path)))
 
 
 def open_model(

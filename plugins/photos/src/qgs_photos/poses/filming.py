@@ -1,5 +1,6 @@
 """Films of Gaussians: path, size and length; rendered pictures as mp4 or WebP."""
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,13 +19,13 @@ from qgs.contracts import Renderer
 from qgs.drawing.images import rgb_picture
 from qgs.files import replacing
 from qgs.geometry.poses import relative_to, scaled
+from qgs.geometry.transforms import moved
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians
 from qgs_photos.poses.paths import KINDS, path_of, read_path
 from qgs_photos.record import GAUSSIANS, has_record, read_record
-from qgs_photos.refine.result import RENDERER, in_world
 
 SUFFIXES = (".mp4", ".webp")
 # Of x264; 0 loses nothing, 23 is its default.
@@ -166,20 +167,21 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
         )
     if photos is None:
         raise ValueError(f"{file} holds no cameras: add the photos, as `qgs video {source} PHOTOS`")
+    renderer = AutoRenderer(_scene_options(file.parent))
     cameras = photo_scene(photos, None, name).cameras
-    return _in_own_world(load_ply(file), cameras)
+    return _in_own_world(load_ply(file), cameras, renderer)
 
 
-def _in_own_world(gaussians: Gaussians, cameras: Cameras) -> FilmScene:
+def _in_own_world(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> FilmScene:
     """Move Gaussians (1, G) and cameras (V,) of the photos' world to the first camera's."""
     # near and far of renderers are made for worlds in which what is seen is about 1 away
     reference = cameras.c2w[0].double()
     scale = 1 / _median_depth(gaussians, reference)
     inside = scaled(relative_to(reference, cameras.c2w.double()), scale)
     return FilmScene(
-        gaussians=in_world(gaussians, (reference, scale)),
+        gaussians=moved(gaussians, scaled(torch.linalg.inv(reference), scale), float(scale)),
         cameras=Cameras(inside.float()[None], cameras.intrinsics.float()[None], cameras.size),
-        renderer=RENDERER,
+        renderer=renderer,
         world=(reference, scale),
     )
 
@@ -190,3 +192,12 @@ def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
     depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
     ahead = depths[depths > 0]
     return ahead.median() if ahead.numel() else torch.ones((), dtype=torch.float64)
+
+
+def _scene_options(folder: Path) -> AutoRenderer.Config:
+    """Return the renderer's options of what `qgs scene` wrote, else the default ones."""
+    try:
+        given = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["background"]
+        return AutoRenderer.Config.model_validate({"background": tuple(given)})
+    except (OSError, ValueError, KeyError, TypeError):
+        return AutoRenderer.Config()

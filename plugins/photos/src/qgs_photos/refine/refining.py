@@ -264,17 +264,12 @@ def partly_swept(
     kept = gaussians.most_opaque(count - new)
     if not new:
         return kept
-    return joined(kept, swept(views, new, distance(gaussians, views), generator))
-
-
-def joined(gaussians: Gaussians, others: Gaussians) -> Gaussians:
-    """Return `gaussians` (1, N) and `others` (1, M), whose harmonics and features are 0."""
+    others = swept(views, new, distance(gaussians, views), generator)
     for name in ("sh", "features"):
-        given = getattr(gaussians, name)
+        given = getattr(kept, name)
         if given is not None:
-            shape = (1, others.count, *given.shape[2:])
-            others = replace(others, **{name: given.new_zeros(shape)})
-    return concatenated([gaussians, others], 1)
+            others = replace(others, **{name: given.new_zeros(1, new, *given.shape[2:])})
+    return concatenated([kept, others], 1)
 
 
 def distance(gaussians: Gaussians, views: Views) -> float:

@@ -17,13 +17,12 @@ from qgs.drawing.images import rgb_picture
 from qgs.extensions import INSTALL_ALL
 from qgs.files import replacing_entries, write_text
 from qgs.geometry.harmonics import seen_colors
-from qgs.geometry.poses import scaled
 from qgs.geometry.transforms import moved, to_camera, to_pixels
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
-from qgs.reconstruction.scene_formats import load_ply, save_ply, save_splat
+from qgs.reconstruction.scene_formats import save_ply, save_splat
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Rendering, Views
+from qgs.types import Cameras, Gaussians, Views
 from qgs_photos.printing import say
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
@@ -32,9 +31,7 @@ from qgs_photos.refine.scene_photos import ScenePhotos
 _SHOWN = 6
 # Photos on the page.
 _ON_PAGE = 12
-_SCORES = ("psnr", "ssim", "nearest_input", "alpha")
-RENDERER = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0), far=1e4))
-"""Renders over black, as viewers do, and however far the surroundings are."""
+_SCORES = ("psnr", "ssim", "nearest_input")
 
 PageWriter = Callable[[Gaussians, Views, tuple[float, float, float]], str]
 
@@ -49,6 +46,7 @@ class Result:
     command: str
     world: tuple[Tensor, Tensor]
     refined: RefinedScene
+    renderer: AutoRenderer
     photos: ScenePhotos
     views: Views
     judged: Views
@@ -62,15 +60,10 @@ class Result:
         """Return the file of a photo."""
         return self.photos.small.frame_name(frame)
 
-    def render(self, views: Views) -> Rendering:
-        """Render the scene over black from the cameras of `views` (1, V)."""
-        return RENDERER(self.refined.gaussians, views.cameras)
-
-
-def in_world(gaussians: Gaussians, world: tuple[Tensor, Tensor]) -> Gaussians:
-    """Move Gaussians (1, G) from the photos' world into one of its own, see `Result`."""
-    reference, scale = world
-    return moved(gaussians, scaled(torch.linalg.inv(reference.double()), scale), float(scale))
+    def render(self, views: Views) -> Tensor:
+        """Return the scene as from the cameras of `views` (1, V): (1, V, 3, H, W)."""
+        gaussians = replace(self.refined.gaussians, features=None)
+        return self.renderer(gaussians, views.cameras).rgb
 
 
 @torch.no_grad()
@@ -84,15 +77,10 @@ def write_scene(
     refined = result.refined
     # neither .splat files nor the page show harmonics
     shown = plain(refined.gaussians, refined.cameras)
+    record = scores(result)
     # all files or none: a scene without its scores is none
     with replacing_entries(out, "scene.ply") as fresh:
         save_ply(result.in_photos_world(refined.gaussians), fresh / "scene.ply")
-        # the file is judged, not what it was made of
-        read = in_world(load_ply(fresh / "scene.ply"), result.world)
-        result = replace(
-            result, refined=replace(refined, gaussians=read.to(refined.gaussians.means.device))
-        )
-        record = scores(result)
         save_splat(result.in_photos_world(shown), fresh / "scene.splat")
         if result.photos.held_out:
             picture = held_out_picture(result, record["held_out"])
@@ -101,7 +89,7 @@ def write_scene(
             views = replace(result.views, cameras=refined.cameras)
             every = max(len(result.photos.frames) // _ON_PAGE, 1)
             few = views.select(slice(None, None, every))
-            write_text(fresh / "index.html", page(shown, few, (0, 0, 0)))
+            write_text(fresh / "index.html", page(shown, few, result.renderer.config.background))
         record["total_seconds"] = round(perf_counter() - began, 1)
         write_text(fresh / "metrics.json", json.dumps(record, indent=1))
         names = sorted(entry.name for entry in fresh.iterdir())
@@ -115,8 +103,7 @@ def write_scene(
         say(
             console,
             f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
-            f"{mean['ssim']:.3f}, {mean['alpha']:.1%} covered; the nearest photo "
-            f"{mean['nearest_input']:.2f} dB",
+            f"{mean['ssim']:.3f}; the nearest photo {mean['nearest_input']:.2f} dB",
         )
     for name in names:
         say(console, f"wrote {out / name}")
@@ -128,23 +115,23 @@ def scores(result: Result) -> dict[str, Any]:
     rows = list[dict[str, Any]]()
     for place, frame in enumerate(result.photos.held_out):
         photo = result.judged.select([place])
-        rendering = result.render(photo)
+        rgb = result.render(photo)
         # what no optimisation is needed for
         nearest = nearest_input(result.views, photo.cameras)
         rows.append(
             {
                 "frame": frame,
                 "photo": result.photo(frame),
-                "psnr": float(psnr(rendering.rgb, photo.images).mean()),
-                "ssim": float(ssim(rendering.rgb, photo.images).mean()),
+                "psnr": float(psnr(rgb, photo.images).mean()),
+                "ssim": float(ssim(rgb, photo.images).mean()),
                 "nearest_input": float(psnr(nearest, photo.images).mean()),
-                "alpha": float(rendering.alpha.mean()),
             }
         )
     mean = {name: sum(row[name] for row in rows) / len(rows) for name in _SCORES} if rows else {}
     return {
         "command": result.command,
         "gaussians": refined.gaussians.count,
+        "background": list(result.renderer.config.background),
         "steps": refined.steps,
         "seconds": round(refined.seconds, 1),
         "stopped_by": refined.stopped_by,
@@ -160,7 +147,7 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
     views = result.judged.select(slice(None, None, every))
     pictures = {
         "photo": [rgb_picture(image) for image in views.images[0]],
-        "render": [rgb_picture(image) for image in result.render(views).rgb[0]],
+        "render": [rgb_picture(image) for image in result.render(views)[0]],
     }
     titles = [f"{Path(row['photo']).name}\n{row['psnr']:.2f} dB" for row in rows[::every]]
     return figure_picture(grid_figure(pictures, titles), 120)

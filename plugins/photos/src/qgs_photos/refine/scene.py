@@ -1,5 +1,6 @@
 """`qgs scene`: from photos to the files of the best scene in a given time."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -7,16 +8,16 @@ from time import perf_counter
 import torch
 from rich.console import Console
 
+from qgs.contracts import Scene
 from qgs.data.samples import views_in
 from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians, Views
 from qgs_photos.printing import say
 from qgs_photos.refine.initial import chosen_initialisation, photos_start
 from qgs_photos.refine.options import Options
-from qgs_photos.refine.refining import distance, joined, refine, seconds_of_step
+from qgs_photos.refine.refining import refine, seconds_of_step
 from qgs_photos.refine.result import Result, page_writer, write_scene
 from qgs_photos.refine.scene_photos import TIMED, ScenePhotos, affordable
-from qgs_photos.refine.surroundings import surroundings
 from qgs_photos.refine.sweeping import swept
 
 END = 4.0
@@ -46,19 +47,18 @@ def make_scene(
 
     photos = ScenePhotos(path, options)
     start = chosen_initialisation(photos, options)
-    small = views_in(start.world, photos.small, photos.frames).to(options.device)
-    # what masks leave out stays empty, which viewers show black
-    background = (0.0, 0.0, 0.0) if options.masks else backdrop(small)
+    background = backdrop(photos.small, photos.frames)
     renderer = AutoRenderer(AutoRenderer.Config(background=background))
+    small = views_in(start.world, photos.small, photos.frames).to(options.device)
     few, seconds_of_pixel = timed_sweep(small)
     # on this machine, with these options: exposure and harmonics cost time too
     step = seconds_of_step(few, small, renderer, options.extras)
     size, count = affordable(step, small.cameras.size, photos, left(), options)
     frames = (*photos.frames, *photos.held_out)
     every = views_in(start.world, photos.at(size), frames).to(options.device)
-    every = masked(every) if options.masks else every
+    every = masked(every, background) if options.masks else every
     budget = left()
-    command = replace(
+    chosen = replace(
         options,
         model=start.model,
         frames=start.frames,
@@ -66,11 +66,14 @@ def make_scene(
         size=size,
         gaussians=count,
         seconds=budget,
-    ).command(path, str(out))
+    )
+    command = chosen.command(path, str(out))
     # before the optimisation: an interrupted one can be repeated
     say(console, command)
-    most = int(SWEEP * budget / seconds_of_pixel)
-    gaussians = start.gaussians or photos_start(photos.small, start.world, small, count, most)
+    gaussians = start.gaussians
+    if gaussians is None:
+        most = int(SWEEP * budget / seconds_of_pixel)
+        gaussians = photos_start(photos.small, start.world, small, count, most)
     views = every.select(slice(len(photos.frames)))
     refined = refine(
         gaussians,
@@ -83,22 +86,20 @@ def make_scene(
         console=console,
         extras=options.extras,
     )
-    if not options.masks:
-        far = surroundings(every.cameras, distance(gaussians, views), background)
-        refined = replace(refined, gaussians=joined(refined.gaussians, far))
     judged = every.select(slice(len(photos.frames), None))
-    result = Result(command, start.world, refined, photos, views, judged)
+    result = Result(command, start.world, refined, renderer, photos, views, judged)
     write_scene(result, out, page, began, console)
 
 
-def masked(views: Views) -> Views:
-    """Paint black what the photos' masks leave out, as viewers show it.
+def masked(views: Views, background: Sequence[float]) -> Views:
+    """Put the background in place of what the photos' masks leave out.
 
     What is empty is thereby seen to be empty. Raises ValueError for photos without masks.
     """
     if views.masks is None:
         raise ValueError("--masks: these photos have no masks: leave it out, or add masks")
-    return replace(views, images=views.masks * views.images)
+    color = views.images.new_tensor(background)[:, None, None]
+    return replace(views, images=views.masks * views.images + (1 - views.masks) * color)
 
 
 def timed_sweep(views: Views) -> tuple[Gaussians, float]:
@@ -108,9 +109,11 @@ def timed_sweep(views: Views) -> tuple[Gaussians, float]:
     return found, (perf_counter() - began) / found.count
 
 
-def backdrop(views: Views) -> tuple[float, float, float]:
+def backdrop(scene: Scene, frames: Sequence[int]) -> tuple[float, float, float]:
     """Return the median colour at photos' edges: what is there need not be made of Gaussians."""
-    pixels = views.images[0].transpose(0, 1)
+    # 16 photos show the background as well as all
+    few = frames[:: max(len(frames) // 16, 1)]
+    pixels = scene.images(few)
     edges = [pixels[..., 0, :], pixels[..., -1, :], pixels[..., 0], pixels[..., -1]]
-    red, green, blue = torch.cat(edges, -1).flatten(1).median(1).values.tolist()
+    red, green, blue = torch.cat(edges, -1).transpose(0, 1).flatten(1).median(1).values.tolist()
     return red, green, blue

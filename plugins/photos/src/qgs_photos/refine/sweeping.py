@@ -52,13 +52,8 @@ def swept(views: Views, count: int, size: float, generator: torch.Generator) -> 
         own = drawn[drawn // pixels == photo] % pixels
         parts += [_on_photo(views, photo, few, size) for few in own.split(_AT_ONCE)]
     means, scales, colors = (torch.cat(part)[None] for part in zip(*parts, strict=True))
-    return balls(means, scales, _OPACITY, colors)
-
-
-def balls(means: Tensor, scales: Tensor, opacity: float, colors: Tensor) -> Gaussians:
-    """Return round Gaussians (1, G) of one opacity. means, scales, colors: (1, G, 3)."""
-    quats = means.new_tensor([1.0, 0, 0, 0]).expand(*means.shape[:2], 4)
-    return Gaussians(means, scales, quats, torch.full_like(means[..., 0], opacity), colors)
+    quats = means.new_tensor([1.0, 0, 0, 0]).expand(1, count, 4)
+    return Gaussians(means, scales, quats, torch.full_like(means[..., 0], _OPACITY), colors)
 
 
 def _on_photo(
@@ -70,13 +65,13 @@ def _on_photo(
     rows = pixels // cameras.size[1]
     columns = pixels % cameras.size[1]
     depths = _depths(views, photo, rows, columns, size)
-    rays = pixel_rays(cameras, photo, rows, columns)
+    rays = _rays(cameras, photo, rows, columns)
     means = cameras.c2w[0, photo, :3, 3] + rays * depths[:, None]
     scales = (_PIXELS * depths / cameras.intrinsics[0, photo, 0])[:, None].expand(-1, 3)
     return means, scales, views.images[0, photo][:, rows, columns].T
 
 
-def pixel_rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
+def _rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
     """Return world directions (..., 3) of pixels (...), scaled to depth 1 in the camera."""
     fx, fy, cx, cy = cameras.intrinsics[0, photo]
     x = (columns + 0.5 - cx) / fx
@@ -95,7 +90,7 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
     rows = (rows[:, None] + down).clamp(0, height - 1)
     columns = (columns[:, None] + right).clamp(0, width - 1)
     colors = views.images[0, photo][:, rows, columns]
-    rays = pixel_rays(cameras, photo, rows, columns)
+    rays = _rays(cameras, photo, rows, columns)
     points = cameras.c2w[0, photo, :3, 3] + rays[:, :, None] * tried[:, None]
     costs = list[Tensor]()
     for other in _others(cameras, photo, size):
