@@ -45,13 +45,8 @@ class FootprintCenters(RadiusScaledCenters):
 
     name = "footprint"
 
-    class Config(RadiusScaledCenters.Config):
-        """Options of `locus/radius_scaled`."""
-
-    config: Config
-
     @classmethod
-    def fields_read(cls, config: Config) -> Fields:
+    def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
         """Return anchors, the axes of their photos, and their footprints."""
         return {**super().fields_read(config), **FRAME_FIELD, **FOOTPRINT_FIELD}
 
@@ -132,19 +127,14 @@ class FramedRefinement(AnchorRefinement):
 
     name = "refine"
 
-    class Config(AnchorRefinement.Config):
-        """Options of `locus/refine`."""
-
-    config: Config
-
     @classmethod
-    def fields_read(cls, config: Config) -> Fields:
+    def fields_read(cls, config: AnchorRefinement.Config) -> Fields:
         """Return the refined fields, and frames and radii if centres are refined."""
         framed = {**FRAME_FIELD, **radius_field(config)} if config.center else {}
         return {**super().fields_read(config), **framed}
 
     @classmethod
-    def fields_written(cls, config: Config) -> Fields:
+    def fields_written(cls, config: AnchorRefinement.Config) -> Fields:
         """Return the fields that are refined."""
         return super().fields_read(config)
 
