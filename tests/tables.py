@@ -3,7 +3,7 @@
 import pytest
 
 
-def must_refuse(match, function, *given, kind=ValueError):
+def must_refuse(match, function, *given, kind=ValueError, **options):
     """`function` raises `kind` with `match`."""
     with pytest.raises(kind, match=match):
-        function(*given)
+        function(*given, **options)

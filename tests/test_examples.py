@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from odd_views import odd_views
+from torch.testing import assert_close
 
 import qgs
 from qgs.recipe import resolve
@@ -43,10 +44,10 @@ def test_loss_and_gradients_are_the_frameworks(nano):
     parts = ((v.images, v.cameras.c2w, v.cameras.intrinsics) for v in (inputs, targets))
     value = nano.loss(p, *parts)
     value.backward()
-    torch.testing.assert_close(value, loss)
+    assert_close(value, loss)
     gradients = {name: parameter.grad for name, parameter in model.named_parameters()}
     found = {name: weight.grad for name, weight in p.items()}
-    torch.testing.assert_close(found, gradients, rtol=1e-3, atol=1e-5)
+    assert_close(found, gradients, rtol=1e-3, atol=1e-5)
 
 
 def test_it_trains(nano, monkeypatch, capsys):

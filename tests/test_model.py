@@ -5,6 +5,7 @@ import re
 import pytest
 import torch
 from odd_views import odd_views
+from tables import must_refuse
 
 import qgs
 
@@ -42,8 +43,7 @@ def test_layers_that_are_decoded_and_refined(views):
     assert list(model.train()(views).layers) == [2, 4]
     assert list(model.eval()(views).layers) == [4]
     assert list(model(views, layers=[1, 3]).layers) == [1, 3, 4]
-    with pytest.raises(ValueError, match=r"layers \[5\] do not exist"):
-        model(views, layers=[5])
+    must_refuse(r"layers \[5\] do not exist", model, views, layers=[5])
     override = "model.decoder.layers.0.refinement={type: locus/refine, radius: false}"
     assert [len(x.refinements) for x in (model, small("locus", override))] == [1, 2]
 

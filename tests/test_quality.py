@@ -55,7 +55,7 @@ def test_no_path_of_one_machine():
     found = []
     for path in paths:
         if path.is_file() and path.suffix in suffixes and path.name != ".git":
-            for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            for number, line in enumerate(path.read_text().splitlines(), start=1):
                 if MACHINE_PATH.search(line):
                     found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
     assert found == [], "write a relative path, or one below `~`"

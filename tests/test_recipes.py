@@ -21,7 +21,7 @@ from qgs.recipe import resolve
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"
-SCHEMA = json.loads((RECIPES / "recipe.schema.json").read_text(encoding="utf-8"))
+SCHEMA = json.loads((RECIPES / "recipe.schema.json").read_text())
 IS_VALID = jsonschema.Draft202012Validator(SCHEMA).is_valid
 EVERY = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
 STUDIES = [file for file in EVERY if file.startswith("studies/")]
@@ -69,7 +69,7 @@ EQUALS = {
 
 
 def document(name):
-    return (ROOT / name).read_text(encoding="utf-8")
+    return (ROOT / name).read_text()
 
 
 PAGE = document("docs/experiments.md")

@@ -50,7 +50,7 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
     """
     # The mean of moments and directions is a ray through the middle, a little too short.
     pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
-    return pooled.flatten(2).transpose(1, 2).reshape(plucker.shape[0], -1, 6)
+    return pooled.flatten(2).mT.reshape(plucker.shape[0], -1, 6)
 
 
 @full_precision
@@ -60,9 +60,7 @@ def camera_centers(rays: Tensor, grid: tuple[int, int, int]) -> Tensor:
     rays (B, M, 6). Each centre is the point where the rays of its view meet, by least squares.
     """
     moments, directions = rays.unflatten(1, (grid[0], -1)).chunk(2, -1)
-    # o x d = m gives (|d|^2 I - d d^T) o = d x m; the sum over a view's rays has one solution.
-    lengths = directions.square().sum((-2, -1))
-    outer = directions.mT @ directions
-    normal = torch.diag_embed(lengths[..., None].expand(-1, -1, 3)) - outer
-    right = torch.linalg.cross(directions, moments, dim=-1).sum(-2)
-    return torch.linalg.solve(normal, right)
+    # A moment o x d is the sum over axes of o_i (e_i x d).
+    parts = torch.linalg.cross(torch.eye(3).to(rays), directions[..., None, :], dim=-1)
+    left = parts.mT.flatten(2, 3)
+    return torch.linalg.lstsq(left, moments.flatten(2)[..., None]).solution[..., 0]

@@ -9,6 +9,7 @@ import pytest
 from commands import MODEL, done, run_qgs
 from photo_formats import noisy_photos
 from PIL import Image
+from tables import must_refuse
 from training_runs import run as train
 
 import qgs
@@ -89,8 +90,9 @@ def test_other_weights_of_a_run_keep_its_evaluation(tmp_path):
 
 
 def test_settings_of_the_trained_model_are_refused(trained):
-    with pytest.raises(ValueError, match="would change the trained model"):
-        done("eval", trained[1], "--set", "training.steps=1")
+    must_refuse(
+        "would change the trained model", done, "eval", trained[1], "--set", "training.steps=1"
+    )
 
 
 def test_tune_says_what_and_how_often():

@@ -49,8 +49,7 @@ def test_everything_is_written_and_what_a_user_made_is_kept(
         (tmp_path, (), "--overwrite"),
         (tmp_path, ("--overwrite",), "views"),
     ):
-        with pytest.raises(FileExistsError, match=word):
-            written(checkpoint, photos, *flags, out=out)
+        must_refuse(word, written, checkpoint, photos, *flags, out=out, kind=FileExistsError)
         assert {*tmp_path.rglob("*")} == {notes, old.parent, old}
     (tmp_path / "gaussians.ply").touch()  # as an earlier result has it
     words = ("--overwrite", "--set", "views.scale=auto")
@@ -155,6 +154,5 @@ SENSELESS = """
 def test_options_that_make_no_sense_are_refused(checkpoint, photos, tmp_path):
     for line in SENSELESS.strip().splitlines():
         words, reason = line.split(" | ")
-        with pytest.raises(ValueError, match=reason):
-            written(checkpoint, photos, *words.split(), out=tmp_path / "out")
+        must_refuse(reason, written, checkpoint, photos, *words.split(), out=tmp_path / "out")
         assert not (tmp_path / "out").exists()

@@ -47,8 +47,7 @@ def test_the_angle_of_view_goes_with_the_images(tmp_path, photos):
 
 
 def test_images_cannot_be_replaced(tmp_path, photos):
-    with pytest.raises(ValueError, match="`images`"):
-        read(write_blender(tmp_path, photos, train=6), images="images_2")
+    must_refuse("`images`", read, write_blender(tmp_path, photos, train=6), images="images_2")
 
 
 def test_the_published_axes(tmp_path):

@@ -20,6 +20,7 @@ from photo_formats import (
 )
 from PIL import Image
 from pydantic import ValidationError
+from tables import must_refuse
 from upath import UPath
 
 from qgs.data import PhotosSource
@@ -64,8 +65,7 @@ def test_what_a_folder_holds_most_is_read_in_a_told_order(tmp_path, caplog):
     write_colmap(tmp_path, photos, "text")
     assert_same(scene(tmp_path), photos)
     assert "data.format: llff reads the other" in caplog.text
-    with pytest.raises(FileNotFoundError, match=r"transforms\.json"):
-        scene(tmp_path, format="nerfstudio")
+    must_refuse(r"transforms\.json", scene, tmp_path, format="nerfstudio", kind=FileNotFoundError)
 
 
 @pytest.mark.parametrize("write", [write_llff, write_nerfstudio, write_colmap])
@@ -87,8 +87,7 @@ def test_scaled_copies(tmp_path, write):
     reads("images_4", "images_4")
     shutil.rmtree(tmp_path / "images")
     reads("images_4")
-    with pytest.raises(FileNotFoundError, match="images_3"):
-        scene(tmp_path, images="images_3")
+    must_refuse("images_3", scene, tmp_path, images="images_3", kind=FileNotFoundError)
 
 
 def test_a_folder_of_scenes(tmp_path, caplog):
@@ -137,14 +136,17 @@ plugin = Csv
 
 
 def test_a_distribution_adds_a_format(install, tmp_path, caplog):
-    with pytest.raises(ValidationError, match="csv"):
-        PhotosSource.Config(path="photos", format="csv")
+    must_refuse("csv", PhotosSource.Config, path="photos", format="csv", kind=ValidationError)
     for name, source in (("csv", CSV), ("nerfstudio", CSV), ("none", "")):
         install(f"{name}-photos", name, source, group=GROUP)
     assert PhotosSource.Config(path="photos", format="csv").format == "csv"
     (folder := UPath(tmp_path / "photos")).mkdir()
-    with pytest.raises(FileNotFoundError, match=r"transforms\.json.*poses\.csv \(csv\)"):
-        formats.read_listing(folder)
+    must_refuse(
+        r"transforms\.json.*poses\.csv \(csv\)",
+        formats.read_listing,
+        folder,
+        kind=FileNotFoundError,
+    )
     photos = synthetic(tmp_path / "photos", count=2)
     lines = [
         ",".join(map(str, [file.name, *photos.intrinsics, *pose.flatten().tolist()]))

@@ -125,10 +125,8 @@ def test_poses_far_from_the_origin_keep_their_digits():
 
 
 def test_too_few_frames_and_a_gap_too_short_are_explained():
-    with pytest.raises(ValueError, match="line3"):
-        drawn(Line(3), 0, inputs=4)
-    with pytest.raises(ValueError, match=r"views\.gap"):
-        drawn(Line(30), 0, inputs=6, gap=(2, 3))
+    must_refuse("line3", drawn, Line(3), 0, inputs=4)
+    must_refuse(r"views\.gap", drawn, Line(30), 0, inputs=6, gap=(2, 3))
 
 
 def test_every_held_out_frame_is_a_target_once():
@@ -243,5 +241,11 @@ def test_a_schedule_moves_the_gap_of_the_default():
 
 def test_a_least_gap_above_the_largest_is_refused():
     tiny("tokengs", "view_sampler.min_gap=4", "view_sampler.max_gap=9")
-    with pytest.raises(RecipeError, match=r"view_sampler\.min_gap"):
-        tiny("tokengs", "view_sampler.min_gap=9", "view_sampler.max_gap=4")
+    must_refuse(
+        r"view_sampler\.min_gap",
+        tiny,
+        "tokengs",
+        "view_sampler.min_gap=9",
+        "view_sampler.max_gap=4",
+        kind=RecipeError,
+    )

@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 from line_scenes import samples_of
+from tables import must_refuse
 from training_runs import tiny
 
 from qgs.containers import map_tensors
@@ -93,5 +94,9 @@ def test_a_forward_pass_starts_from_the_given_state():
         )
     assert torch.equal(plain, same)
     assert not torch.allclose(plain, moved)
-    with pytest.raises(ValueError, match="the memory has 1 scenes, but the initial state has 2"):
-        model(inputs, state=model.queries.start(2))
+    must_refuse(
+        "the memory has 1 scenes, but the initial state has 2",
+        model,
+        inputs,
+        state=model.queries.start(2),
+    )

@@ -12,6 +12,7 @@ from guide_pages import blocks, contract_failures
 from PIL import Image
 from qgs_dev import Case, cases_of
 from qgs_dev.new_command import rendered
+from tables import must_refuse
 
 from qgs.recipe import RecipeError, resolve
 from qgs.recipe.registry import InstalledPlugin
@@ -69,8 +70,20 @@ def test_the_recipes_work_and_what_the_page_says_is_refused(package):
     for name in ("depth.yaml", "cnn.yaml"):
         assert resolve(name, plugins=plugins)
     assert {*resolve("widening.yaml", plugins=plugins).tree["plugins"]} >= {"locus", "sightline"}
-    with pytest.raises(RecipeError, match="far must be more than near, 9\n  fix: set it farther"):
-        resolve("frustum.yaml", ["model.centers.near=9"], plugins=plugins)
+    must_refuse(
+        "far must be more than near, 9\n  fix: set it farther",
+        resolve,
+        "frustum.yaml",
+        ["model.centers.near=9"],
+        plugins=plugins,
+        kind=RecipeError,
+    )
     needed = r"`sightline/deepen` needs sightline\.log_depth [\s\S]*use `sightline/deep`"
-    with pytest.raises(RecipeError, match=needed):
-        resolve("depth.yaml", ["model.queries.type=qgs/latent"], plugins=plugins)
+    must_refuse(
+        needed,
+        resolve,
+        "depth.yaml",
+        ["model.queries.type=qgs/latent"],
+        plugins=plugins,
+        kind=RecipeError,
+    )

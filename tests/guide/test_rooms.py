@@ -6,7 +6,7 @@ from rooms import PICTURE, ROOT, drawn
 
 
 def test_the_picture_is_fresh():
-    assert PICTURE.read_text(encoding="utf-8") == drawn(), "run python tools/rooms.py"
+    assert PICTURE.read_text() == drawn(), "run python tools/rooms.py"
 
 
 def test_files_that_are_named_exist():

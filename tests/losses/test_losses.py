@@ -5,6 +5,7 @@ import pytest
 import torch
 import yaml
 from losses.judging import CAMERAS, GOLDEN, PREDICTED, TRUTH, judged
+from tables import must_refuse
 from torch.testing import assert_close
 from training_runs import run, tiny
 
@@ -29,8 +30,13 @@ def test_valid_ssim_is_the_metric_of_large_enough_images():
     rgb = PREDICTED.clamp(0, 1)
     found = photometric(rgb, ssim_weight=0.3, padding="valid")["ssim"]
     assert_close(found, 0.3 * (1 - ssim(rgb, TRUTH).mean()) / 2)
-    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 24"):
-        photometric(rgb[..., :10, :], TRUTH[..., :10, :], padding="valid")
+    must_refuse(
+        "at least 11 pixels a side, got 10 x 24",
+        photometric,
+        rgb[..., :10, :],
+        TRUTH[..., :10, :],
+        padding="valid",
+    )
 
 
 def test_terms_have_weights_and_those_of_weight_zero_are_left_out():
@@ -41,8 +47,7 @@ def test_terms_have_weights_and_those_of_weight_zero_are_left_out():
 
 
 def test_mask_without_masks_is_refused():
-    with pytest.raises(ValueError, match="qgs/mask needs views with masks"):
-        judged(Mask(Mask.Config()), VIEWS)
+    must_refuse("qgs/mask needs views with masks", judged, Mask(Mask.Config()), VIEWS)
 
 
 def test_gradients_of_visibility_are_finite_everywhere():

@@ -3,10 +3,10 @@
 import random
 from pathlib import Path
 
-import pytest
 import torch
 import yaml
 from refusals import refused
+from tables import must_refuse
 
 from qgs.recipe import compose, resolve
 from qgs.recipe.errors import Problems
@@ -100,8 +100,7 @@ def test_mappings_and_files_that_hold_no_recipe(tmp_path):
     binary.write_bytes(b"recipe: \xff\n")
     for path in (tmp_path, binary):
         assert refused(path).file == str(path)
-    with pytest.raises(ValueError, match="this recipe has no data"):
-        resolve(SMALL).build_data()
+    must_refuse("this recipe has no data", resolve(SMALL).build_data)
 
 
 def test_tabs_and_what_is_nested_deeper_than_pythons_stack(write):

@@ -7,6 +7,7 @@ import torch
 import yaml
 from commands import MODEL
 from photo_formats import noisy_photos, scene
+from torch.testing import assert_close
 from varying_head import VaryingHead
 
 import qgs
@@ -56,12 +57,12 @@ def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):
     model.eval()
     inputs = result.sample.inputs
     assert result.sample.input_frames == (0, 1)  # all of them
-    torch.testing.assert_close(inputs.cameras.c2w[0, 0], torch.eye(4))
+    assert_close(inputs.cameras.c2w[0, 0], torch.eye(4))
     assert float(inputs.cameras.c2w[0, 1, :3, 3].norm()) == pytest.approx(0.5, rel=1e-4)
     assert not caplog.text
-    torch.testing.assert_close(result.gaussians.means, model(inputs).gaussians.means)
+    assert_close(result.gaussians.means, model(inputs).gaussians.means)
     again = qgs.reconstruct(model, views)
-    torch.testing.assert_close(again.gaussians.means, result.gaussians.means, atol=1e-3, rtol=1e-3)
+    assert_close(again.gaussians.means, result.gaussians.means, atol=1e-3, rtol=1e-3)
     assert result._repr_png_().startswith(b"\x89PNG")
 
 
@@ -76,9 +77,9 @@ def test_gaussians_with_harmonics_lie_in_the_world_of_the_photos(model, far, tmp
     assert result.save(file) == [file]
     renderer = AutoRenderer(AutoRenderer.Config(far=1e5))  # in the unit of the photos
     for seen in (renderer(qgs.load_ply(file), far.cameras), result.render(far.cameras)):
-        torch.testing.assert_close(seen.rgb, own.rgb, atol=5e-3, rtol=0)
+        assert_close(seen.rgb, own.rgb, atol=5e-3, rtol=0)
         depth = seen.depth * float(result.sample.world[1])
-        torch.testing.assert_close(depth, own.depth, atol=5e-3, rtol=1e-2)
+        assert_close(depth, own.depth, atol=5e-3, rtol=1e-2)
 
 
 def test_what_cannot_be_reconstructed_is_refused(model, views, photos):

@@ -2,6 +2,7 @@
 
 import pytest
 from commands import done
+from tables import must_refuse
 from walk import Walk
 
 import qgs
@@ -51,5 +52,12 @@ def test_the_range_follows_the_unit_and_the_training():
 
 def test_training_and_evaluation_refuse_a_search(tmp_path):
     words = ("--set", "views.scale=search", "--set", "training.steps=1")
-    with pytest.raises(ValueError, match=r"views\.scale: search"):
-        done("train", "tiny/tokengs.yaml", "--out", tmp_path / "run", *words)
+    must_refuse(
+        r"views\.scale: search",
+        done,
+        "train",
+        "tiny/tokengs.yaml",
+        "--out",
+        tmp_path / "run",
+        *words,
+    )

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 import qgs
 
@@ -18,10 +19,10 @@ def test_chosen_layers_and_queries_are_recorded_of_a_pass_that_predicts_the_same
     first, last = trace.layers.values()
     for state, number in ((first.after, 1), (last.before, 2)):
         expected = prediction.layers[number].state.features[:, [7, 2]]
-        torch.testing.assert_close(state.features, expected)
+        assert_close(state.features, expected)
     read = last.cross_attention.weights
     assert read.shape == (1, 2, 2, 32)
-    torch.testing.assert_close(read.sum(-1), torch.ones(1, 2, 2))
+    assert_close(read.sum(-1), torch.ones(1, 2, 2))
     assert last.self_attention.weights.shape == (1, 2, 2, 12)
     assert last.cross_attention.geometry is None
 

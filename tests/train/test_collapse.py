@@ -6,6 +6,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 from accelerate import PartialState
+from tables import must_refuse
 from training_runs import run, run_calling, same, tiny
 
 import qgs
@@ -83,8 +84,9 @@ def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights(tm
 
     checkpoint = run_calling(die, recipe, tmp_path).folder.checkpoint
     assert CheckpointFile(checkpoint).step == 8  # in doubt: saved as it is
-    with pytest.raises(CollapseError, match="at step 15: for the last 10 steps"):
-        run(recipe, tmp_path, resume=True)
+    must_refuse(
+        "at step 15: for the last 10 steps", run, recipe, tmp_path, resume=True, kind=CollapseError
+    )
     assert CheckpointFile(checkpoint).step == 2
     assert same(qgs.load(checkpoint).state_dict(), after[2])
 
@@ -95,8 +97,7 @@ def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(t
         recipe = tiny("tokengs", INVISIBLE, f"training.steps={steps}", *options)
         folder = RunFolder(tmp_path / str(steps))
         words = f"for the last {dead} steps the renderings are empty"
-        with pytest.raises(CollapseError, match=words):
-            run(recipe, folder.path)
+        must_refuse(words, run, recipe, folder.path, kind=CollapseError)
         assert len(folder.history()) == min(steps, 10)
         assert CheckpointFile(folder.checkpoint).step == 0
 
@@ -111,8 +112,7 @@ def test_weights_that_are_not_finite_end_a_run_and_are_never_saved(tmp_path):
     for steps, words in ((2, f"step 1: .*{features}"), (1, f"weights are not finite: {features}")):
         recipe = tiny("tokengs", f"training.steps={steps}", "optimizer.warmup=0")
         folder = tmp_path / str(steps)
-        with pytest.raises(CollapseError, match=words):
-            run_calling(break_weights, recipe, folder)
+        must_refuse(words, run_calling, break_weights, recipe, folder, kind=CollapseError)
         kept = qgs.load(RunFolder(folder).checkpoint).state_dict()
         assert all(tensor.isfinite().all() for tensor in kept.values())
 

@@ -7,6 +7,7 @@ from unittest.mock import DEFAULT, Mock
 import pytest
 import torch
 from safetensors import SafetensorError, safe_open
+from tables import must_refuse
 from training_runs import (
     TRAINED,
     assert_equal_runs,
@@ -69,8 +70,7 @@ def test_a_killed_worker_leaves_a_run_that_goes_on(tmp_path):
         for child in multiprocessing.active_children():
             child.kill()
 
-    with pytest.raises(WorkerError, match=r"lower training\.workers"):
-        run_calling(kill, recipe, tmp_path)
+    must_refuse(r"lower training\.workers", run_calling, kill, recipe, tmp_path, kind=WorkerError)
     assert saved_step(tmp_path) == len(losses(tmp_path)) >= 1
 
 
@@ -78,8 +78,7 @@ def test_a_step_without_memory_says_what_takes_less_and_the_run_is_saved(tmp_pat
     error = RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
     second_fails = Mock(wraps=training.compute_gradients, side_effect=[DEFAULT, error])
     monkeypatch.setattr(training, "compute_gradients", second_fails)
-    with pytest.raises(OutOfMemoryError, match=r"step 2.*batch_size"):
-        run(tiny("tokengs"), tmp_path)
+    must_refuse(r"step 2.*batch_size", run, tiny("tokengs"), tmp_path, kind=OutOfMemoryError)
     assert saved_step(tmp_path) == 1
 
 
@@ -91,14 +90,12 @@ def test_bad_samples_are_skipped_and_named_if_asked_for(tmp_path, monkeypatch, c
             raise SampleError(f"scene 'x', frame {number + attempt} (a.png): cannot be read")
 
     change_samples(monkeypatch, unreadable)
-    with pytest.raises(SampleError, match="frame 1"):
-        run(tiny("tokengs"), tmp_path / "stops")
+    must_refuse("frame 1", run, tiny("tokengs"), tmp_path / "stops", kind=SampleError)
     skipping = tiny("tokengs", "training.on_bad_sample=skip")
     assert run(skipping, tmp_path / "skips").steps == 3
     assert caplog.text.count("a sample is left out: scene 'x', frame ") == 2
     bad.update(range(100))
-    with pytest.raises(SampleError, match=str(MAX_REPLACED + 1)):
-        run(skipping, tmp_path / "ends")
+    must_refuse(str(MAX_REPLACED + 1), run, skipping, tmp_path / "ends", kind=SampleError)
 
 
 def test_an_evaluation_that_fails_is_told_and_ends_nothing(tmp_path, monkeypatch, caplog):
@@ -141,8 +138,7 @@ def test_a_full_disk_is_told_with_what_to_do(copied, monkeypatch):
     whole = state.read_bytes()
     with monkeypatch.context() as patch:
         patch.setattr("qgs.checkpoint.tensors.save_file", full)
-        with pytest.raises(OSError, match="--resume"):
-            run(recipe, copied, resume=True)
+        must_refuse("--resume", run, recipe, copied, resume=True, kind=OSError)
     assert state.read_bytes() == whole
     assert run(recipe, copied, resume=True).steps == 4
 
@@ -171,27 +167,21 @@ def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
     for content in contents:
         state.write_bytes(content)
         before = {path: path.read_bytes() for path in copied.glob("*.*")}
-        with pytest.raises(CheckpointError, match=str(state)):
-            run(recipe, copied, resume=True)
+        must_refuse(str(state), run, recipe, copied, resume=True, kind=CheckpointError)
         assert before == {path: path.read_bytes() for path in copied.glob("*.*")}
 
 
 def test_a_folder_in_use_is_refused_untouched(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="never overwrites"):
-        run(tiny("tokengs"), tmp_path)
-    with pytest.raises(FileExistsError, match="is a file"):
-        run(tiny("tokengs"), tmp_path / "notes.txt")
+    must_refuse("never overwrites", run, tiny("tokengs"), tmp_path, kind=FileExistsError)
+    must_refuse("is a file", run, tiny("tokengs"), tmp_path / "notes.txt", kind=FileExistsError)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def test_a_start_that_fails_leaves_no_folder(tmp_path):
     out = tmp_path / "run"
     nowhere = f"data={{type: qgs/photos, path: {tmp_path / 'nowhere'}, image_size: [32, 32]}}"
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        run(tiny("tokengs", nowhere), out)
-    with pytest.raises(ValueError, match=r"optimizer\.warmup"):
-        run(tiny("tokengs", "optimizer.warmup=3"), out)
-    with pytest.raises(ValueError, match=r"views\.gap"):
-        run(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out)
+    must_refuse("nowhere", run, tiny("tokengs", nowhere), out, kind=FileNotFoundError)
+    must_refuse(r"optimizer\.warmup", run, tiny("tokengs", "optimizer.warmup=3"), out)
+    must_refuse(r"views\.gap", run, tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out)
     assert not out.exists()

@@ -6,6 +6,7 @@ import pytest
 import torch
 from rich.console import Console
 from safetensors.torch import load_file
+from torch.testing import assert_close
 from training_runs import tiny, weights
 
 from qgs.checkpoint.model_file import save
@@ -86,7 +87,7 @@ def test_larger_patches_give_the_tokens_of_coarser_images(learned):
     fine = images.repeat_interleave(2, -1).repeat_interleave(2, -2)
     found = model.encoder.rgb_embedding(fine)
     tokens = coarse.encoder.rgb_embedding(images)
-    torch.testing.assert_close(found, tokens)
+    assert_close(found, tokens)
     assert "encoder.ray_embedding.proj.weight: (32, 6, 8, 8) -> (32, 6, 16, 16)" in told
 
 
@@ -97,5 +98,5 @@ def test_training_starts_from_a_run(trained_run, tmp_path):
     grown = tiny("locus", "model.queries.count=32", start, *still)
     result = train(grown, tmp_path, device="cpu", console=console)
     before, after = (weights(r)["queries.center"] for r in (trained_run, result))
-    torch.testing.assert_close(after[:COUNT], before, rtol=0, atol=1e-6)
+    assert_close(after[:COUNT], before, rtol=0, atol=1e-6)
     assert "queries.center: (24, 3) -> (32, 3)" in console.file.getvalue()

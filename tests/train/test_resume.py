@@ -10,6 +10,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from tables import must_refuse
 from training_runs import (
     TRAINED,
     TWO,
@@ -69,8 +70,14 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     assert CheckpointFile(again).step == 2
     assert qgs.load(again).renderer.config.dilation == 2
     for other in ("objective.depth_weight=0.5", "losses.photometric.ssim_weight.values=[0.4, 0.1]"):
-        with pytest.raises(OtherRunError, match=other.split("=")[0]):
-            run(tiny("locus", *options, other), parts, resume=True)
+        must_refuse(
+            other.split("=")[0],
+            run,
+            tiny("locus", *options, other),
+            parts,
+            resume=True,
+            kind=OtherRunError,
+        )
     assert run_calling(note, recipe, parts, resume=True).resumed_at == 2
     assert_equal_runs(whole, parts)
     # After a step there stand the numbers of the next one.
@@ -137,8 +144,7 @@ def test_a_run_killed_before_its_first_save_starts_again(trained_run, copied):
         file.unlink()
     for name in (".state.safetensors.4711.tmp", ".tmpA9b0zZ"):
         (copied / name).write_text("half a state")
-    with pytest.raises(OtherRunError, match=r"seed: 1 here, 0 in the run"):
-        resumed(copied, "seed=1")
+    must_refuse(r"seed: 1 here, 0 in the run", resumed, copied, "seed=1", kind=OtherRunError)
     assert resumed(copied).resumed_at is None
     assert_equal_runs(copied, trained_run.folder.path)
     assert not list(copied.glob(".*"))
@@ -156,18 +162,21 @@ def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, cop
         resumed(copied, "optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
     assert "seed: 4 here, 0 in the run" in str(caught.value)
     assert "training.save_every:" not in str(caught.value)
-    with pytest.raises(OtherRunError, match=r"uses 2 samples.*asks for 3.*batch_size=2"):
-        resumed(copied, "training.batch_size=3")
+    must_refuse(
+        r"uses 2 samples.*asks for 3.*batch_size=2",
+        resumed,
+        copied,
+        "training.batch_size=3",
+        kind=OtherRunError,
+    )
     folder = RunFolder(copied)
     folder.take()
-    with pytest.raises(FileExistsError, match="another process is training"):
-        resumed(copied)
+    must_refuse("another process is training", resumed, copied, kind=FileExistsError)
     folder.close()
     resumed(copied)
     assert files() == before
     change_counters(copied, scenes="others")
-    with pytest.raises(OtherRunError, match="training scenes have changed"):
-        resumed(copied)
+    must_refuse("training scenes have changed", resumed, copied, kind=OtherRunError)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from unittest.mock import MagicMock
 import pytest
 from accelerate import PartialState
 from rich.console import Console
+from tables import must_refuse
 from training_runs import TRAINED, run, tiny
 
 from qgs.contracts import MissingExtraError
@@ -65,11 +66,15 @@ def test_distributions_offer_trackers_and_one_that_fails_is_left_out(tmp_path, i
 
 
 def test_a_missing_tracker_is_told_before_anything_is_made(tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="tensorboard, wandb"):
-        Trackers(("linez",))
+    must_refuse("tensorboard, wandb", Trackers, ("linez",))
     monkeypatch.setattr(tracking, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match="pip install tensorboard"):
-        run(tiny("tokengs", "training.trackers=[tensorboard]"), tmp_path / "run")
+    must_refuse(
+        "pip install tensorboard",
+        run,
+        tiny("tokengs", "training.trackers=[tensorboard]"),
+        tmp_path / "run",
+        kind=MissingExtraError,
+    )
     assert not (tmp_path / "run").exists()
 
 

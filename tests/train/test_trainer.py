@@ -6,6 +6,7 @@ import pytest
 import torch
 from PIL import Image
 from qgs_viewer.curves import curves_of
+from tables import must_refuse
 from training_runs import (
     TRAINED,
     change_samples,
@@ -82,8 +83,7 @@ def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run
 def test_scenes_that_do_not_split_evenly_are_refused():
     for processes, accumulate in ((3, 1), (1, 5), (8, 4)):
         config = TrainingConfig(batch_size=16, accumulate=accumulate)
-        with pytest.raises(ValueError, match=r"training\.batch_size: 16"):
-            config.scenes_per_batch(processes)
+        must_refuse(r"training\.batch_size: 16", config.scenes_per_batch, processes)
 
 
 def test_bf16_trains_with_finite_numbers(tmp_path):
@@ -148,14 +148,20 @@ def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
     model = tiny("tokengs").build_model()
     next(model.parameters()).register_hook(lambda gradient: gradient * torch.inf)
     monkeypatch.setattr(Recipe, "build_model", Mock(return_value=model))
-    with pytest.raises(NonFiniteError, match="the first bad tensor is gradient of"):
-        run(tiny("tokengs"), tmp_path)
+    must_refuse(
+        "the first bad tensor is gradient of", run, tiny("tokengs"), tmp_path, kind=NonFiniteError
+    )
     assert not losses(tmp_path)
 
 
 def test_skipping_comes_to_an_end(tmp_path, monkeypatch):
     spoil(monkeypatch, *range(2, 100))
     monkeypatch.setattr(guard, "MAX_SKIPPED", 2)
-    with pytest.raises(NonFiniteError, match="most 2 steps in a row"):
-        run(tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50"), tmp_path)
+    must_refuse(
+        "most 2 steps in a row",
+        run,
+        tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50"),
+        tmp_path,
+        kind=NonFiniteError,
+    )
     assert len(read_jsonl(tmp_path / "history.jsonl")) == 3

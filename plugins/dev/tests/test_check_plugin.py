@@ -22,6 +22,7 @@ from qgs_dev import (
     runs_of,
 )
 from qgs_dev.modules import attributes
+from tables import must_refuse
 from torch import nn
 
 from qgs.contracts import CONTRACT_VERSION, MissingExtraError, Plugin
@@ -111,8 +112,7 @@ def test_exemptions_are_of_a_class_or_of_options() -> None:
 )
 def test_unsound_exemptions_are_refused(exemptions, examples) -> None:
     installed = _installed(FreeCenters, examples=examples, exemptions=exemptions)
-    with pytest.raises(PluginError, match="exemptions"):
-        runs_of(installed)
+    must_refuse("exemptions", runs_of, installed, kind=PluginError)
 
 
 @pytest.mark.parametrize("component", [CannotDefault, PhotosSource])
@@ -172,8 +172,12 @@ def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeyp
     assert titles[0] == f"{CACHES.label}: {STATE}"
     assert titles[1].startswith(f"{CACHES.label}: {FROZEN} passes, although")
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(pytest.skip.Exception, match="runs only on cuda"):
-        CaseRun(Case(GsplatRenderer.Config())).check(["core"])
+    must_refuse(
+        "runs only on cuda",
+        CaseRun(Case(GsplatRenderer.Config())).check,
+        ["core"],
+        kind=pytest.skip.Exception,
+    )
 
 
 def test_further_options_of_a_class_have_the_checks_that_see_options() -> None:

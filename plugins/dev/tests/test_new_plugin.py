@@ -91,7 +91,7 @@ def test_its_component_computes_its_formula(sink: float) -> None:
     state = QueryState(torch.randn(2, 3, 16))
     keys, values = torch.randn(2, 2, 2, 6, 8)
     memory = ImageMemory(torch.randn(2, 6, 16), keys, values, torch.randn(2, 6, 6), (1, 2, 3))
-    logits = module.core.project(state.features) @ keys.transpose(-1, -2) / 8**0.5
+    logits = module.core.project(state.features) @ keys.mT / 8**0.5
     read = logits.exp() @ values / (math.exp(sink) + logits.exp().sum(-1, keepdim=True))
     expected = module.core.out_proj(read.transpose(1, 2).flatten(2))
     torch.testing.assert_close(module(state, memory), expected)

@@ -8,6 +8,7 @@ from qgs_locus.kernels import attention_choice
 from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.kernels.attention_choice import SHARE, chosen_kernel
 from qgs_locus.ray_bias import RayBias
+from tables import must_refuse
 
 
 class NotInTriton(RayBias):
@@ -78,5 +79,4 @@ def test_on_a_cpu_blocks_are_taken_and_triton_is_refused(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     q, bias = case()
     assert chosen_kernel(q, bias, "auto") == "blocks"
-    with pytest.raises(ValueError, match="a GPU"):
-        biased_attention(q, q, q, bias, "triton")
+    must_refuse("a GPU", biased_attention, q, q, q, bias, "triton")

@@ -18,6 +18,7 @@ from qgs_viewer.comparison import open_models, resolve_fairly
 from qgs_viewer.opening import open_source
 from qgs_viewer.scenes import model_scenes
 from small import RECIPE, stand_in
+from tables import must_refuse
 
 import qgs
 from qgs.drawing.images import rgb_picture, write_png
@@ -38,8 +39,7 @@ def test_recipes_with_other_data_are_not_compared(tmp_path):
     few.write_text(yaml.safe_dump(RECIPE))
     more.write_text("{recipe: 1, extends: few.yaml, views: {gap: [2, 5]}}")
     assert [*resolve_fairly([few, few], seconds=1, seed=0)] == ["few", "few (2)"]
-    with pytest.raises(ValueError, match="more and few differ in views"):
-        resolve_fairly([few, more], seconds=1, seed=0)
+    must_refuse("more and few differ in views", resolve_fairly, [few, more], seconds=1, seed=0)
 
 
 def test_all_systems_can_be_compared():
@@ -105,8 +105,9 @@ def test_small_scenes_keep_their_photos_and_others_every_eighth(models, tmp_path
 def test_two_photos_leave_nothing_to_compare_with(models, tmp_path):
     photos = noisy_photos(tmp_path / "two", 2)
     out = tmp_path / "demo"
-    with pytest.raises(ValueError, match="none is left to compare with"):
-        done("demo", photos, "--model", models[0], "--out", out)
+    must_refuse(
+        "none is left to compare with", done, "demo", photos, "--model", models[0], "--out", out
+    )
     assert not out.exists()
 
 
@@ -131,8 +132,7 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     (tmp_path / "demo").mkdir()
     assert new_folder(None, "demo").name == "demo-2"
     (tmp_path / "demo/report.html").touch()
-    with pytest.raises(FileExistsError, match="not empty"):
-        new_folder(tmp_path / "demo", "demo")
+    must_refuse("not empty", new_folder, tmp_path / "demo", "demo", kind=FileExistsError)
 
 
 RUN = "<script>alert(1)"
@@ -234,5 +234,4 @@ def test_a_scale_can_be_set(room, tmp_path):
         ("report", MODEL, "--photos", room, *out),
         ("view", MODEL, room),
     ):
-        with pytest.raises(ValueError, match="--scale"):
-            done(*words, "--scale", "0")
+        must_refuse("--scale", done, *words, "--scale", "0")

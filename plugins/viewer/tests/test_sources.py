@@ -7,6 +7,7 @@ import pytest
 from qgs_viewer.opening import ModelSource, open_source
 from qgs_viewer.query_scene import NEUTRAL
 from small import VIEWS, model_of
+from tables import must_refuse
 from walk import Walk
 
 import qgs
@@ -72,5 +73,4 @@ def test_without_its_model_it_is_shown_as_it_is(opened):
 def test_a_reconstruction_keeps_its_background(opened):
     assert opened(model="", background=[0.0, 0.5, 1.0]).scene_of(()).background == (0.0, 0.5, 1.0)
     assert opened("scene", "views").scene_of(()).background == NEUTRAL
-    with pytest.raises(ValueError, match=r"cameras\.json is no record"):
-        opened(background=[0.5])
+    must_refuse(r"cameras\.json is no record", opened, background=[0.5])

@@ -21,6 +21,7 @@ from qgs_viewer.page import quiet_server, scene_html
 from qgs_viewer.panel import Panel, plain
 from qgs_viewer.query_scene import QueryScene
 from small import QUERIES, cloud, model_of, model_scenes_of, sample_of, source_of
+from tables import must_refuse
 from viser.transforms import SO3
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -224,8 +225,7 @@ def test_a_page_shows_the_query_that_was_asked_for(opened, tmp_path):
         view(model, *where, "--query", 3)
     assert picked.read_text() != plain.read_text()
     for where in (["--html", none], ["--port", 0]):
-        with pytest.raises(ValueError, match=f"--query {QUERIES}"):
-            view(model, *where, "--query", QUERIES)
+        must_refuse(f"--query {QUERIES}", view, model, *where, "--query", QUERIES)
     assert not none.exists()
 
 

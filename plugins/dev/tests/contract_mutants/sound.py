@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from contract_mutants.mutant import named
 from contract_mutants.renderers import RefusesWhatItDeclares
-from contract_mutants.spatial import PlacesByALayer
+from contract_mutants.spatial import BiasedAttention, PlacesByALayer
 from einops import rearrange
 from torch import nn
 
@@ -126,7 +126,7 @@ class RefusesIntrinsics(RefusesWhatItDeclares):
 
 
 @named
-class EachHeadSeesASide(ContentCrossAttention):
+class EachHeadSeesASide(BiasedAttention):
     """A bias for each head that hides what lies left, or right, of the camera's axis."""
 
     @classmethod
@@ -141,11 +141,3 @@ class EachHeadSeesASide(ContentCrossAttention):
         heads = torch.arange(self.dims.heads).to(side_B1M.device) % 2 == 1
         bias_BhM = side_B1M.square().masked_fill((side_B1M < 0.05) == heads[:, None], -torch.inf)
         return bias_BhM[:, :, None].expand(-1, -1, state.features.shape[1], -1)
-
-    def forward(self, state, memory):
-        bias = self.bias(state, memory)
-        return self.core(state.features, memory.keys, memory.values, bias)
-
-    def explain(self, state, memory, queries):
-        bias = self.bias(state, memory)
-        return self.core.explain(state.features, memory.keys, queries, bias)

@@ -147,17 +147,8 @@ class DecodesInHalf(GaussianHead):
         return GaussianAttributes(good.offsets, good.scales, good.quats, opacities, good.colors)
 
 
-@mutant(CHECK, "explain.geometry")
-class BiasesInHalf(ContentCrossAttention):
-    @classmethod
-    def fields_read(cls, config):
-        memory = ("memory.keys", "memory.values", "memory.patch_rays")
-        return {**PLACE, **{name: MEMORY_FIELDS[name] for name in memory}}
-
-    def bias(self, state, memory):
-        center = state["place.center"]
-        directions = memory.patch_rays[..., 3:]
-        return (center @ directions.transpose(-1, -2)).to(center)
+class BiasedAttention(ContentCrossAttention):
+    """Attention with the bias that a subclass computes."""
 
     def forward(self, state, memory):
         bias = self.bias(state, memory)
@@ -166,6 +157,19 @@ class BiasesInHalf(ContentCrossAttention):
     def explain(self, state, memory, queries):
         bias = self.bias(state, memory)
         return self.core.explain(state.features, memory.keys, queries, bias)
+
+
+@mutant(CHECK, "explain.geometry")
+class BiasesInHalf(BiasedAttention):
+    @classmethod
+    def fields_read(cls, config):
+        memory = ("memory.keys", "memory.values", "memory.patch_rays")
+        return {**PLACE, **{name: MEMORY_FIELDS[name] for name in memory}}
+
+    def bias(self, state, memory):
+        center = state["place.center"]
+        directions = memory.patch_rays[..., 3:]
+        return (center @ directions.mT).to(center)
 
 
 @mutant("updates_are_explained", "of them is unexplained")
@@ -188,7 +192,7 @@ class BatchNormed(MlpFeedForward):
         self.statistics = nn.BatchNorm1d(dims.width)
 
     def forward(self, features):
-        return self.statistics(super().forward(features).transpose(1, 2)).transpose(1, 2)
+        return self.statistics(super().forward(features).mT).mT
 
 
 @mutant("query_permutation", "permuted queries")

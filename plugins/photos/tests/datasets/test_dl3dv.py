@@ -86,8 +86,7 @@ def test_reduced_photos_are_chosen(tmp_path):
     write(tmp_path / "abc", {**files, "images_8/0.png": photo(9, (16, 9))})
     for options, red in (({"images": "images_8"}, 90), ({}, 0)):
         assert scene(tmp_path, **options).images([0])[0, 0, 0, 0] * 255 == pytest.approx(red)
-    with pytest.raises(FileNotFoundError, match="images_2"):
-        scene(tmp_path, images="images_2")
+    must_refuse("images_2", scene, tmp_path, images="images_2", kind=FileNotFoundError)
 
 
 def length(path):
@@ -113,8 +112,7 @@ def test_a_damaged_photo_names_archive_and_file(tmp_path):
     data = bytearray(archive.read_bytes())
     data[data.index(photo(1)) + 60] ^= 255
     archive.write_bytes(data)
-    with pytest.raises(ValueError, match=r"abc/images_4/1\.png::.*abc\.zip"):
-        scene(tmp_path).images([1])
+    must_refuse(r"abc/images_4/1\.png::.*abc\.zip", scene(tmp_path).images, [1])
 
 
 def several(path):

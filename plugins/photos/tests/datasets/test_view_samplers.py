@@ -3,10 +3,10 @@
 from itertools import islice
 
 import numpy as np
-import pytest
 import torch
 from line_scenes import Line, Lines, circle, samples_of
 from qgs_photos.datasets.view_samplers import Bounded, Farthest, Overlapping
+from tables import must_refuse
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
@@ -50,8 +50,7 @@ def test_the_gap_widens_as_in_pixelsplat():
 
 def test_short_scenes_and_several_inputs():
     assert bounded().draw(Line(5), TWO, seeded(), END)[0] == (0, 4)
-    with pytest.raises(ValueError, match="5 frames"):
-        bounded(margin=3).draw(Line(5), TWO, seeded(), END)
+    must_refuse("5 frames", bounded(margin=3).draw, Line(5), TWO, seeded(), END)
     inputs, _ = bounded().draw(Line(30), ViewsConfig(inputs=4, targets=1), seeded(), END)
     assert len(inputs) == 4
     assert list(inputs) == sorted({*inputs})
@@ -129,8 +128,13 @@ def test_inputs_stand_where_cameras_move():
 
 
 def test_more_inputs_than_views():
-    with pytest.raises(RecipeError, match="fewest"):
-        opened("view_sampler={type: datasets/farthest, fewest: 3}", "views.inputs=2")
+    must_refuse(
+        "fewest",
+        opened,
+        "view_sampler={type: datasets/farthest, fewest: 3}",
+        "views.inputs=2",
+        kind=RecipeError,
+    )
 
 
 def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
@@ -233,18 +237,25 @@ def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn():
     scene = Arc(40, held_out=(3,))
     scene.times = torch.arange(40).double()
     assert SAMPLER.windows(scene, VIEWS) == []
-    with pytest.raises(ValueError, match=r"moves: .* qgs/span"):
-        SAMPLER.draw(scene, VIEWS, seeded(), 0)
+    must_refuse(r"moves: .* qgs/span", SAMPLER.draw, scene, VIEWS, seeded(), 0)
 
 
 def test_too_few_photos_are_refused():
-    with pytest.raises(ValueError, match="'line2' has 2 photos, and needs 3"):
-        SAMPLER.draw(Line(2), VIEWS, seeded(), 0)
-    with pytest.raises(ValueError, match="has 1 photos beside 1 held-out ones, and needs 2"):
-        SAMPLER.windows(Line(2, held_out=(1,)), VIEWS)
+    must_refuse("'line2' has 2 photos, and needs 3", SAMPLER.draw, Line(2), VIEWS, seeded(), 0)
+    must_refuse(
+        "has 1 photos beside 1 held-out ones, and needs 2",
+        SAMPLER.windows,
+        Line(2, held_out=(1,)),
+        VIEWS,
+    )
 
 
 def test_bounds_are_ordered():
     for apart in ("[2, 1]", "[0, 1]"):
-        with pytest.raises(RecipeError, match="least"):
-            resolve("finetune/photos.yaml", [f"view_sampler.apart={apart}"])
+        must_refuse(
+            "least",
+            resolve,
+            "finetune/photos.yaml",
+            [f"view_sampler.apart={apart}"],
+            kind=RecipeError,
+        )

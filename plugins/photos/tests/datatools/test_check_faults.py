@@ -3,12 +3,12 @@
 import os
 
 import numpy as np
-import pytest
 import torch
 from photo_formats import encoded
 from PIL import Image
 from planted import ALL, FLIP, HASH, INTRINSICS, SIZE, alike, record, save, told
 from qgs_photos.datatools.check import Options, check
+from tables import must_refuse
 from upath import UPath
 
 from qgs.data.photos import present_frames
@@ -146,8 +146,11 @@ def test_photos_have_one_number_in_reading_and_in_checking(planted):
     del room.files["images/1.jpg"]
     room.poses[3] = np.nan
     planted.check()
-    with pytest.raises(ValueError, match=r"frame 2 \(images/3\.jpg\): the pose has NaN"):
-        present_frames(UPath(planted.root / "room 00"))
+    must_refuse(
+        r"frame 2 \(images/3\.jpg\): the pose has NaN",
+        present_frames,
+        UPath(planted.root / "room 00"),
+    )
 
 
 def test_faults_of_a_scene_in_a_chunk(shots, tmp_path):
@@ -228,7 +231,18 @@ def test_single_files_are_data_sets_too(good):
 
 def test_nothing_passes_in_silence(good):
     room = UPath(good / "room")
-    with pytest.raises(FileNotFoundError, match="holds no chunks: leave --format out"):
-        check(room, Options(format="chunks"))
-    with pytest.raises(FileNotFoundError, match="no evaluation index at"):
-        check(room, Options(geometry=0), [room / "none.json"])
+    must_refuse(
+        "holds no chunks: leave --format out",
+        check,
+        room,
+        Options(format="chunks"),
+        kind=FileNotFoundError,
+    )
+    must_refuse(
+        "no evaluation index at",
+        check,
+        room,
+        Options(geometry=0),
+        [room / "none.json"],
+        kind=FileNotFoundError,
+    )

@@ -173,18 +173,25 @@ def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path
     image = tmp_path / "scenes/s3/images/1.png"
     whole = image.read_bytes()
     image.write_bytes(whole[:200])
-    with pytest.raises(ValueError, match=r"scene 's3', frame 1 \(images/1\.png\) cannot be read"):
-        pack(six, out, chunk_bytes=1)
+    must_refuse(
+        r"scene 's3', frame 1 \(images/1\.png\) cannot be read", pack, six, out, chunk_bytes=1
+    )
     assert not list(out.rglob("index.json"))
-    with pytest.raises(ValueError, match=r"other settings .*'chunk_bytes': 1"):
-        pack(six, out, chunk_bytes=2)
+    must_refuse(r"other settings .*'chunk_bytes': 1", pack, six, out, chunk_bytes=2)
 
     result = pack(six, tmp_path / "others", leave_out_broken=True)
     assert result.scenes["train"] == 5
     assert "images/1.png" in result.left_out["s3"]
     alone = {"train": {"s3": ("train", 3)}, "test": {}}
-    with pytest.raises(ValueError, match="no scene to pack: s3: "):
-        packing.pack(six, alone, UPath(tmp_path / "none"), {}, leave_out_broken=True)
+    must_refuse(
+        "no scene to pack: s3: ",
+        packing.pack,
+        six,
+        alone,
+        UPath(tmp_path / "none"),
+        {},
+        leave_out_broken=True,
+    )
 
     image.write_bytes(whole)
     six = source(tmp_path / "scenes")

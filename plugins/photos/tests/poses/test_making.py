@@ -14,6 +14,7 @@ from PIL import Image
 from qgs_photos.poses import door, making
 from qgs_photos.poses.making import Options, make_poses
 from qgs_photos.poses.photos import PosesError
+from tables import must_refuse
 from upath import UPath
 from walked import PHOTOS, SCALE, quiet, write_photos, write_video
 
@@ -92,8 +93,15 @@ def test_turning_on_the_spot_gives_no_poses(monkeypatch, shots, tmp_path):
     monkeypatch.setattr(textured_room, "_poses", lambda count: turns)
     folder = write_photos(tmp_path / "photos", [shot.image for shot in textured_room.walk(PHOTOS)])
     # several threads now and then find a model of points far away
-    with pytest.raises(PosesError, match="turn on the spot"):
-        make_poses(folder, tmp_path / "poses", Options(threads=1), quiet())
+    must_refuse(
+        "turn on the spot",
+        make_poses,
+        folder,
+        tmp_path / "poses",
+        Options(threads=1),
+        quiet(),
+        kind=PosesError,
+    )
 
 
 @pytest.fixture
@@ -133,20 +141,17 @@ def test_poses_are_made_once_and_kept_beside_the_photos(folder, calls):
     assert (beside / "sparse/0").is_dir()
     assert {*folder.parent.iterdir()} == {folder, beside}
     (folder / "1.jpg").unlink()  # other photos are not mixed up
-    with pytest.raises(PosesError, match="holiday_poses"):
-        photos_of(folder)
+    must_refuse("holiday_poses", photos_of, folder, kind=PosesError)
 
 
 def test_a_training_makes_none(folder, calls):
-    with pytest.raises(FileNotFoundError, match="Make some by `qgs poses`"):
-        opened(folder).scenes("train")
+    must_refuse("Make some by `qgs poses`", opened, folder, kind=FileNotFoundError)
     assert not calls
 
 
 def test_a_folder_whose_photos_are_elsewhere_is_none(tmp_path):
     (tmp_path / "a/b").mkdir(parents=True)
-    with pytest.raises(FileNotFoundError, match="lists no cameras"):
-        photos_of(tmp_path / "a")
+    must_refuse("lists no cameras", photos_of, tmp_path / "a", kind=FileNotFoundError)
 
 
 def test_of_several_calls_at_once_one_makes_them_and_the_others_wait(folder, calls):
@@ -161,5 +166,4 @@ def test_a_read_only_place_names_the_command_for_another(folder, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(door, "FileLock", refused)
-    with pytest.raises(OSError, match=re.escape(f"qgs poses {folder} --out")):
-        door.posed_folder(folder)
+    must_refuse(re.escape(f"qgs poses {folder} --out"), door.posed_folder, folder, kind=OSError)

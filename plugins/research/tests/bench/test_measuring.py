@@ -8,7 +8,6 @@ from copy import deepcopy
 from dataclasses import replace
 from unittest.mock import Mock, call
 
-import pytest
 import torch
 import torch.nn.functional as F
 from qgs_research.bench.run import forward_flops, in_turn
@@ -20,6 +19,7 @@ from qgs_research.bench.work import (
     resident_bytes,
     workload_of,
 )
+from tables import must_refuse
 from torch import nn
 from torch.testing import assert_close
 
@@ -41,8 +41,7 @@ def test_the_recipe_says_how_much_work_there_is():
     recipe = resolve("locus/dl3dv_4096_4views.yaml")
     assert workload_of(recipe) == Workload(views=4, targets=4, size=(256, 448))
     assert workload_of(recipe, views=6, size=(64, 32)) == Workload(6, 4, (64, 32))
-    with pytest.raises(ValueError, match=r"no data\.image_size.*--size HxW"):
-        workload_of(resolve("locus/overlay.yaml"))
+    must_refuse(r"no data\.image_size.*--size HxW", workload_of, resolve("locus/overlay.yaml"))
 
 
 def test_inference_leaves_the_model_alone_and_a_step_trains_every_part():
@@ -90,11 +89,18 @@ def die(*_):
 
 def test_what_failed_in_the_process_is_told(monkeypatch):
     recipe = resolve(TOKENGS, SMALL)
-    with pytest.raises(ValueError, match="images of 15 x 24 cannot be cut into patches"):
-        peak_memory(recipe, "forward", Workload(2, 2, (15, 24)), threads=1)
+    must_refuse(
+        "images of 15 x 24 cannot be cut into patches",
+        peak_memory,
+        recipe,
+        "forward",
+        Workload(2, 2, (15, 24)),
+        threads=1,
+    )
     monkeypatch.setattr("qgs_research.bench.work.measure", die)
-    with pytest.raises(ChildProcessError, match="was killed"):
-        peak_memory(recipe, "forward", MODEST, threads=1)
+    must_refuse(
+        "was killed", peak_memory, recipe, "forward", MODEST, threads=1, kind=ChildProcessError
+    )
 
 
 def test_operations_are_those_of_layers_and_attention(monkeypatch):

@@ -14,6 +14,7 @@ from qgs_research.published.layouts import PublishedError, fitting_recipe, names
 from qgs_research.published.tokengs import TOKENGS
 from qgs_research.published.tokengs2026 import TOKENGS_2026_6
 from safetensors.torch import load_file, save_file
+from tables import must_refuse
 from torch.testing import assert_close
 
 import qgs
@@ -65,7 +66,7 @@ def test_an_imported_checkpoint_is_like_any_other(tmp_path):
     model = qgs.load(path)
     assert torch.equal(model.queries.get_parameter("center"), LOCUS["gs_anchor_xyz_raw"])
     assert CheckpointFile(path).extra == {"imported": "LocusGS weights w.safetensors"}
-    text = path.with_suffix(".yaml").read_text(encoding="utf-8")
+    text = path.with_suffix(".yaml").read_text()
     assert model.recipe == resolve(path.with_suffix(".yaml")).tree
     assert "queries:\n    type: locus/anchored\n    count: 12\n" in text
     assert "#   losses: photometric, visibility, and anchor visibility" in text
@@ -157,24 +158,21 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path):
         broken = TOKENGS_A["gs_tokens"].clone()
         broken[3, 5] = value
         for tokens in (broken, broken.nan_to_num(0, 0).long()):
-            with pytest.raises(ValueError, match="gs_tokens"):
-                imported(tmp_path, TOKENGS_A | {"gs_tokens": tokens})
+            must_refuse("gs_tokens", imported, tmp_path, TOKENGS_A | {"gs_tokens": tokens})
     assert os.listdir(tmp_path) == ["w.safetensors"]
 
 
 def test_nothing_is_overwritten(tmp_path):
     for name in ("made.safetensors", "made.yaml"):
         (tmp_path / name).touch()
-        with pytest.raises(FileExistsError, match=name):
-            imported(tmp_path, TOKENGS_A)
+        must_refuse(name, imported, tmp_path, TOKENGS_A, kind=FileExistsError)
         (tmp_path / name).unlink()
 
 
 def test_no_checkpoint_stays_without_its_recipe(tmp_path, monkeypatch):
     full = Mock(side_effect=OSError("no space left"))
     monkeypatch.setattr("qgs_research.published.importing.write_text", full)
-    with pytest.raises(OSError, match="no space left"):
-        imported(tmp_path, TOKENGS_A)
+    must_refuse("no space left", imported, tmp_path, TOKENGS_A, kind=OSError)
     assert os.listdir(tmp_path) == ["w.safetensors"]
 
 

@@ -18,6 +18,7 @@ from qgs_research.studies.results import Results
 from qgs_research.studies.runs import run_of
 from qgs_research.studies.study import read_study
 from rich.console import Console
+from tables import must_refuse
 
 RECIPES = Path(__file__).parents[4] / "recipes"
 
@@ -60,8 +61,7 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
 
     changed = study.read_text().replace("qgs/content}", "locus/ray_biased, bandwidth: fixed}")
     study.write_text(changed)
-    with pytest.raises(ValueError, match="`flat`"):
-        done("study", study, "--out", out, "--workers", 0)
+    must_refuse("`flat`", done, "study", study, "--out", out, "--workers", 0)
 
 
 def trained(plan, runs=None, workers=1):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from commands import done, run_qgs, sets
+from tables import must_refuse
 
 RECIPE = Path(__file__).parents[4] / "recipes/tiny/locus.yaml"
 
@@ -20,10 +21,16 @@ def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(tmp_path,
     assert f"cd {tmp_path} || exit\n" in script
     assert f"--output='{tmp_path}/my runs/a.slurm-%j.log'\n" in script
     assert "training.batch_size=8 --out 'my runs/a' --threads 2 --resume & job=$!\n" in script
-    with pytest.raises(ValueError, match=r"training\.batch_size"):
-        done(*words, "--out", "b", "--gpus", 3)
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        done(*words, "--out", "b", *sets("data={type: qgs/photos, path: nowhere}"))
+    must_refuse(r"training\.batch_size", done, *words, "--out", "b", "--gpus", 3)
+    must_refuse(
+        "nowhere",
+        done,
+        *words,
+        "--out",
+        "b",
+        *sets("data={type: qgs/photos, path: nowhere}"),
+        kind=FileNotFoundError,
+    )
     assert run_qgs(*words, "--out", "b", "--gpu", 2).exit_code == 2
     assert [path.name for path in tmp_path.iterdir()] == ["my runs"]
 

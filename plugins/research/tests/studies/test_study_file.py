@@ -13,6 +13,7 @@ from qgs_research.studies.hypotheses import parsed
 from qgs_research.studies.plan import composed, planned
 from qgs_research.studies.runs import recipe_file, run_of, write_plan
 from qgs_research.studies.study import read_study
+from tables import must_refuse
 
 from qgs.contracts import OptionError
 from qgs.recipe import RecipeError, resolve
@@ -131,8 +132,7 @@ def test_a_study_that_was_moved_knows_its_runs_by_what_the_index_holds(tmp_path)
         index = json.loads(text)
         index.popitem()
         (new / file).write_text(json.dumps(index))
-        with pytest.raises(ValueError, match=f"{file}.*{remedy}"):
-            planned(study, out)
+        must_refuse(f"{file}.*{remedy}", planned, study, out)
         (new / file).write_text(text)
 
 
@@ -150,8 +150,7 @@ def test_variants_judged_by_the_same_index_under_two_names_are_alike(tmp_path, n
 def test_a_metric_that_cannot_be_measured_here_is_refused_before_training(tmp_path):
     metrics = "{plugins: [lpips], metrics: {lpips: {type: lpips/vgg16}}}"
     text = SOUND + f"metric: lpips\noverlay: {metrics}\n"
-    with pytest.raises(OptionError, match="lpips"):
-        planned(read(tmp_path, text), tmp_path / "out")
+    must_refuse("lpips", planned, read(tmp_path, text), tmp_path / "out", kind=OptionError)
 
 
 def test_hypotheses_are_sums_that_weigh_alike():

@@ -11,6 +11,7 @@ from odd_views import odd_views
 from qgs_dev import Case, checks_for, run_check
 from qgs_zoo.c3g.vggt import MODULE, VggtFeatures
 from safetensors.torch import load_file, save_file
+from tables import must_refuse
 from torch import nn
 from torch.testing import assert_close
 
@@ -101,8 +102,12 @@ def test_without_vggt_the_message_names_what_installs_it(weights, monkeypatch):
     monkeypatch.setitem(sys.modules, MODULE, None)
     recipe = resolve(TINY, overrides(weights))
     for device in ("cpu", "meta"):
-        with pytest.raises(MissingExtraError, match=r"pip install git\+https.*qgs/multiview_vit"):
-            recipe.build_model(device)
+        must_refuse(
+            r"pip install git\+https.*qgs/multiview_vit",
+            recipe.build_model,
+            device,
+            kind=MissingExtraError,
+        )
 
 
 def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
@@ -113,8 +118,7 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
     loaded = qgs.load(tmp_path / "checkpoint.safetensors")
     given = odd_views(3, 28, 42)
     assert torch.equal(loaded(given).gaussians.means, model(given).gaussians.means)
-    with pytest.raises(MissingExtraError, match="cannot read weights"):
-        recipe.build_model()
+    must_refuse("cannot read weights", recipe.build_model, kind=MissingExtraError)
 
 
 def test_it_keeps_the_contract_of_encoders(weights):

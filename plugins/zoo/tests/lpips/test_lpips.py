@@ -8,6 +8,7 @@ import torch
 from qgs_zoo.lpips import Lpips, LpipsLoss
 from refusals import refused
 from safetensors.torch import load_file, save_file
+from tables import must_refuse
 from torch import nn
 from torch.testing import assert_close
 
@@ -97,14 +98,14 @@ def test_images_are_clipped_and_small_ones_refused(vgg):
     lpips = lpips_of(vgg).distance
     image, truth = torch.rand(2, 1, 3, 16, 16)
     assert torch.equal(lpips(image * 3 - 1, truth), lpips((image * 3 - 1).clamp(0, 1), truth))
-    with pytest.raises(ValueError, match="at least 16 pixels a side, got 15x16"):
-        lpips(image[..., :15, :], truth[..., :15, :])
+    must_refuse(
+        "at least 16 pixels a side, got 15x16", lpips, image[..., :15, :], truth[..., :15, :]
+    )
 
 
 def test_without_the_package_the_reason_names_the_extra(monkeypatch):
     monkeypatch.setattr("qgs_zoo.lpips.network.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match="lpips"):
-        lpips_of()
+    must_refuse("lpips", lpips_of, kind=MissingExtraError)
     metrics = resolve(RECIPE, ["metrics={lpips: {type: lpips/vgg16}}"]).build_metrics()
     assert "lpips" in metrics["lpips"].unavailable  # evaluations go on without it
 
@@ -115,8 +116,7 @@ def test_weights_that_are_not_there_or_do_not_fit_are_named(tmp_path, monkeypatc
     resnet = tmp_path / "resnet.safetensors"
     save_file({"conv1.weight": torch.zeros(1)}, resnet)
     for weights, named in ((None, "vgg16-397"), (Path("mine.pth"), "mine.pth"), (resnet, "resnet")):
-        with pytest.raises(MissingExtraError, match=named):
-            lpips_of(weights)
+        must_refuse(named, lpips_of, weights, kind=MissingExtraError)
 
 
 def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg):

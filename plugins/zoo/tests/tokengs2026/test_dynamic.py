@@ -9,6 +9,7 @@ from qgs_zoo.tokengs2026.dynamic import MOVES, DynamicQueries
 from qgs_zoo.tokengs2026.multiscale import MultiscaleViT, TimeEmbedding, time_features
 from refusals import problems_of
 from small_parts import made
+from tables import must_refuse
 from torch.testing import assert_close
 
 from qgs.contracts.schedule import follow
@@ -79,10 +80,10 @@ def model():
 
 
 def test_views_without_times_are_refused(model):
-    with pytest.raises(ValueError, match=r"reads the times of photos, .*time_channels to 0"):
-        model(views(target=torch.zeros(2, 1)))
-    with pytest.raises(ValueError, match=r"requested time: .* target_time \(B, 1\)"):
-        model(views(torch.zeros(2, 2)))
+    must_refuse(
+        r"reads the times of photos, .*time_channels to 0", model, views(target=torch.zeros(2, 1))
+    )
+    must_refuse(r"requested time: .* target_time \(B, 1\)", model, views(torch.zeros(2, 2)))
 
 
 def test_what_reads_times_is_refused_beside_data_that_tell_none():
@@ -112,8 +113,7 @@ def test_no_loss_may_have_the_term_of_the_objective(model):
     objective = TrainingPass(small(), model)
     loss = next(iter(objective.losses.values()))
     loss.forward = lambda *given: {"dynamic": given[0].gaussians.means.sum()}
-    with pytest.raises(ValueError, match=r"losses have terms \['dynamic'\] already"):
-        objective(INPUTS, TARGETS)
+    must_refuse(r"losses have terms \['dynamic'\] already", objective, INPUTS, TARGETS)
 
 
 def test_larger_patches_embed_times_as_smaller_ones():
