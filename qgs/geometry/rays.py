@@ -38,7 +38,7 @@ def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
 def plucker_rays(cameras: Cameras) -> Tensor:
     """Return Plücker maps (..., 6, H, W): moment o x d, then direction d (TokenGS release)."""
     origins, directions = camera_rays(cameras)
-    moments = torch.linalg.cross(origins, directions, dim=-1)
+    moments = torch.linalg.cross(origins, directions)
     return torch.cat([moments, directions], -1).movedim(-1, -3)
 
 
@@ -61,6 +61,7 @@ def camera_centers(rays: Tensor, grid: tuple[int, int, int]) -> Tensor:
     """
     moments, directions = rays.unflatten(1, (grid[0], -1)).chunk(2, -1)
     # A moment o x d is the sum over axes of o_i (e_i x d).
-    parts = torch.linalg.cross(torch.eye(3).to(rays), directions[..., None, :], dim=-1)
+    axes = torch.eye(3).to(rays)[None, None, None]
+    parts = torch.linalg.cross(axes, directions[..., None, :])
     left = parts.mT.flatten(2, 3)
     return torch.linalg.lstsq(left, moments.flatten(2)[..., None]).solution[..., 0]

@@ -43,8 +43,7 @@ def bench(
 ) -> None:
     """Measure size, latency and memory of models, for any number of recipes.
 
-    Weights, photos and poses are random, so no data is needed. Latency and FLOPs
-    go from photos to Gaussians. Memory is a peak: of a process, or of a GPU.
+    Weights, photos and poses are random. Latency and FLOPs go to the Gaussians.
     """
     from rich.console import Console
 
