@@ -98,20 +98,27 @@ class QueryGaussianModel(nn.Module):
         # NumPy's cameras are float64, the weights hardly ever.
         views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))
         if isinstance(views, Photos):
-            parts = (self.encoder, self.queries, self.feedback)
-            readers = [type(part).__name__ for part in parts if part.reads_cameras]
-            if readers:
-                raise ValueError(
-                    f"{' and '.join(readers)} of this model need cameras, but these photos have "
-                    "none; give Views with cameras, or use an encoder that does not read them "
-                    "(reads_cameras)"
-                )
-            # Photos have all other fields that are read.
-            views = cast(Views, views)
+            views = self._without_cameras(views)
         memory = self.encoder(views)
         # Tuning at test time brings its own state.
         initial = self.queries(memory, views) if state is None else state
         return self.predict(views, memory, initial, layers)
+
+    def _without_cameras(self, photos: Photos) -> Views:
+        """Return `photos` for parts that read no cameras; raise ValueError if one does."""
+        readers = [
+            type(part).__name__
+            for part in (self.encoder, self.queries, self.feedback)
+            if part.reads_cameras
+        ]
+        if readers:
+            raise ValueError(
+                f"{' and '.join(readers)} of this model need cameras, but these photos have none; "
+                "give Views with cameras, or use an encoder that does not read them "
+                "(reads_cameras)"
+            )
+        # Photos have all other fields that are read.
+        return cast(Views, photos)
 
     def predict(
         self,
@@ -159,8 +166,9 @@ class QueryGaussianModel(nn.Module):
                 state, memory = self.feedback(before.state, first, rendering, photos)
             elif index == again:
                 first = memory
+            refine = self.refinements[self.refinement_of[index]]
             state, memory = self.decoder[index](state, memory)
-            state = self.refinements[self.refinement_of[index]](state)
+            state = refine(state)
             if number in layers or index == last - 1:
                 decoded[number] = LayerPrediction(self.decode(state), state)
         return Prediction(decoded[len(order)].gaussians, state, decoded)

@@ -257,7 +257,8 @@ def differing_options(
 
     None stands for an option that a recipe does not have.
     """
-    ours, theirs = ({key: inline(value) for key, value in flat(x).items()} for x in (a, b))
+    ours = {key: inline(value) for key, value in flat(a).items()}
+    theirs = {key: inline(value) for key, value in flat(b).items()}
     pairs = {key: (ours.get(key), theirs.get(key)) for key in ours | theirs}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
