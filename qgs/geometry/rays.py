@@ -62,6 +62,5 @@ def camera_centers(rays: Tensor, grid: tuple[int, int, int]) -> Tensor:
     moments, directions = rays.unflatten(1, (grid[0], -1)).chunk(2, -1)
     # A moment o x d is the sum over axes of o_i (e_i x d).
     axes = torch.eye(3).to(rays)[None, None, None]
-    parts = torch.linalg.cross(axes, directions[..., None, :])
-    left = parts.mT.flatten(2, 3)
-    return torch.linalg.lstsq(left, moments.flatten(2)[..., None]).solution[..., 0]
+    parts = torch.linalg.cross(axes, directions[..., None, :]).mT
+    return torch.linalg.lstsq(parts.flatten(2, 3), moments.flatten(2)[..., None]).solution[..., 0]

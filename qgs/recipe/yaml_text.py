@@ -73,9 +73,9 @@ class MapNode(dict[str, Any]):
             found = value if isinstance(value, MapNode) else empty
         return found
 
-    def origin_of(self, *keys: str) -> Origin:
-        """Return the origin of the first of `keys` that exists, else of the mapping."""
-        return next((self.origins[key] for key in keys if key in self.origins), self.origin)
+    def origin_of(self, key: str) -> Origin:
+        """Return the origin of `key` if it exists, else of the mapping."""
+        return self.origins.get(key, self.origin)
 
 
 class ListNode(list[Any]):

@@ -30,10 +30,8 @@ class LayerSupervision(Supervision):
         @field_validator("layers")
         @classmethod
         def _ascending(cls, layers: tuple[int, ...]) -> tuple[int, ...]:
-            if layers == (0,):
-                return layers
-            if list(layers) != sorted(set(layers)) or layers[0] < 1:
-                ascending = sorted({max(number, 1) for number in layers})
+            ascending = sorted({max(number, 1) for number in layers})
+            if layers != (0,) and list(layers) != ascending:
                 raise OptionError(
                     f"layers must ascend from 1 without repeats, got {list(layers)}",
                     f"write {ascending}",
