@@ -57,4 +57,4 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
 def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
     """Return a fix for a message: the nearest choice, or the list of choices."""
     near = nearest(word, choices)
-    return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices)) or 'none'}"
+    return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices), 30) or 'none'}"

@@ -13,7 +13,7 @@ from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.sections import SETTINGS
 from qgs.recipe.slots import MODEL_SLOTS, SLOTS, summary_of
 from qgs.recipe.yaml_text import inline
-from qgs.wording import did_you_mean
+from qgs.wording import nearest
 from qgs_dev.schema import settings_schema
 
 Schema = Mapping[str, Any]
@@ -68,8 +68,9 @@ def details(name: str, registry: Registry) -> Iterator[Table | str]:
         yield escape(f"{file}: {file.stat().st_size / 1e6:.1f} MB\n\n{card_of(file)}")
     elif not shown:
         known = [*SLOTS, *settings, *models, *(kind for _, kind in components)]
-        hint = did_you_mean(name, known, "names")
-        raise ValueError(f"there is no slot, component or section `{name}` in `qgs list`; {hint}")
+        near = nearest(name, known)
+        hint = f"did you mean `{near}`?" if near else "`qgs list` shows all names"
+        raise ValueError(f"there is no slot, component or section `{name}`; {hint}")
     for place, kind in shown:
         component = registry.components(place)[kind]
         heading = f"{recipe_path(place)}: {kind}, {_release(kind, registry)}"
