@@ -19,7 +19,7 @@ from qgs.domain import Domain, verdict
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import checked_window, choose_frames
-from qgs.reconstruction.scale import FoundScale, constant_scale, find_scale, photo_settings
+from qgs.reconstruction.scale import constant_scale, find_scale, photo_settings
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene
 from qgs.types import Cameras
@@ -137,20 +137,19 @@ def open_model(
     window = choose_frames(shown, recipe.views, inputs, chosen, None, trained)
     # photos of a user have a unit of their own
     views = photo_settings(recipe.views, own, overrides)
-    scales: list[FoundScale] = []
-    if views.scale == "search":
-        scales.append(find_scale(model, shown, *window, views))
+    scale = find_scale(model, shown, *window, views) if views.scale == "search" else None
+    if scale:
         # inputs that are chosen later keep the scale
-        views = constant_scale(views, scales[0].factor)
+        views = constant_scale(views, scale.factor)
     sample = make_sample(shown, *window, views, mirror=False)
     # users learn if their photos are like those of the training
     seen = Domain()
     seen.see(sample.inputs.cameras, sample.targets.cameras)
     notes = [
-        *(f"{scale.text}; --scale sets another" for scale in scales),
+        f"{scale.text}; --scale sets another" if scale else "",
         f"inputs {listed(map(shown.frame_name, sample.input_frames))}" if photos else "",
         verdict(trained, seen),
-        *(scale.poor for scale in scales),
+        scale.poor if scale else "",
     ]
     title = f"{name}: {shown.name}"
     given = [note for note in notes if note]

@@ -18,8 +18,8 @@ def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
     parts = []
     for model in models:
         if found := model.search.found.values():
-            factors = sorted(scale.factor for scale in found)
-            ends = dict.fromkeys(f"{factor:.3g}" for factor in (factors[0], factors[-1]))
+            factors = [scale.factor for scale in found]
+            ends = dict.fromkeys(f"{factor:.3g}" for factor in (min(factors), max(factors)))
             mean = sum(scale.psnr for scale in found) / len(found)
             poor = sum(bool(scale.poor) for scale in found)
             fault = f", no scale fits {counted(poor, 'window')}" if poor else ""

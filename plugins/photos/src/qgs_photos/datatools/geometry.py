@@ -240,8 +240,9 @@ def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Findi
         )
         every = range(len(scene.photos))
         advice = _ADVICE
+        height, width = scene.decoded[0].size or (0, 1)
         # of other shapes both readings are understood
-        if any(p.listed.turns for p in scene.photos) and len({*(scene.decoded[0].size or ())}) == 1:
+        if height == width and any(photo.listed.turns for photo in scene.photos):
             advice = f"these are square and turned by EXIF: {TURN}"
         yield scene.finding(every, reason, advice, severity(geometry.fraction))
 
