@@ -31,29 +31,31 @@ from qgs_locus.fields import (
 
 
 class NormalCenters(ComponentConfig):
-    """Normal distribution of the first centres (release: N(0, 1), z + 1)."""
+    """Normal distribution of the initial anchor centres; the defaults are LocusGS's."""
 
     kind: Literal["normal"] = "normal"
-    """Draw the centres from a normal distribution around `mean`."""
+    """Draw the initial anchor centres from a normal distribution around `mean`."""
     mean: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Mean of the centres, world units."""
     std: float = Field(default=1.0, ge=0)
     """Standard deviation of each coordinate, world units."""
 
     def sample(self, count: int) -> Tensor:
-        """Draw centres (count, 3)."""
+        """Draw `count` centres (count, 3), world frame."""
         return torch.randn(count, 3) * self.std + torch.tensor(self.mean)
 
 
 class FrustumCenters(ComponentConfig):
-    """First centres in the first camera's frustum, uniform in log depth and in the image."""
+    """Initial anchor centres in the first camera's frustum, uniform in log depth and image."""
 
     kind: Literal["frustum"]
-    """Draw centres in the first camera's frustum, uniformly in log depth and in the image."""
+    """Draw the initial anchor centres in the frustum of the first camera. They are uniformly
+    distributed over the image and over the logarithm of depth."""
     depth: tuple[float, float] = (0.3, 3.0)
-    """[nearest, farthest] z, world units."""
+    """[nearest, farthest] depth z of a centre, world units."""
     slope: float = Field(default=0.6, gt=0)
-    """Largest |x / z| and |y / z|."""
+    """Largest |x / z| and |y / z| of a centre. This is half of the frustum's width and height at
+    depth 1."""
 
     @field_validator("depth")
     @classmethod
@@ -67,7 +69,7 @@ class FrustumCenters(ComponentConfig):
         return depth
 
     def sample(self, count: int) -> Tensor:
-        """Draw centres (count, 3)."""
+        """Draw `count` centres (count, 3), world frame."""
         near, far = self.depth
         # Equal steps of parallax, not of depth.
         z = near * (far / near) ** torch.rand(count, 1)
@@ -75,7 +77,7 @@ class FrustumCenters(ComponentConfig):
 
 
 class AnchoredQueries(LearnedQueries):
-    """N queries with learned features, centres mu and raw radii rho, shared by all scenes."""
+    """N learned queries for all scenes: features, anchor centres mu and raw radii rho."""
 
     name = "anchored"
 
@@ -87,7 +89,7 @@ class AnchoredQueries(LearnedQueries):
         radius: bool = True
         """Give anchors a support radius. With false, they have a centre only."""
         init_radius: float = Field(default=1.0, gt=0)
-        """Initial softplus of each raw radius, world units."""
+        """Initial radius of each anchor, world units, before `radius_min` changes it."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
@@ -107,7 +109,7 @@ class AnchoredQueries(LearnedQueries):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the centre, and the raw radius if there is one."""
+        """Return the field of anchor centres, and the field of raw radii if `radius` is true."""
         return {**CENTER_FIELD, **(radius_field(config) if config.radius else {})}
 
     @classmethod
@@ -118,7 +120,7 @@ class AnchoredQueries(LearnedQueries):
             yield from without_effect(config, idle, "`radius` is false")
 
     def start(self, batch_size: int) -> QueryState:
-        """Return features (B, N, D), `anchor.center` (B, N, 3), `anchor.raw_radius` (B, N, 1)."""
+        """Return initial queries: features (B, N, D), centres (B, N, 3), raw radii (B, N, 1)."""
         fields = {CENTER: self.center.expand(batch_size, -1, -1)}
         if self.config.radius:
             fields[RAW_RADIUS] = self.raw_radius.expand(batch_size, -1, -1)
@@ -126,7 +128,7 @@ class AnchoredQueries(LearnedQueries):
         return QueryState(features=features, fields=fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
-        """Return balls of the support radius; anchors without a radius are points."""
+        """Return each anchor as a ball of its support radius, or as a point if it has no radius."""
         center_BN3 = state[CENTER]
         # A radius of 0 shows an anchor as a point.
         r_BN1 = torch.zeros_like(center_BN3[..., :1])

@@ -1,4 +1,4 @@
-"""`locus/ray_biased`: queries attend more to rays that pass near their anchor."""
+"""`locus/ray_biased`: attention that prefers image patches whose rays pass near the anchor."""
 
 from collections.abc import Iterable
 from typing import ClassVar, Literal
@@ -34,11 +34,11 @@ from qgs_locus.ray_bias import RayBias, ray_tokens
 
 
 class RayBiasedCrossAttention(CrossAttention):
-    """Cross-attention that prefers patches whose rays pass near the anchor: equation (4).
+    """Cross-attention that prefers image patches whose rays pass near the query's anchor.
 
-    It computes softmax(q k / sqrt(d) + gamma b) v with b = -1/2 (D / sigma)^2. D is the distance
-    from the patch's ray to the anchor's centre. sigma is sigma0 r ("radius") or sigma0 ("fixed").
-    All heads share the bias.
+    It computes softmax(q k / sqrt(d) + gamma b) v with the bias b = -1/2 (D / sigma)^2. D is the
+    distance from the patch's ray to the anchor's centre. `bandwidth` sets sigma; gamma > 0 is
+    learned. All heads share the bias. This is equation (4) of the plugin's README.
     """
 
     name = "ray_biased"
@@ -47,17 +47,20 @@ class RayBiasedCrossAttention(CrossAttention):
 
     class Config(RadiusOptions):
         bandwidth: Literal["radius", "fixed"] = "radius"
-        """Set sigma to `sigma0` times the anchor's radius, or to `sigma0` for all ("fixed")."""
+        """Bandwidth sigma of the bias: `sigma0` times the anchor's radius ("radius"), or `sigma0`
+        for all anchors ("fixed")."""
         sigma0: float = Field(default=0.1, gt=0)
-        """Bandwidth sigma in radii of the anchor, or in world units if it is fixed."""
+        """Bandwidth sigma in radii of the anchor. With `bandwidth: fixed`, in world units."""
         sigma_sq_min: float = Field(default=1e-3, gt=0)
-        """Lower bound of (sigma0 r)^2, world units squared."""
+        """Lower bound of sigma^2 = (sigma0 r)^2, with r the anchor's radius, world units
+        squared."""
         bias_min: float = Field(default=-20.0, lt=0)
         """Lower bound of the bias b, before it is multiplied by gamma."""
         direction_eps: float = Field(default=1e-6, gt=0)
-        """Lower bound of the length by which the mean direction of a patch is divided."""
+        """Least length by which the mean ray direction of a patch is divided to normalise it."""
         gamma_init: float = -2.25
-        """Initial g of each layer. The bias is multiplied by gamma = softplus(g)."""
+        """Initial value of the learned g of each layer. The bias is multiplied by
+        gamma = softplus(g)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
         """Number that every LayerNorm adds to the variance."""
 
@@ -71,28 +74,28 @@ class RayBiasedCrossAttention(CrossAttention):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields of the class, and the radii if the bandwidth follows them."""
+        """Return the fields in `reads`, and those in `bandwidth_fields`."""
         return {**cls.reads, **cls.bandwidth_fields(config)}
 
     @classmethod
     def bandwidth_fields(cls, config: Config) -> Fields:
-        """Return the fields that the bandwidth depends on; none if it is fixed."""
+        """Return the fields that the bandwidth depends on, or no field if it is fixed."""
         return radius_field(config) if config.bandwidth == "radius" else {}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report radius options that a fixed bandwidth does not read."""
+        """Report radius options that have no effect because the bandwidth is fixed."""
         if config.bandwidth == "fixed":
             idle = ("sigma_sq_min", "radius_bound", "radius_min")
             yield from without_effect(config, idle, "`bandwidth` is fixed")
 
     @property
     def gamma(self) -> Tensor:
-        """Positive weight of the bias, 0-d."""
+        """Positive weight gamma of the bias, 0-d."""
         return F.softplus(self.raw_gamma)
 
     def sigma_sq(self, state: QueryState) -> Tensor | float:
-        """Return the squared bandwidth: (B, N, 1), or one number if it is fixed."""
+        """Return sigma^2, world units squared: (B, N, 1), or one number if sigma is fixed."""
         if self.config.bandwidth == "fixed":
             return self.config.sigma0**2
         r_BN1 = support_radius(state[self.raw_radius], self.config)
@@ -100,7 +103,7 @@ class RayBiasedCrossAttention(CrossAttention):
         return (self.config.sigma0 * r_BN1).square().clamp_min(self.config.sigma_sq_min)
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
-        """Return gamma b for the state before this layer."""
+        """Return the bias gamma b from the anchors in `state` and the patch rays in `memory`."""
         config = self.config
         eps = config.direction_eps
         # The rays of a scene are the same in all layers.

@@ -21,17 +21,18 @@ from qgs_locus.fields import (
 
 
 class OffsetOptions(ComponentConfig):
-    """Options that turn raw offsets into displacements from the anchor."""
+    """Options of the map from the head's raw offsets to displacements from the anchor."""
 
     offset: Literal["posact", "linear"] = "posact"
-    """Displacement for a raw offset t: posact(t) (release), or t itself (paper)."""
+    """Displacement for a raw offset t: posact(t) = sign(t) (exp|t| - 1) (LocusGS release), or t
+    itself ("linear", LocusGS paper)."""
     input_limit: float | None = Field(default=100.0, gt=0)
-    """Clamp raw offsets to +- this before posact. Null means no clamp."""
+    """Largest size of a raw offset: larger ones are clamped before posact. Null means no limit."""
     output_limit: float | None = Field(default=1000.0, gt=0)
-    """Clamp displacements to +- this after posact. Null means no clamp."""
+    """Largest size of a displacement: larger ones are clamped after posact. Null means no limit."""
 
     def displacement(self, raw: Tensor) -> Tensor:
-        """Return the displacements for raw offsets of any shape, in float32 or better."""
+        """Return displacements for raw offsets of any shape, in float32 or float64."""
         if self.offset == "linear":
             return at_least_float32(raw)
         # An untrained head may give huge offsets; the limits keep them and their gradients finite.
@@ -39,13 +40,13 @@ class OffsetOptions(ComponentConfig):
 
 
 class AnchorOffsetCenters(Centers):
-    """Means at mu + posact(offset), with mu the anchor's centre."""
+    """Gaussian means at mu + posact(offset), with mu the anchor's centre."""
 
     name = "anchor_offset"
     reads = CENTER_FIELD
 
     class Config(OffsetOptions):
-        """Options of `OffsetOptions`."""
+        """Options of the map from raw offsets to displacements."""
 
     config: Config
 
@@ -56,27 +57,30 @@ class AnchorOffsetCenters(Centers):
             yield from without_effect(config, ("input_limit", "output_limit"), "`offset` is linear")
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
+        """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
         return state[CENTER][:, :, None] + self.config.displacement(offsets)
 
 
 class RadiusScaledCenters(AnchorOffsetCenters):
-    """Means at mu + r posact(offset), with r the support radius: equation (7)."""
+    """Gaussian means at mu + r posact(offset), with centre mu and radius r of the anchor.
+
+    This is equation (7) of the plugin's README.
+    """
 
     name = "radius_scaled"
 
     class Config(OffsetOptions, RadiusOptions):
-        """Options of `OffsetOptions` and `RadiusOptions`."""
+        """Options of the maps from raw offsets to displacements and from raw radii to radii."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return centres and radii."""
+        """Return the fields of anchor centres and raw radii."""
         return {**CENTER_FIELD, **radius_field(config)}
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
+        """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
         # Offsets are in radii: a query with a large support spreads its Gaussians widely.
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         return state[CENTER][:, :, None] + r_BN1[:, :, None] * self.config.displacement(offsets)

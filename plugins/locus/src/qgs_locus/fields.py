@@ -16,26 +16,27 @@ CENTER = "anchor.center"
 RAW_RADIUS = "anchor.raw_radius"
 
 CENTER_FIELD: Fields = {CENTER: FieldSpec((3,), frame="world")}
-"""Anchor centre mu (B, N, 3), unbounded."""
+"""Field of anchor centres mu (B, N, 3), world frame, unbounded."""
 
 RAW_LEAST = 1e-6
-"""Lower bound of softplus(rho) where rho is computed from a radius, so that rho is finite."""
+"""Lower bound of softplus(rho) when rho is computed from a radius. It keeps rho finite."""
 
 
 class RadiusOptions(ComponentConfig):
-    """Options that map the raw radius rho to the support radius r; all components must agree."""
+    """Options of the map from the raw radius rho to the support radius r of an anchor."""
 
     radius_bound: Literal["floor", "offset"] = "floor"
-    """Use r = max(softplus(rho), radius_min) ("floor", release) or r = softplus(rho) + radius_min
-    ("offset", paper). It must be the same in all components."""
+    """Support radius r = max(softplus(rho), radius_min) ("floor", LocusGS release) or
+    r = softplus(rho) + radius_min ("offset", paper). All components must have the same value."""
     radius_min: float = Field(default=1e-3, ge=0)
-    """Least support radius, world units. It must be the same in all components."""
+    """Least support radius, world units. All components must have the same value."""
 
 
 def radius_field(options: RadiusOptions) -> Fields:
     """Return the field of raw radii rho (B, N, 1).
 
-    Its encoding lets the composer refuse components that disagree about the options.
+    Its encoding states the options, so that a recipe is refused if its components have different
+    ones.
     """
     reading = {
         "floor": f"radius = max(softplus(x), {options.radius_min:g})",
@@ -46,7 +47,10 @@ def radius_field(options: RadiusOptions) -> Fields:
 
 @full_precision
 def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
-    """Return support radii r > 0, world units, for raw radii of any shape: equation (1)."""
+    """Return support radii r > 0, world units, for raw radii of any shape.
+
+    This is equation (1) of the plugin's README.
+    """
     radius = F.softplus(raw_radius)
     # Softplus can be almost 0, and equation (3) divides by r.
     if options.radius_bound == "floor":
@@ -55,7 +59,7 @@ def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
 
 
 def raw_radius_of(radius: float) -> float:
-    """Return rho with softplus(rho) = `radius` > 0."""
+    """Return the raw radius rho for which softplus(rho) is `radius`, a positive number."""
     return radius + math.log(-math.expm1(-radius))
 
 
@@ -63,7 +67,7 @@ def raw_radius_of(radius: float) -> float:
 def raw_radii(radii: Tensor, options: RadiusOptions) -> Tensor:
     """Return the raw radii for which `support_radius` gives `radii`.
 
-    Radii below the least possible one are raised to it.
+    Radii below the least possible radius are raised to the least one.
     """
     least = options.radius_min if options.radius_bound == "offset" else 0.0
     # softplus^-1(y) = y + log(1 - exp(-y)), which stays exact for large y.
@@ -72,5 +76,5 @@ def raw_radii(radii: Tensor, options: RadiusOptions) -> Tensor:
 
 
 def ball_support(centers: Tensor, radii: Tensor) -> SpatialSupport:
-    """Return balls with centres (B, N, 3) and radii (B, N, 1)."""
+    """Return balls with centres (B, N, 3) and radii (B, N, 1), world units."""
     return SpatialSupport(centers=centers, axes=radii[..., None] * torch.eye(3).to(centers))

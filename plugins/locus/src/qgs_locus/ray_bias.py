@@ -1,7 +1,8 @@
-"""Attention bias between anchors and image rays: equations (2) and (3) of the README.
+"""Attention bias that depends on the distance of anchor and image ray.
 
-`dense_bias` is the reference: it follows the README line by line, for all pairs at once. `RayBias`
-computes the same for blocks of queries, in a form for kernels. The tests compare both.
+`dense_bias` is the reference: it follows equations (2) and (3) of the plugin's README line by line,
+for all pairs of anchor and ray at once. `RayBias` computes the same numbers for blocks of queries.
+The tests compare both.
 """
 
 from typing import Self
@@ -15,9 +16,9 @@ from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
 
 @full_precision
 def normalised_rays(rays: Tensor, eps: float = 1e-6) -> tuple[Tensor, Tensor]:
-    """Return Plücker rays (m, d) / max(|d|, `eps`), whose directions have unit length.
+    """Divide Plücker rays (m, d) by max(|d|, `eps`), so that directions have unit length.
 
-    rays (..., 6), moment first -> moments (..., 3), directions (..., 3).
+    Takes rays (..., 6), moment m first. Returns moments (..., 3) and directions (..., 3).
     """
     moments, directions = rays.split(3, dim=-1)
     length = directions.norm(dim=-1, keepdim=True).clamp_min(eps)
@@ -31,7 +32,10 @@ def dense_bias(
     rays: Tensor,  # (B, M, 6) Plücker rays of patches, world
     bias_min: float,
 ) -> Tensor:
-    """Return b (B, N, M), without its weight gamma."""
+    """Return the bias b (B, N, M) of each anchor and ray, without its weight gamma.
+
+    bias_min: lower bound of b.
+    """
     # A patch's ray is the mean of its pixels' rays, so |d| < 1; D needs |d| = 1.
     moment, direction = (x[:, None] for x in normalised_rays(rays))
     # (2). In float32: for rays that pass near, D is a small difference of numbers of size |mu|.
@@ -44,18 +48,19 @@ def dense_bias(
 
 @full_precision
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
-    """Return moments and directions as rows: (B, M, 6) -> (B, 6, M).
+    """Normalise rays (B, M, 6), and return moments and directions as rows (B, 6, M).
 
-    direction_eps: lower bound of the |d| by which a ray is divided.
+    direction_eps: least length |d| of a direction by which its ray is divided.
     """
     return torch.cat(normalised_rays(rays_BM6, direction_eps), -1).mT.contiguous()
 
 
 class RayBias(AttentionBias):
-    """Bias gamma b in the form for kernels: max(-factor D^2, lower).
+    """Bias gamma b as max(-factor D^2, lower), with D the distance of anchor centre and ray.
 
-    Each query has five numbers: mu, factor = gamma / (2 sigma^2) and lower = gamma bias_min. Each
-    token has m and d. Everything that does not depend on the pair is computed once.
+    Each query has five numbers: the anchor's centre mu, factor = gamma / (2 sigma^2) and
+    lower = gamma bias_min. Each token has six: moment m and direction d of its ray. So kernels
+    compute only D for each pair of query and token.
     """
 
     in_triton = True
@@ -72,8 +77,8 @@ class RayBias(AttentionBias):
     ) -> Self:
         """Make the bias of a layer.
 
-        sigma_sq: (B, N, 1) or a number. tokens: from `ray_tokens`, the same for all layers.
-        gamma: 0-d, positive.
+        center: anchor centres, world. sigma_sq: squared bandwidths (B, N, 1), or one number.
+        tokens: result of `ray_tokens`. bias_min: lower bound of b. gamma: positive weight, 0-d.
         """
         # Kernels read one row per query, even if all queries share a number.
         each_BN1 = torch.ones_like(center_BN3[..., :1])
@@ -81,10 +86,10 @@ class RayBias(AttentionBias):
         return cls(torch.cat(parts, -1), tokens_B6M)
 
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
-        """Return the bias (n, M), through cross products (n, M, 3).
+        """Return the bias (n, M) of n queries and the M tokens of a scene.
 
-        |mu x d - m|^2 is computed as written. A matrix product of features of mu and of the ray
-        would be off by several logits far from the cameras.
+        D^2 = |mu x d - m|^2 is computed from cross products (n, M, 3). A single matrix product
+        would be off by several logits for anchors far from the cameras.
         """
         center_n3, factor_n1, lower_n1 = queries_nF.split([3, 1, 1], -1)
         m_M3 = tokens_GM[:3].mT
@@ -99,6 +104,6 @@ class RayBias(AttentionBias):
 
 
 def clamped(bias_nM: Tensor, lower_n1: Tensor) -> Tensor:
-    """Return max(bias, lower); where the bound is reached, the gradient goes to `lower_n1`."""
+    """Return max(bias, lower). Where `lower` is returned, it gets the gradient."""
     # The condition is false for NaN, so that NaN stays.
     return torch.where(bias_nM <= lower_n1, lower_n1, bias_nM)

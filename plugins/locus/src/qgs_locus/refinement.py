@@ -14,9 +14,10 @@ from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, radius_field
 
 
 class AnchorRefinement(Refinement):
-    """Refinement mu += posact(MLP_mu(x)), rho += MLP_rho(x): equation (6).
+    """Update of anchors after each layer: mu += posact(MLP_mu(x)), rho += MLP_rho(x).
 
-    All layers share the two MLPs.
+    mu is the anchor's centre, rho its raw radius, x the query's features. All layers share the two
+    MLPs. This is equation (6) of the plugin's README.
     """
 
     name = "refine"
@@ -24,17 +25,21 @@ class AnchorRefinement(Refinement):
 
     class Config(RadiusOptions):
         center: bool = True
-        """Refine the centres."""
+        """Update anchor centres after each decoder layer. With false, they stay unchanged."""
         radius: bool = True
-        """Refine the radii."""
+        """Update anchor radii after each decoder layer. With false, they stay unchanged."""
         center_step: Literal["posact", "linear"] = "posact"
-        """Step of a centre for an MLP output t: posact(t) (release), or t itself (paper)."""
+        """Step of a centre for an output t of its MLP: posact(t) = sign(t) (exp|t| - 1) (LocusGS
+        release), or t itself ("linear", LocusGS paper)."""
         input_limit: float | None = Field(default=100.0, gt=0)
-        """Clamp MLP outputs to +- this before posact. Null means no clamp."""
+        """Largest size of an MLP output: larger ones are clamped before posact. Null means no
+        limit."""
         output_limit: float | None = Field(default=1000.0, gt=0)
-        """Clamp steps to +- this after posact, world units. Null means no clamp."""
+        """Largest size of a step, world units: larger ones are clamped after posact. Null means no
+        limit."""
         zero_init: bool = False
-        """Start the last layer of each MLP at zero, for a steadier start (in neither release)."""
+        """Initialise the last layer of each MLP with zeros, so that anchors do not move at first.
+        The LocusGS release does not."""
 
     config: Config
 
@@ -58,7 +63,7 @@ class AnchorRefinement(Refinement):
 
     @classmethod
     def radius_field(cls, config: Config) -> Fields:
-        """Return the field of raw radii; a subclass may use one with more channels."""
+        """Return the field of raw radii. A subclass may return a field with more channels."""
         return radius_field(config)
 
     @classmethod
@@ -74,7 +79,7 @@ class AnchorRefinement(Refinement):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report options that refine nothing, and options without effect."""
+        """Report a refinement that updates nothing, and options without effect."""
         if not cls.fields_read(config):
             yield Problem(
                 "",
@@ -101,7 +106,7 @@ class AnchorRefinement(Refinement):
         return state.replace(fields=refined)
 
     def center_step(self, state: QueryState) -> Tensor:
-        """Return the step of the centres (B, N, 3), in float32 or better, world frame."""
+        """Return the steps of the centres (B, N, 3), world frame, in float32 or float64."""
         step_BN3 = self.center_mlp(state.features)
         if self.config.center_step == "posact":
             step_BN3 = posact(step_BN3, self.config.input_limit, self.config.output_limit)

@@ -1,4 +1,4 @@
-"""`locus/anchor_aware`: self-attention with an embedding of the anchor centres."""
+"""`locus/anchor_aware`: self-attention of queries, with an embedding of their anchor centres."""
 
 import math
 from typing import Literal
@@ -18,10 +18,11 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 def sine_embedding(
     position: Tensor, features: int = 128, temperature: float = 10_000.0, divisor_eps: float = 1e-6
 ) -> Tensor:
-    """Return sine features of positions in [-1, 1]: (..., 3) -> (..., 3 * features).
+    """Embed positions (..., 3) in [-1, 1] as sines and cosines (..., 3 * features).
 
-    Each axis is mapped to [0, 2 pi] and divided by temperature^(2i / features) + divisor_eps. Sines
-    and cosines alternate, axis by axis (LocusGS release).
+    Each coordinate is mapped to [0, 2 pi]. For frequency i it is divided by
+    temperature^(2i / features) + divisor_eps. Its sine and cosine follow each other, frequency by
+    frequency and axis by axis (LocusGS release).
     """
     # Each sine shares its frequency with a cosine.
     half = torch.arange(features // 2, dtype=position.dtype, device=position.device)
@@ -31,9 +32,10 @@ def sine_embedding(
 
 
 class AnchorAwareSelfAttention(SelfAttention):
-    """Self-attention over x + p with p = MLP(PE(mu)): equation (5).
+    """Self-attention over x + p, with p = MLP(sine embedding of the anchor centre).
 
-    Queries, keys and values all contain p. The residual stream does not keep it.
+    x are the query's features. Queries, keys and values are computed from x + p, but p is not added
+    to the features of the next layer. This is equation (5) of the plugin's README.
     """
 
     name = "anchor_aware"
@@ -41,9 +43,10 @@ class AnchorAwareSelfAttention(SelfAttention):
 
     class Config(ComponentConfig):
         position: Literal["tanh", "raw"] = "tanh"
-        """Embed tanh of the centre ("tanh", release) or the centre itself ("raw", paper)."""
+        """Embed tanh of the centre ("tanh", LocusGS release) or the centre itself ("raw",
+        paper)."""
         features: int = Field(default=128, ge=2, multiple_of=2)
-        """Number of sines and cosines per axis, together."""
+        """Number of sines plus number of cosines for each axis."""
         temperature: float = Field(default=10_000.0, gt=0)
         """Approximate ratio of the longest to the shortest wavelength of the sines."""
         divisor_eps: float = Field(default=1e-6, ge=0)
@@ -60,7 +63,7 @@ class AnchorAwareSelfAttention(SelfAttention):
         self.position_mlp = Mlp(3 * config.features, dims.width, dims.width)
 
     def position_embedding(self, state: QueryState) -> Tensor:
-        """Return the embedding p (B, N, D)."""
+        """Return the embedding p (B, N, D) of the anchor centres."""
         position_BN3 = state[CENTER]
         c = self.config
         # The sines expect [-1, 1], but centres are unbounded.
@@ -71,11 +74,11 @@ class AnchorAwareSelfAttention(SelfAttention):
         )
 
     def forward(self, state: QueryState) -> Tensor:
-        """Return the update (B, N, D)."""
+        """Return the update (B, N, D) of the queries' features."""
         x_BND = self.norm(state.features + self.position_embedding(state))
         return self.attention(x_BND, state.mask)
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        """Return the attention of the chosen queries to all queries."""
+        """Return the attention of the queries with indices `queries` to all queries."""
         x_BND = self.norm(state.features + self.position_embedding(state))
         return self.attention.explain(x_BND, queries, state.mask)

@@ -12,7 +12,11 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 
 
 class AnchorVisibility(Loss):
-    """Mean of `qgs.losses.view_visibility` over the anchors of all queries: equation (8)."""
+    """Mean distance of anchor centres to the image of the nearest target view.
+
+    A centre that a target view sees has distance 0. The distance is that of
+    `qgs.losses.view_visibility`, equation (8) of the plugin's README.
+    """
 
     name = "anchor_visibility"
     reads = CENTER_FIELD
@@ -20,9 +24,9 @@ class AnchorVisibility(Loss):
 
     class Config(VisibilityOptions):
         weight: float = Field(default=0.1, ge=0)
-        """Factor of the term in the objective."""
+        """Weight of this loss in the objective."""
         z_guard: float = Field(default=1e-3, gt=0)
-        """Least |z| in the perspective division; smaller ones are raised to it, world units."""
+        """Least |z| in the perspective division, world units. A z closer to 0 is replaced by it."""
 
     config: Config
 

@@ -1,4 +1,4 @@
-"""Attention with a computed bias: `RayBias` in numba for CPUs, in Triton for GPUs.
+"""Fast attention with the bias `RayBias`: numba kernels for CPUs, Triton kernels for GPUs.
 
-`qgs_locus.ray_bias` has the formula of the bias; `attention_bias` has that of attention.
+The formula of the bias is in `qgs_locus.ray_bias`, the formula of attention in `attention_bias`.
 """

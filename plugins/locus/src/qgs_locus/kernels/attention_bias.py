@@ -1,11 +1,12 @@
 """Attention with a bias that depends on query and token, computed block by block.
 
-The logits are q k / sqrt(d) + b. The logits, b and their gradients never exist for all N x M pairs.
-They exist for one block at a time: some queries and all tokens. The backward pass computes b again,
-and the weights p = exp(logits - lse) from the log-sum-exp of each query. This is FlashAttention
-(arXiv 2205.14135, section 3.1), which also splits the tokens into blocks.
+The logits are q k / sqrt(d) + b, with b the bias. To save memory, the logits, b and their gradients
+never exist for all N x M pairs of query and token. They exist for one block at a time, which has
+some queries and all tokens. The backward pass computes b again, and the attention weights as
+exp(logits - lse), with lse the log-sum-exp of each query. FlashAttention (arXiv 2205.14135, section
+3.1) does this too, and splits the tokens as well.
 
-Axes: F numbers of a query, G numbers of a token, n queries of a block.
+Axes: F numbers per query and G numbers per token, from which b is computed; n queries of a block.
 """
 
 import threading
@@ -27,12 +28,12 @@ from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 T = TypeVar("T")
 Kernel: TypeAlias = Callable[..., None]
 Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]
-"""Block of queries: the scene, a slice of its queries, and buffers (n, M) for them."""
+"""Block: index of the scene, slice of its queries, and buffers (n, M) for these n queries."""
 
 BLOCK = {"cpu": 2**22, "cuda": 2**25}
-"""Numbers that all buffers (n, M) of a block may hold together.
+"""Most numbers in all buffers (n, M) of a block together, by type of device.
 
-On a CPU they fit into its caches; on a GPU they are enough to keep it busy.
+They fit into the caches of a CPU, and are enough to keep a GPU busy.
 """
 
 _kept = threading.local()
@@ -44,14 +45,14 @@ _PART = 2**21
 
 
 class AttentionBias(ABC):
-    """Bias of attention logits that depends on query and token and is the same for all heads.
+    """Bias of attention logits that is computed from numbers of query and token.
 
-    queries: (B, N, F), numbers of each query. tokens: (B, G, M), numbers of each token. Gradients
-    flow into these two only. Both are float32 or float64.
+    It is the same for all heads. queries: F numbers of each query (B, N, F). tokens: G numbers of
+    each token (B, G, M). Both are float32 or float64, and only they get gradients.
     """
 
     in_triton = False
-    """True if `attention_triton` can compute it."""
+    """True if the kernels of `attention_triton` can compute this bias."""
 
     def __init__(self, queries: Tensor, tokens: Tensor) -> None:
         self.queries = queries
@@ -59,20 +60,21 @@ class AttentionBias(ABC):
 
     @abstractmethod
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
-        """Return the bias (n, M) of some queries of a scene and all its tokens, differentiable."""
+        """Return the bias (n, M) of n queries and all tokens of a scene, differentiable."""
 
     def compiled(self) -> tuple[Kernel, Kernel] | None:
-        """Return two kernels (`qgs.kernels.kernel`) for float32 on a CPU, or None.
+        """Return two kernels (`qgs.kernels.kernel`) for float32 on a CPU, or None without kernels.
 
         The first takes arrays (queries, tokens, out) and writes `value` to `out`. The second takes
-        (queries, tokens, gradient, out): from the gradient of the bias it computes that of the
-        queries (n, F). Several threads may run a kernel, each on its own rows.
+        (queries, tokens, gradient, out). From the gradient of the bias (n, M) it computes the
+        gradient of the queries (n, F) and writes it to `out`. Several threads may run a kernel,
+        each for other queries.
         """
         return None
 
     @full_precision
     def write(self, queries_nF: Tensor, tokens_GM: Tensor, out_nM: Tensor) -> None:
-        """Write `value` into `out_nM`."""
+        """Write the bias (n, M) of n queries and all tokens of a scene into `out_nM`."""
         kernels = self._kernels(queries_nF)
         # Kernels need no (n, M, 3) tensors: they work in registers.
         if kernels is not None:
@@ -84,9 +86,10 @@ class AttentionBias(ABC):
     def gradients(
         self, queries_nF: Tensor, tokens_GM: Tensor, gradient_nM: Tensor
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Return gradients (n, F) of the queries and (G, M) of the tokens from that of the bias.
+        """Return gradients of the queries (n, F) and the tokens (G, M).
 
-        A gradient is None if `self.queries` or `self.tokens` needs none. At least one needs it.
+        gradient: of the bias (n, M). A result is None if `self.queries` or `self.tokens` needs no
+        gradient. At least one of them must need it.
         """
         of_queries = self.queries.requires_grad
         of_tokens = self.tokens.requires_grad
@@ -114,7 +117,7 @@ class AttentionBias(ABC):
         return self.compiled() if usable else None
 
     def dense(self, chosen: Tensor | None = None) -> Tensor:
-        """Return the bias of all queries (B, N, M), or of those with indices `chosen` (B, Q, M)."""
+        """Return the bias (B, N, M) of all queries, or (B, Q, M) of the Q indices `chosen`."""
         bias = self
         if chosen is not None:
             bias = copy(self)
@@ -122,7 +125,7 @@ class AttentionBias(ABC):
         return _outside_graphs(_Dense.apply)(bias.queries, bias.tokens, bias)
 
     def blocks(self, buffers: int, dtype: torch.dtype) -> Iterator[Block]:
-        """Yield all queries block by block, with memory for `buffers` tensors of its shape."""
+        """Yield all queries block by block, each with `buffers` tensors (n, M) to write to."""
         scenes, count, _ = self.queries.shape
         tokens = self.tokens.shape[2]
         device = self.queries.device
@@ -137,13 +140,13 @@ class AttentionBias(ABC):
 
 
 def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...], ...]:
-    """Split both tensors into parts of about `_PART` pairs."""
+    """Split both tensors by queries into parts of about `_PART` pairs of query and token."""
     rows = max(_PART // max(of_pairs_nM.shape[1], 1), 1)
     return queries_nF.split(rows), of_pairs_nM.split(rows)
 
 
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
-    """Call a kernel on several threads, each with some rows of all arrays except the tokens."""
+    """Call a kernel on several threads, each with all tokens and some rows of other arrays."""
     tokens = tokens_GM.numpy()
     queries, *others = (x.numpy() for x in of_rows)
     pairs = len(queries) * tokens.shape[1]
@@ -157,7 +160,7 @@ def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
 
 
 def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Return memory for `size` numbers."""
+    """Return uninitialised memory for `size` numbers, which the next call may return again."""
     if device.type != "cpu":
         return torch.empty(size, device=device, dtype=dtype)
     # Memory is kept: touching new memory takes as long as computing the bias.
@@ -176,7 +179,7 @@ def biased_attention(
     bias: AttentionBias,
     kernel: AttentionKernel = "auto",
 ) -> Tensor:
-    """Return softmax(q k / sqrt(d) + b) v, (B, h, N, d).
+    """Return attention softmax(q k / sqrt(d) + b) v, (B, h, N, d), with the bias b.
 
     Raises ValueError if `kernel` cannot compute it.
     """
@@ -194,17 +197,17 @@ def biased_attention(
 
 
 def _outside_graphs(function: Callable[..., T]) -> Callable[..., T]:
-    """Keep `function` out of compiled graphs, which would unroll its loop for every size.
+    """Keep `function` out of graphs of torch.compile, which would unroll its loop for every size.
 
-    If nothing is being compiled, return it unchanged: `torch.compiler.disable` would import the
-    compiler, which takes 0.8 s.
+    If nothing is being compiled, return the function unchanged: `torch.compiler.disable` would
+    import the compiler, which takes 0.8 s.
     """
     outside: Any = torch.compiler.disable if torch.compiler.is_compiling() else lambda f: f
     return outside(function)
 
 
 class _Dense(torch.autograd.Function):
-    """Bias of all pairs, which is computed again in the backward pass."""
+    """Autograd function that returns the bias (B, N, M) of all queries and tokens."""
 
     @staticmethod
     def forward(ctx: Any, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> Tensor:
@@ -238,7 +241,7 @@ class _BiasGradients:
         self.wanted = bias.queries.requires_grad or bias.tokens.requires_grad
 
     def add(self, scene: int, rows: slice, gradient_nM: Tensor) -> None:
-        """Add the gradients of a block, given the gradient of its values."""
+        """Add the gradients of a block of n queries, given the gradient of its bias (n, M)."""
         read = self._read[0][scene, rows], self._read[1][scene]
         of_queries, of_tokens = self._bias.gradients(*read, gradient_nM)
         if self.queries is not None and of_queries is not None:
@@ -278,7 +281,7 @@ class _BiasedAttention(torch.autograd.Function):
 
 
 def _attend(q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weighted values (h, n, d) and log-sum-exp (h, n) of some queries of a scene."""
+    """Return attention (h, n, d) of n queries of a scene, and log-sum-exp (h, n) of the logits."""
     if q_hnd.device.type != "cpu" or (flash := _flash_for_cpu()) is None:
         return _attend_anywhere(q_hnd, k_hMd, v_hMd, bias_nM)
     out, lse = flash(q_hnd[None], k_hMd[None], v_hMd[None], attn_mask=bias_nM[None, None])
@@ -287,7 +290,7 @@ def _attend(q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor) -> tup
 
 @cache
 def _flash_for_cpu() -> Callable[..., tuple[Tensor, Tensor]] | None:
-    """Return torch's private operator for attention on a CPU, or None if it is not as expected.
+    """Return torch's private operator for attention on a CPU, or None if it does not work.
 
     Only this operator returns the log-sum-exp, which saves a softmax in the backward pass.
     """
@@ -304,7 +307,7 @@ def _flash_for_cpu() -> Callable[..., tuple[Tensor, Tensor]] | None:
 def _attend_anywhere(
     q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the same as `_attend`, in float32 or better, on any device."""
+    """Return the same as `_attend`, in float32 or float64, on any device."""
     logits_hnM = torch.baddbmm(bias_nM, q_hnd, k_hMd.mT, alpha=q_hnd.shape[-1] ** -0.5)
     lse_hn = logits_hnM.logsumexp(-1)
     return logits_hnM.sub_(lse_hn[..., None]).exp_() @ v_hMd, lse_hn
@@ -316,9 +319,10 @@ def _attention_gradients(
 ) -> tuple[Tensor | None, ...]:
     """Return gradients of q, k, v (each (B, h, ., d)) and of the bias's queries and tokens.
 
-    Gradients that are not needed are None. P are the weights of a head, dO is the gradient of its
-    output O: dV = P' dO, dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d),
-    dK = dS' Q / sqrt(d). The gradient of the bias is dS, summed over heads.
+    Gradients that are not needed are None. For a head with attention weights P, output O and its
+    gradient dO: dV = P' dO, dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d),
+    dK = dS' Q / sqrt(d). ' transposes, * multiplies entries. The gradient of the bias is the sum of
+    dS over heads.
     """
     q, k, v, queries, tokens, out, lse = saved
     scale = q.shape[-1] ** -0.5

@@ -1,9 +1,10 @@
 """Choice of the code that computes attention with a bias that depends on query and token.
 
-A CPU uses blocks. CUDA uses the plain way, with the bias of all pairs, if one layer needs at most
-1 / SHARE of the GPU's memory for it: every layer keeps its bias for the backward pass. For larger
-sizes CUDA uses Triton kernels, or blocks if Triton cannot be used. The paths have not been compared
-on a GPU. The choice depends on sizes only, so all layers, steps and processes choose the same.
+On a CPU this is the code of blocks. On a GPU it is plain attention if one layer needs at most
+1 / SHARE of the GPU's memory for the bias of all pairs, which every layer keeps for the backward
+pass. For larger sizes it is Triton kernels, or blocks if Triton cannot be used. Their speeds have
+not been compared on a GPU. The choice depends on sizes only, so all layers, steps and processes
+make the same one.
 """
 
 import logging
@@ -20,9 +21,10 @@ if TYPE_CHECKING:
     from qgs_locus.kernels.attention_bias import AttentionBias
 
 AttentionKernel: TypeAlias = Literal["auto", "plain", "blocks", "triton"]
-"""Ways to compute attention.
+"""Code that computes attention with a bias.
 
-plain: torch's attention with the bias of all pairs. blocks: torch, block by block.
+auto: chosen by size. plain: torch's attention with the bias of all pairs of query and token.
+blocks: torch, for some queries at a time. triton: Triton kernels, which never store the bias.
 """
 
 SHARE = 16
@@ -47,12 +49,12 @@ def chosen_kernel(
     if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
-    _log_once(f"attention with a bias uses {found}: the bias of all pairs needs too much memory")
+    _log_once(f"attention uses {found}: a bias for each query and token needs too much memory")
     return found
 
 
 def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
-    """Return the bytes that the plain way needs for the bias and its gradient per head."""
+    """Return the bytes that plain attention needs for the bias, and for its gradient per head."""
     scenes, heads, queries, _ = q_BhNd.shape
     read = q_BhNd.element_size()
     each = bias.queries.element_size()
@@ -82,7 +84,7 @@ def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:
 
 @cache
 def triton_version() -> tuple[int, ...]:
-    """Return (major, minor), or () if triton is not installed."""
+    """Return (major, minor) of the installed triton, or () if it is not installed."""
     if find_spec("triton") is None:
         return ()
     return tuple(map(int, import_module("triton").__version__.split(".")[:2]))

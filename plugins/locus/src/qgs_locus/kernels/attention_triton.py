@@ -1,16 +1,16 @@
-"""Attention with a computed bias in Triton: the numbers of a pair stay in registers.
+"""Attention with the bias `RayBias` in Triton: logits and bias of a pair stay in registers.
 
 There are three kernels, as in FlashAttention-2 (arXiv 2307.08691). Two loop over all tokens for a
 block of queries: one for the result, one for the gradients of the queries. The third loops over all
 queries for a block of tokens, for the gradients of keys and values. The bias and all sums are in
-float32. One program sums each number in a fixed order, so results are the same bit for bit.
+float32. Each sum is added in a fixed order, so a repeated run gives the same bits.
 
-The bias is `RayBias` of `qgs_locus.ray_bias`. A query has five numbers: x, y, z,
-gamma / (2 sigma^2), gamma * bias_min. A token has six: m and d. The functions of the bias get
-pointers (n, 1) and (1, m) to the first number of each query and token. `step` is the distance from
-one number of a token to its next.
+`RayBias` is in `qgs_locus.ray_bias`. A query has five numbers: its anchor's centre mu = (x, y, z),
+factor = gamma / (2 sigma^2) and lower = gamma * bias_min. A token has six: moment m and direction d
+of its ray. The functions of the bias get pointers (n, 1) and (1, m) to the first numbers of n
+queries and m tokens. `step` is the distance in memory from one number of a token to its next.
 
-Axes: as in `qgs_locus.kernels.attention_bias`. W is the least power of two that is at least d.
+Axes: as in `qgs_locus.kernels.attention_bias`. W is d, rounded up to a power of two.
 """
 
 from typing import Any
@@ -28,7 +28,7 @@ G = tl.constexpr(6)
 
 @jit
 def _moment(queries, tokens, step):
-    """Return the three coordinates of mu x d - m, each (n, m)."""
+    """Return the three coordinates of mu x d - m for n queries and m tokens, each (n, m)."""
     x = tl.load(queries)
     y = tl.load(queries + 1)
     z = tl.load(queries + 2)
@@ -43,7 +43,7 @@ def _moment(queries, tokens, step):
 
 @jit
 def _bias(queries, tokens, step):
-    """Return max(-factor |mu x d - m|^2, lower), (n, m)."""
+    """Return the bias max(-factor |mu x d - m|^2, lower) of n queries and m tokens, (n, m)."""
     e0, e1, e2 = _moment(queries, tokens, step)
     bias = -tl.load(queries + 3) * (e0 * e0 + e1 * e1 + e2 * e2)
     lower = tl.load(queries + 4)
@@ -52,7 +52,7 @@ def _bias(queries, tokens, step):
 
 @jit
 def _bias_gradients(queries, tokens, step, gradient, sums):
-    """Return the five `sums` (n,) plus the gradients of the queries' five numbers.
+    """Return `sums`, five tensors (n,), plus the gradients of the queries' five numbers.
 
     gradient: of the bias (n, m). With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e.
     """
@@ -79,7 +79,7 @@ def _bias_gradients(queries, tokens, step, gradient, sums):
 
 @jit
 def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
-    """Load rows of a head: (rows, W), 0 outside.
+    """Load `rows` of a scene and head as (rows, W), with 0 outside the tensor.
 
     x: a tensor (B, h, count, width) and its strides.
     """
@@ -89,7 +89,7 @@ def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
 
 @jit
 def _store(x, scene, head, rows, count, width, values, WIDTH: tl.constexpr):
-    """Write rows to where `_load` reads them, unless x is None."""
+    """Write `values` to the rows that `_load` reads, unless x is None."""
     if x is not None:
         at, inside = _at(x, scene, head, rows, count, width, WIDTH)
         tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
@@ -106,7 +106,7 @@ def _at(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
 
 @jit
 def _logits(q, k, queries, tokens, m, M, scale):
-    """Return q k / sqrt(d) + b, (n, m); -inf outside."""
+    """Return logits q k / sqrt(d) + b (n, m), with -inf for tokens from number M on."""
     products = tl.dot(q, tl.trans(k), input_precision="ieee") * scale
     return tl.where((m < M)[None, :], products + _bias(queries, tokens, M), float("-inf"))
 
@@ -116,7 +116,7 @@ def _forward(
     q, k, v, read_q, read_k, out, lse, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Write the result, and the log-sum-exp of each query (B, h, N)."""
+    """Write attention to `out`, and the log-sum-exp of each query's logits (B, h, N) to `lse`."""
     # Offsets exceed 2^31 for large batches.
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
@@ -149,7 +149,10 @@ def _backward_queries(
     q, k, v, read_q, read_k, g, lse, rowsum, dq, of_bias, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Write gradients of q, and of the bias's queries per head (B, h, N, F); None skips one."""
+    """Write gradients of q to `dq`, of the bias's queries per head (B, h, N, F) to `of_bias`.
+
+    If `dq` or `of_bias` is None, its gradient is not computed.
+    """
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
     head = each % heads
@@ -185,9 +188,9 @@ def _backward_tokens(
     q, k, v, read_q, read_k, g, lse, rowsum, dk, dv, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Write gradients of k and v; None skips one.
+    """Write gradients of k and v to `dk` and `dv`. If one is None, its gradient is not computed.
 
-    Queries outside have log-sum-exp inf, so their weights are 0.
+    Rows beyond the last query get log-sum-exp inf, so their attention weights are 0.
     """
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
@@ -219,7 +222,7 @@ def _backward_tokens(
 class TritonAttention(torch.autograd.Function):
     """Autograd function of `biased_attention` in Triton.
 
-    queries: (B, N, F) and tokens: (B, G, M), the numbers of the bias, float32. Tokens get no
+    queries (B, N, F) and tokens (B, G, M) are the numbers of `RayBias`, float32. Tokens get no
     gradient.
     """
 
@@ -255,7 +258,7 @@ class TritonAttention(torch.autograd.Function):
 
 
 def _launch(kernel: Any, *tensors: Any) -> None:
-    """Run a kernel for each head and block; tensors (B, h, ., d) are passed with strides."""
+    """Run a kernel for each head and block; tensors with four axes are passed with strides."""
     q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)
@@ -268,9 +271,10 @@ def _launch(kernel: Any, *tensors: Any) -> None:
 
 
 def _blocks(q: Tensor) -> dict[str, int]:
-    """Return sizes of a block, and its warps, that nearly fit into 255 registers per thread.
+    """Return block sizes and numbers of warps that nearly fit into 255 registers per thread.
 
-    Products in float32 do not use the matrix units; there, loading ahead costs registers.
+    Products in float32 do not use the GPU's matrix units, so loading ahead would only cost
+    registers.
     """
     # `tl.dot` needs at least 16.
     width = max(triton.next_power_of_2(q.shape[-1]), 16)

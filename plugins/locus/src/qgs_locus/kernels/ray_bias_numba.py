@@ -1,6 +1,7 @@
-"""Numba kernels of `RayBias`: one pass over the rays of each query, in registers.
+"""Numba kernels of `RayBias`, which pass once over all rays for each query.
 
-Each query is a row (x, y, z, gamma / (2 sigma^2), gamma * bias_min). Tokens have six rows: m and d.
+Each query is a row (x, y, z, factor, lower): the anchor's centre mu, gamma / (2 sigma^2) and
+gamma * bias_min. Tokens are six rows: moments m and directions d of the rays.
 """
 
 import numpy as np
@@ -13,7 +14,7 @@ _TWO = np.float32(2)
 
 @kernel
 def write(queries, tokens, out):
-    """Write max(-factor |mu x d - m|^2, lower) to `out`."""
+    """Write the bias max(-factor |mu x d - m|^2, lower) of queries and tokens to `out`."""
     m0 = tokens[0]
     m1 = tokens[1]
     m2 = tokens[2]
@@ -38,7 +39,10 @@ def write(queries, tokens, out):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Write gradients of the queries to `out`: with e = mu x d - m, d|e|^2 / dmu is 2 d x e."""
+    """Write gradients of the queries' five numbers to `out`.
+
+    gradient: of the bias. With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e.
+    """
     m0 = tokens[0]
     m1 = tokens[1]
     m2 = tokens[2]
