@@ -1,4 +1,4 @@
-"""Ellipsoidal anchors for qgs: LocusGS whose support has three radii and a rotation."""
+"""Ellipsoidal anchors for qgs: LocusGS with a rotation and three radii instead of one radius."""
 
 from qgs.contracts import Plugin
 from qgs_anchors.ellipsoid.anchors import EllipsoidQueries

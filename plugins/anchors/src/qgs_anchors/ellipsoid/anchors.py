@@ -1,6 +1,6 @@
-"""`ellipsoid/anchored`: queries with a 3D anchor, a centre with an ellipsoid around it.
+"""`ellipsoid/anchored`: queries with a 3D anchor, which is a centre with an ellipsoid around it.
 
-LocusGS is a special case: its weights become ellipsoids with three equal radii.
+LocusGS is the special case of three equal radii: `from_locus` converts its weights.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ Radius = Annotated[float, Field(gt=0)]
 
 
 class EllipsoidQueries(LearnedQueries):
-    """N queries with learned features, centres mu, rotations, raw radii, shared by all scenes."""
+    """N learned queries for all scenes: features, anchor centres, rotations, three raw radii."""
 
     name = "anchored"
 
@@ -31,7 +31,8 @@ class EllipsoidQueries(LearnedQueries):
         std: float = Field(default=0.01, ge=0)
         """Standard deviation of the initial features, which are normally distributed."""
         init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
-        """Initial softplus of the raw radii of each anchor, along the world's axes, world units."""
+        """Initial radii of each anchor along the world's axes, world units, before `radius_min`
+        changes them."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
@@ -51,15 +52,18 @@ class EllipsoidQueries(LearnedQueries):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return centre, rotation and raw radii."""
+        """Return the fields of anchor centres, rotations and raw radii."""
         return {**CENTER_FIELD, **shape_fields(config)}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Leave rotations out of weight decay, because their length has no effect."""
+        """Leave rotations out of weight decay: the length of a quaternion has no effect."""
         return name != "rotation" and super().decays(name, parameter)
 
     def start(self, batch_size: int) -> QueryState:
-        """Return features (B, N, D), centres (B, N, 3), rotations (B, N, 4), radii (B, N, 3)."""
+        """Return initial queries: features (B, N, D), and the fields of their anchors.
+
+        Those are centres (B, N, 3), unit quaternions (B, N, 4) and raw radii (B, N, 3).
+        """
         # The optimiser changes the meaningless lengths; components get unit quaternions.
         quats = F.normalize(self.rotation, dim=-1)
         fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
@@ -68,17 +72,17 @@ class EllipsoidQueries(LearnedQueries):
         return QueryState(features=features, fields=fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
-        """Return the ellipsoids."""
+        """Return the ellipsoid of each anchor."""
         return SpatialSupport(centers=state[CENTER], axes=anchor_axes(state, self.config))
 
 
 def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Convert a LocusGS state dict for the same recipe with ellipsoidal anchors.
+    """Convert LocusGS's weights to those of the same recipe with ellipsoidal anchors.
 
-    The head must stay that of LocusGS. Each radius becomes three equal ones, which get equal steps
-    in the refinement. Rotations are the identity. With `rotation: false` the model computes the
-    same as LocusGS. Weights that refine rotations are missing (load with `strict=False`). Raises
-    KeyError for weights without radii.
+    The recipe must keep LocusGS's head. Each radius becomes three equal radii, which the refinement
+    changes by equal steps. Rotations are the identity. If the refinement has `rotation: false`, the
+    model then computes the same as LocusGS. Weights of the MLP that refines rotations are missing,
+    so load the result with `strict=False`. Raises KeyError for weights without radii.
     """
     converted = {name: _tripled(name, values) for name, values in weights.items()}
     converted["queries.raw_radii"] = converted.pop("queries.raw_radius")

@@ -1,4 +1,4 @@
-"""`ellipsoid/ray_biased`: attention that prefers rays through the query's ellipsoid."""
+"""`ellipsoid/ray_biased`: attention that prefers patches with rays through a query's ellipsoid."""
 
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER
@@ -12,10 +12,11 @@ from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 
 
 class EllipsoidCrossAttention(RayBiasedCrossAttention):
-    """Attention `locus/ray_biased` with distances to rays in the metric of the ellipsoid.
+    """Attention `locus/ray_biased` with an ellipsoid instead of a ball around the anchor's centre.
 
-    Options, floors, clamp and gamma are those of LocusGS. The floor of (sigma0 r)^2 applies to each
-    axis. A fixed bandwidth ignores the shape.
+    Along each axis of the ellipsoid, distances from the centre to rays are measured in its radius
+    on that axis. Options have the same meaning; `sigma_sq_min` bounds (sigma0 r)^2 on each axis.
+    With `bandwidth: fixed` the ellipsoid has no effect.
     """
 
     name = "ray_biased"
@@ -26,7 +27,7 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
         return shape_fields(config) if config.bandwidth == "radius" else {}
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
-        """Return gamma b for the state before this layer."""
+        """Return the bias gamma b from the anchors in `state` and the patch rays in `memory`."""
         config = self.config
         sigma_sq_BN3 = self.sigma_sq(state)
         # With one bandwidth for all anchors, the bias is that of LocusGS, whose kernels are faster.

@@ -1,4 +1,4 @@
-"""State fields of an anchor's shape: a rotation and three raw radii, beside its centre.
+"""State fields of an ellipsoidal anchor besides its centre: a rotation and three raw radii.
 
 Rotations are quaternions w x y z.
 """
@@ -19,41 +19,42 @@ RAW_RADII = "ellipsoid.raw_radii"
 ROTATION_FIELD: Fields = {
     ROTATION: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, anchor to world")
 }
-"""Rotation R of the anchor's axes (B, N, 4)."""
+"""Field of rotations of the anchors' axes (B, N, 4)."""
 
 
 def radii_field(options: RadiusOptions) -> Fields:
-    """Return the field of raw radii (B, N, 3) along the anchor's axes, encoded as in LocusGS."""
+    """Return the field of raw radii (B, N, 3) along the anchor's axes, with LocusGS's encoding."""
     (scalar,) = radius_field(options).values()
     return {RAW_RADII: FieldSpec((3,), encoding=scalar.encoding)}
 
 
 def shape_fields(options: RadiusOptions) -> Fields:
-    """Return the fields of rotation and raw radii."""
+    """Return the fields of rotations and raw radii."""
     return {**ROTATION_FIELD, **radii_field(options)}
 
 
 @full_precision
 def anchor_rotation(quats: Tensor) -> Tensor:
-    """Return R (..., 3, 3), anchor to world, of quaternions (..., 4) of any length.
+    """Return rotation matrices (..., 3, 3), anchor to world, from quaternions (..., 4).
 
-    A quaternion of length 0 gives the identity.
+    Quaternions w x y z may have any length. A quaternion of length 0 gives the identity.
     """
     return quat_to_matrix(unit(quats))
 
 
 def anchor_axes(state: QueryState, options: RadiusOptions) -> Tensor:
-    """Return R diag(r) (B, N, 3, 3): the semi-axes of each anchor as columns, world units."""
+    """Return the semi-axes of each anchor's ellipsoid as columns (B, N, 3, 3), world frame."""
     radii = support_radius(state[RAW_RADII], options)
     return anchor_rotation(state[ROTATION]) * radii[..., None, :]
 
 
 @full_precision
 def turned(quats: Tensor, turn: Tensor) -> Tensor:
-    """Turn `quats` about world axes by `turn` (..., 3), and return unit quaternions (..., 4).
+    """Turn `quats` (..., 4) about world axes by `turn` (..., 3), and return unit quaternions.
 
-    turn / 2 is the Gibbs vector of the rotation (Cayley transform). Its axis is `turn`, its angle
-    2 atan(|turn| / 2). Small angles are about |turn| radians; half a turn is never reached.
+    The axis of the rotation is `turn` and its angle 2 atan(|turn| / 2): about |turn| radians for
+    small ones, and always less than 180 degrees. So turn / 2 is its Gibbs vector (Cayley
+    transform).
     """
     small = torch.cat([torch.ones_like(turn[..., :1]), turn / 2], -1)
     return F.normalize(quat_product(F.normalize(small, dim=-1), quats), dim=-1)

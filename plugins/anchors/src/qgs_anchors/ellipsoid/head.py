@@ -13,26 +13,27 @@ from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape
 
 
 class EllipsoidHead(GaussianHead):
-    """Head `qgs/gaussian_head` with rotations and scales relative to the anchor.
+    """Head `qgs/gaussian_head` with rotations and scales relative to the anchor's ellipsoid.
 
-    A Gaussian is turned with its anchor. Its scale s along an axis is multiplied by the radius of
-    the ellipsoid in that direction: s / |u / r|, with u the axis in the anchor's frame.
+    A Gaussian's rotation is followed by the anchor's. Its scale along an axis is multiplied by the
+    radius of the ellipsoid in that direction, 1 / |u / r|. Here u is the unit vector of the axis in
+    the anchor's frame, and r are the three radii.
     """
 
     name = "gaussian_head"
 
     class Config(GaussianHead.Config, RadiusOptions):
-        """Options of `qgs/gaussian_head`; `scale_cap` is a multiple of the anchor's radius."""
+        """Options of `qgs/gaussian_head`, but with `scale_cap` in radii of the anchor."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields of the anchors' shapes."""
+        """Return the fields of the anchors' rotations and raw radii."""
         return shape_fields(config)
 
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """Return attributes of (B, N, K) Gaussians from features (B, N, D) and anchor shapes."""
+        """Return attributes of (B, N, K) Gaussians from features (B, N, D) and ellipsoids."""
         local = super().forward(state)
         quats = unit(local.quats)
         # The anchor's rotation comes after the Gaussian's own.
@@ -43,26 +44,30 @@ class EllipsoidHead(GaussianHead):
 
 @full_precision
 def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
-    """Return radii (B, N, K, 3) of ellipsoids along the axes of their Gaussians.
+    """Return the radii (B, N, K, 3) of ellipsoids in the directions of their Gaussians' axes.
 
-    quats: Gaussian to anchor. In direction u of the anchor's frame the radius is 1 / |u / r|.
+    radii: of the ellipsoid's own axes. quats: rotation from Gaussian to anchor. In direction u of
+    the anchor's frame an ellipsoid with radii r has the radius 1 / |u / r|.
     """
     return 1 / (quat_to_matrix(quats_BNK4) / radii_BN3[:, :, None, :, None]).norm(dim=-2)
 
 
 class AxisScaledCenters(RadiusScaledCenters):
-    """Means at mu + R diag(r) posact(offset), with the options of `locus/radius_scaled`."""
+    """Gaussian means at mu + R diag(r) posact(offset), for ellipsoidal anchors.
+
+    An anchor has the centre mu, the rotation R and the radii r.
+    """
 
     name = "axis_scaled"
 
     @classmethod
     def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
-        """Return centres and shapes."""
+        """Return the fields of anchor centres, rotations and raw radii."""
         return {**CENTER_FIELD, **shape_fields(config)}
 
     @full_precision
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
+        """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
         # Offsets are along the axes of the ellipsoid, in units of its radii.
         displaced = self.config.displacement(offsets)
         return state[CENTER][:, :, None] + displaced @ anchor_axes(state, self.config).mT

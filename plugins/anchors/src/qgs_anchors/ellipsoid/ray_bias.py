@@ -1,10 +1,10 @@
-"""Attention bias between ellipsoidal anchors and image rays: b = -1/2 min (x-mu)' A (x-mu).
+"""Attention bias between ellipsoidal anchors and image rays: b = -1/2 min |W (x - mu)|^2.
 
-The minimum is over the points x of a ray. A = R diag(1 / sigma^2) R' is the metric of the anchor,
-with bandwidths sigma_i = sigma0 r_i. W = diag(1 / sigma) R' maps the ellipsoid to a unit ball. It
-maps the direction d of a Plücker ray (m, d) to W d. It maps the ray's moment around the centre to
-cof(W) (m - mu x d), because W a x W b = cof(W) (a x b). So the minimum is
-|cof(W) (m - mu x d)|^2 / |W d|^2.
+The minimum is over the points x of a ray; mu is the anchor's centre. W = diag(1 / sigma) R' maps
+the ellipsoid with semi-axes sigma_i = sigma0 r_i to a unit ball, with R' the transposed rotation of
+the anchor and r_i its radii. W maps the direction d of a Plücker ray (m, d) to W d. It maps the
+ray's moment around the centre to cof(W) (m - mu x d), with cof(W) the cofactor matrix, because
+W a x W b = cof(W) (a x b). So the minimum is |cof(W) (m - mu x d)|^2 / |W d|^2.
 """
 
 from typing import Self
@@ -18,24 +18,25 @@ from qgs.geometry.transforms import unit
 from qgs.precision import full_precision
 
 UPWARD = (0.0, 0.0, 1.0)
-"""Direction of a ray whose own direction is 0."""
+"""Direction that replaces the direction of a ray if that is 0."""
 
 
 @full_precision
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
-    """Return moments, directions and unit directions as rows: (B, M, 6) -> (B, 9, M).
+    """Return moments, directions and unit directions of rays (B, M, 6) as rows (B, 9, M).
 
-    direction_eps: lower bound of the |d| by which a ray is divided, as in LocusGS's bias.
+    direction_eps: least length |d| of a direction by which its ray is divided. A shorter direction
+    d stays shorter than 1, but its unit direction has length 1.
     """
     m_BM3, d_BM3 = normalised_rays(rays_BM6, direction_eps)
     return torch.cat([m_BM3, d_BM3, unit(d_BM3, UPWARD)], -1).mT.contiguous()
 
 
 class EllipsoidBias(AttentionBias):
-    """Bias gamma * clamp(b, bias_min, 0).
+    """Bias gamma * max(b, bias_min), with the b of ellipsoids and rays of this module.
 
-    Each query has mu, the rows of cof(W) and of W, gamma / 2 and gamma * bias_min. Each token has
-    m, d and d / |d|.
+    Each query has the anchor's centre mu, the rows of cof(W) and of W, gamma / 2 and
+    gamma * bias_min. Each token has moment m, direction d and unit direction d / |d| of its ray.
     """
 
     @classmethod
@@ -51,8 +52,9 @@ class EllipsoidBias(AttentionBias):
     ) -> Self:
         """Make the bias of a layer.
 
-        rotation: anchor to world. sigma_sq: along the axes of the anchor. tokens: from
-        `ray_tokens`, the same for all layers. gamma: 0-d, positive.
+        center: anchor centres, world. rotation: anchor to world. sigma_sq: squared bandwidths along
+        the anchor's axes. tokens: result of `ray_tokens`. bias_min: lower bound of b. gamma:
+        positive weight, 0-d.
         """
         sigma_BN3 = sigma_sq_BN3.sqrt()
         ball_BN9 = (rotation_BN33 / sigma_BN3[..., None, :]).mT.flatten(2)
@@ -65,7 +67,7 @@ class EllipsoidBias(AttentionBias):
         return cls(torch.cat(parts, -1), tokens_B9M)
 
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
-        """Return the bias (n, M), through moments and directions (n, M, 3)."""
+        """Return the bias (n, M) of n queries and the M tokens of a scene."""
         center_n3, *matrices, factor_n1, lower_n1 = queries_nF.split([3, 9, 9, 1, 1], -1)
         cofactors_n33, ball_n33 = (matrix.unflatten(-1, (3, 3)) for matrix in matrices)
         m_M3, d_M3, unit_M3 = (tokens_GM[rows : rows + 3].mT for rows in (0, 3, 6))
@@ -82,10 +84,13 @@ class EllipsoidBias(AttentionBias):
 
 
 def _times(matrix_n33: Tensor, vectors: Tensor) -> Tensor:
-    """Multiply (n, 3, 3) by (n or 1, M, 3) to (n, M, 3), without a GPU's inexact matrix units."""
+    """Multiply matrices (n, 3, 3) by vectors (n or 1, M, 3) to (n, M, 3), in full float32.
+
+    A matrix product could use a GPU's matrix units, which are less exact.
+    """
     return (matrix_n33[:, None] * vectors[..., None, :]).sum(-1)
 
 
 def _cofactors(matrix: Tensor) -> Tensor:
-    """Return the cofactor matrices of (..., 3, 3)."""
+    """Return the cofactor matrices (..., 3, 3) of matrices (..., 3, 3)."""
     return torch.linalg.cross(matrix.roll(-1, -1), matrix.roll(-2, -1), dim=-2)

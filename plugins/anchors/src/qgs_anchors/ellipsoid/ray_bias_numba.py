@@ -1,7 +1,9 @@
-"""Numba kernels of `EllipsoidBias`: one pass over the rays of each query, in registers.
+"""Numba kernels of `EllipsoidBias`, which pass once over all rays for each query.
 
-Each query is a row: mu, cof(W) and W by rows, gamma / 2, gamma * bias_min. Tokens have nine rows:
-m, d, d / |d|. A matrix is a tuple of its nine entries.
+Each query is a row: the anchor's centre mu, the matrices cof(W) and W by rows, factor = gamma / 2
+and lower = gamma * bias_min. W is defined in `qgs_anchors.ellipsoid.ray_bias`. Tokens are nine
+rows: moments m, directions d and unit directions d / |d| of rays. In the code, a matrix is a tuple
+of its nine entries.
 """
 
 import numpy as np
@@ -14,7 +16,7 @@ _TWO = np.float32(2)
 
 @kernel
 def _times(a, x, y, z):
-    """Return a (x, y, z), with a 3 x 3."""
+    """Return the product of the 3 x 3 matrix `a` and the vector (x, y, z)."""
     return (
         a[0] * x + a[1] * y + a[2] * z,
         a[3] * x + a[4] * y + a[5] * z,
@@ -32,7 +34,7 @@ def _nine(row, first):
 
 @kernel
 def _moment(mu, t, j):
-    """Return m - mu x d of token j."""
+    """Return m - mu x d, with moment m and direction d of token j, and `t` the rows of tokens."""
     return (
         t[0, j] - mu[1] * t[5, j] + mu[2] * t[4, j],
         t[1, j] - mu[2] * t[3, j] + mu[0] * t[5, j],
@@ -42,9 +44,9 @@ def _moment(mu, t, j):
 
 @kernel
 def write(queries, tokens, out):
-    """Write max(-factor |cof(W) (m - mu x d)|^2 / |W d|^2, lower) to `out`.
+    """Write the bias max(-factor |cof(W) (m - mu x d)|^2 / |W u|^2, lower) to `out`.
 
-    The d in the denominator has unit length.
+    u is d / |d|, the unit direction.
     """
     for n in range(queries.shape[0]):
         q = queries[n]
@@ -73,7 +75,10 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Write gradients of the queries to `out`: a gradient g of e = m - mu x d is g x d of mu."""
+    """Write gradients of the numbers of queries to `out`.
+
+    gradient: of the bias. If g is the gradient of e = m - mu x d, then that of mu is g x d.
+    """
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]

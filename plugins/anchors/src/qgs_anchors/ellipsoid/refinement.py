@@ -8,14 +8,17 @@ from qgs_anchors.ellipsoid.fields import ROTATION, ROTATION_FIELD, radii_field, 
 
 
 class EllipsoidRefinement(AnchorRefinement):
-    """Refinement `locus/refine` with three radii (rho += MLP(x)) and R = turn(MLP(x)) R."""
+    """Update of anchors as in `locus/refine`, with three radii and a rotation.
+
+    An MLP of the query's features gives the vector by which `turned` rotates the anchor.
+    """
 
     name = "refine"
     parts = ("`center`", "`rotation`", "`radius`")
 
     class Config(AnchorRefinement.Config):
         rotation: bool = True
-        """Refine the rotations."""
+        """Update anchor rotations after each decoder layer. With false, they stay unchanged."""
 
     config: Config
 

@@ -1,4 +1,4 @@
-"""Landmark for qgs: LocusGS whose anchors start on surfaces that the photos show."""
+"""Landmark for qgs: LocusGS with anchors that start on surfaces which the photos show."""
 
 from qgs.contracts import Plugin
 from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters, FramedRefinement
@@ -30,7 +30,7 @@ plugin = Plugin(
     ),
     exemptions={
         NeighbourAttention: {
-            "updates_are_explained": "it reads values and also places relative to the query"
+            "updates_are_explained": "its update depends on values and on positions of neighbours"
         },
     },
 )

@@ -1,6 +1,6 @@
-"""`landmark/footprint`, `landmark/colored`: Gaussians that start as pixels of a photo.
+"""`landmark/footprint`, `landmark/colored`: Gaussians with first places and colours of pixels.
 
-`landmark/refine`: LocusGS's refinement, with steps in radii along the axes of the photo.
+`landmark/refine`: LocusGS's update of anchors, with steps in radii along the camera's axes.
 """
 
 from collections.abc import Mapping
@@ -30,28 +30,29 @@ from qgs_anchors.landmark.fields import (
 from qgs_anchors.landmark.places import cells, rows_in_square
 
 COLOR_MARGIN = 0.02
-"""Least distance of initial colours from 0 and 1, where they would get no gradient."""
+"""Least distance of initial colours from 0 and from 1, where they would get no gradient."""
 
 _OF_CHANNELS = ("linear.weight", "linear.bias")
 
 
 class FootprintCenters(RadiusScaledCenters):
-    """Means at mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
+    """Gaussian means at mu + r (u, v, 0) + r posact(offset), along the axes of the anchor's camera.
 
-    (u, v) is the centre of the Gaussian's cell relative to the centre of the footprint. Its unit is
-    the side of a square with the area of the footprint. If the radius equals that side, offsets of
-    0 put each Gaussian on the ray of its cell.
+    mu and r are centre and radius of the anchor. A footprint is the part of a photo that a query
+    stands for; each of its cells has a Gaussian. (u, v) is the centre of that cell relative to the
+    centre of the footprint, in units of a side: the root of the footprint's area. If the anchor's
+    radius is one side, an offset of 0 puts the Gaussian on the ray of its cell.
     """
 
     name = "footprint"
 
     @classmethod
     def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
-        """Return anchors, the axes of their photos, and their footprints."""
+        """Return the fields of anchors, of the axes of their cameras, and of their footprints."""
         return {**super().fields_read(config), **FRAME_FIELD, **FOOTPRINT_FIELD}
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
+        """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
         count = offsets.shape[2]
         size_BN2, rows_BN1 = state[FOOTPRINT].tensor_split([2], -1)
         rows = rows_BN1[0, 0, 0].round().long().clamp_max(count)
@@ -64,32 +65,34 @@ class FootprintCenters(RadiusScaledCenters):
 
 
 class ColoredHead(GaussianHead):
-    """Head `qgs/gaussian_head` with colours relative to the photo and scales in radii.
+    """Head `qgs/gaussian_head` with colours relative to the photo's, and scales in anchor radii.
 
-    A Gaussian has the colour (tanh(raw + atanh(2 c - 1)) + 1) / 2, with c the colour of its cell.
-    So raw colours of 0 give those of the photo.
+    Each Gaussian stands for a cell of a photo. Its colour is (tanh(raw + atanh(2 c - 1)) + 1) / 2,
+    with `raw` the head's output and c the mean colour of the cell. So a raw colour of 0 gives c.
     """
 
     name = "colored"
 
     class Config(GaussianHead.Config, RadiusOptions):
         gaussians_per_query: int = Field(default=4, ge=1)
-        """K, the number of Gaussians of each query. It must equal `cells` of the queries."""
+        """K, the number of Gaussians of each query. It must equal the option `cells` of the
+        queries."""
         scale_cap: float = Field(default=0.8, gt=0)
-        """Largest scale, in radii of the anchor. A raw scale of 0 gives 1/e of it."""
+        """Largest scale, in radii of the anchor. A raw scale of 0 gives 1/e of the largest."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return colours and radii."""
+        """Return the fields of cell colours and raw radii."""
         return {**color_field(config.gaussians_per_query), **radius_field(config)}
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Adapt the weights of a head with another number of cells.
+        """Adapt the weights `learned` by a head with a different number of Gaussians per query.
 
-        Each Gaussian takes the weights of the nearest cell. Both sets of cells are taken to fill a
-        square, as with `count: null`; the cells of a tile may have other places.
+        Each Gaussian stands for a cell of a footprint, and takes the weights of the nearest cell
+        of the old head. The footprint is assumed to be a square, as with `count: null`. In a tile,
+        cells may be arranged differently.
         """
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values
@@ -97,9 +100,10 @@ class ColoredHead(GaussianHead):
         }
 
     def _of_cells(self, rows: Tensor) -> Tensor:
-        """Turn rows (K' * 14, ...) of other cells into rows (K * 14, ...) of this head's cells.
+        """Turn rows (K' * 14, ...) of K' cells into rows (K * 14, ...) of this head's K cells.
 
-        Rows that do not divide into channels belong to another kind of head, and stay unchanged.
+        If the number of rows is not a multiple of 14, the rows belong to another kind of head, and
+        are returned unchanged.
         """
         if len(rows) % sum(CHANNELS):
             return rows
@@ -119,17 +123,18 @@ class ColoredHead(GaussianHead):
 
 
 class FramedRefinement(AnchorRefinement):
-    """Refinement mu += r step(MLP_mu(x)) in the frame of the photo, and rho += MLP_rho(x).
+    """Update of anchors as in `locus/refine`, with steps of centres along the camera's axes.
 
-    An anchor that starts on a ray of a photo is off by some radii, mostly in depth. In the frame of
-    its photo, depth is the same direction for all anchors.
+    The unit of a step is the anchor's radius. An anchor that starts on a ray of a photo is wrong by
+    some radii, mostly in depth. Along the axes of the photo's camera, depth is the same direction
+    for all anchors.
     """
 
     name = "refine"
 
     @classmethod
     def fields_read(cls, config: AnchorRefinement.Config) -> Fields:
-        """Return the refined fields, and frames and radii if centres are refined."""
+        """Return the fields that are refined, and camera axes and radii if centres are refined."""
         framed = {**FRAME_FIELD, **radius_field(config)} if config.center else {}
         return {**super().fields_read(config), **framed}
 
@@ -139,7 +144,7 @@ class FramedRefinement(AnchorRefinement):
         return super().fields_read(config)
 
     def center_step(self, state: QueryState) -> Tensor:
-        """Return the step of the centres (B, N, 3), world frame."""
+        """Return the steps of the centres (B, N, 3), world frame."""
         # Steps are in radii: distant anchors, with larger radii, may move further.
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         return in_world(r_BN1 * super().center_step(state), state[FRAME])

@@ -1,4 +1,4 @@
-"""`landmark/neighbours`: self-attention of each anchor to its nearest anchors."""
+"""`landmark/neighbours`: self-attention of each query to those with the nearest anchors."""
 
 import torch
 from pydantic import Field
@@ -12,18 +12,19 @@ from qgs.tokengs.blocks import attention_weights, merge_heads
 from qgs.types import QueryState
 
 MAX_PAIRS = 1 << 22
-"""Distances that are computed at once (16 MiB in float32)."""
+"""Largest number of distances in memory at once (16 MiB in float32)."""
 PLACE = 5
-"""Numbers of a relative place: difference over reach, its length, log of the reach."""
+"""Numbers of a relative position: difference over reach (3), its length, log of the reach."""
 EPS = 1e-6
 
 
 class NeighbourAttention(SelfAttention):
-    """Self-attention softmax_j(q_i k_j / sqrt(d) + MLP(p_ij)) over the k nearest anchors j.
+    """Self-attention of each query i to the queries j with the k nearest anchors, i included.
 
-    The nearest anchors of i include i. Attention reads their values v_j and their relative places
-    p_ij: (mu_j - mu_i) / s_i, its length, and log s_i. The reach s_i is the distance of the
-    farthest of the k, so relative places do not depend on how dense the anchors are.
+    The weights are softmax_j(q_i k_j / sqrt(d) + MLP(p_ij)). They average the values v_j and the
+    relative positions p_ij, which are (mu_j - mu_i) / s_i, the length of this vector, and log s_i.
+    mu is an anchor's centre. The reach s_i is the distance from i to the farthest of the k anchors,
+    so the vectors do not depend on how dense the anchors are.
     """
 
     name = "neighbours"
@@ -33,9 +34,10 @@ class NeighbourAttention(SelfAttention):
 
     class Config(ComponentConfig):
         count: int = Field(default=16, ge=1)
-        """k, the number of anchors that each one reads. It reads all if there are fewer."""
+        """k, the number of nearest anchors that each query reads. If there are fewer anchors, it
+        reads all."""
         hidden: int = Field(default=32, ge=1)
-        """Hidden width of the MLP that turns a relative place into one logit per head."""
+        """Hidden width of the MLP that maps a relative position to one logit per head."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
         """Number that every LayerNorm adds to the variance."""
 
@@ -49,7 +51,7 @@ class NeighbourAttention(SelfAttention):
         self.place_proj = nn.Linear(PLACE * dims.heads, dims.width, bias=False)
 
     def forward(self, state: QueryState) -> Tensor:
-        """Return the update (B, N, D)."""
+        """Return the update (B, N, D) of the queries' features."""
         index_BNk, place_BNkP, bias_BhNk = self._near(state)
         q_BhNd, k_BhNd, v_BhNd = self.attention.project(self.norm(state.features))
         near_k, near_v = (_taken(x, index_BNk) for x in (k_BhNd, v_BhNd))
@@ -62,7 +64,7 @@ class NeighbourAttention(SelfAttention):
         )
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        """Return attention over all queries; queries that are not neighbours are hidden."""
+        """Return the attention of `queries` to all queries, with weight 0 where not a neighbour."""
         index_BNk, _, bias_BhNk = self._near(state)
         q_BhNd, k_BhNd, _ = self.attention.project(self.norm(state.features))
         chosen = bias_BhNk[:, :, queries]
@@ -71,7 +73,10 @@ class NeighbourAttention(SelfAttention):
         return attention_weights(q_BhNd[:, :, queries], k_BhNd, hidden.scatter(-1, index, chosen))
 
     def _near(self, state: QueryState) -> tuple[Tensor, Tensor, Tensor]:
-        """Return neighbours (B, N, k), their relative places, and logits (B, h, N, k) of these."""
+        """Return neighbours (B, N, k), and their relative positions with these positions' logits.
+
+        Positions are (B, N, k, 5) and logits (B, h, N, k).
+        """
         index_BNk, seen_BNk = nearest(state[CENTER], self.config.count, state.mask)
         place_BNkP = relative_places(state[CENTER], index_BNk, seen_BNk)
         bias_BNkh = at_least_float32(self.place_mlp(place_BNkP))
@@ -84,11 +89,10 @@ class NeighbourAttention(SelfAttention):
 @torch.no_grad()
 @full_precision
 def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Return indices (B, N, k) of the nearest anchors of each, and which of them are queries.
+    """Return indices (B, N, k) of the k nearest anchors of each anchor, and which are not masked.
 
-    k is `count`, or the number of all anchors if that is less. The search is exact and computes
-    some rows of distances at a time. Each anchor is its own first neighbour. The second result is
-    None without a mask.
+    k is `count`, or the number of all anchors if that is less. The search is exact. Each anchor is
+    its own first neighbour, even if it is masked. Without a mask the second result is None.
     """
     scenes, anchors, _ = center_BN3.shape
     # One part if all distances fit: torch.compile makes a graph for each number of parts.
@@ -112,7 +116,10 @@ def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Ten
 
 @full_precision
 def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | None) -> Tensor:
-    """Return relative places p (B, N, k, 5); neighbours that are not `seen` count as at 0."""
+    """Return relative positions (B, N, k, 5) of neighbours, as `NeighbourAttention` defines them.
+
+    Where `seen` is False, the neighbour is masked, and its position counts as the anchor's own.
+    """
     around_BNk3 = _taken(center_BN3[:, None], index_BNk)[:, 0]
     step_BNk3 = around_BNk3 - center_BN3[:, :, None]
     if seen_BNk is not None:
@@ -124,7 +131,7 @@ def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | No
 
 
 def _taken(x_BhNd: Tensor, index_BNk: Tensor) -> Tensor:
-    """Return the rows of neighbours (B, h, N, k, d)."""
+    """Return the rows of `x` that belong to the neighbours `index`, (B, h, N, k, d)."""
     # Whole rows: `gather` copies single numbers (10 ms, not 3, for 512 anchors on a CPU).
     scenes, heads, anchors, _ = x_BhNd.shape
     first = torch.arange(scenes * heads, device=index_BNk.device).view(scenes, heads, 1, 1)

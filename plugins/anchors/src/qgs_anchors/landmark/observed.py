@@ -1,4 +1,4 @@
-"""`landmark/observed`: queries whose anchors start on rays of photos, at a predicted depth."""
+"""`landmark/observed`: queries with anchors that start on rays of photos, at a predicted depth."""
 
 import math
 from collections.abc import Iterable
@@ -55,27 +55,27 @@ from qgs_anchors.landmark.places import (
 from qgs_anchors.landmark.sweep import mismatch
 
 SHARPNESS = 300.0
-"""Initial 1 / t. With 300, a difference of 1/300 in RGB makes a depth e times less likely."""
+"""Initial 1 / t of a sweep. A difference of 1/300 in RGB makes a depth e times less likely."""
 UNSEEN = 0.2
-"""Initial difference in RGB that is assumed for a depth that no other photo sees."""
+"""Initial value of the difference in RGB that counts for depths that no other photo sees."""
 SAMPLES = 4
-"""Number of samples along each side of a window."""
+"""Number of samples along each side of the square in which photos are compared."""
 
 
 class ObservedQueries(Queries):
-    """Queries at places of photos, each with the token there and an anchor on the ray through it.
+    """Queries for points of the photos: each starts with the token and on the ray of its point.
 
-    The anchor's depth along the camera's axis is z = near^w far^(1 - w), with w the sigmoid of an
-    MLP of the token. With a sweep, w is the mean of D values from 0 to 1 with weights
-    softmax(MLP(token) - c / t). The cost c is the difference between the photo and the other photos
-    at that depth.
+    The depth of the anchor along the camera's axis is z = near^w far^(1 - w), with w the sigmoid of
+    an MLP of the token. With a sweep over D depths, w is the mean of D values from 0 to 1 with
+    weights softmax(MLP(token) - c / t). The cost c of a depth is the difference in colour between
+    this photo and the other photos there; t is learned.
 
-    A query's footprint is its share of the photos' area: a tile or a square of its photo. The side
-    of a footprint is the root of its area. The initial radius is `radius` times the side at the
-    anchor's depth.
+    A query's footprint is the part of its photo that it stands for, a tile or a square. The side of
+    a footprint is the root of its area. The initial radius of the anchor is `radius` times this
+    side, measured at the anchor's depth.
 
-    A query of S tokens starts with their mean, plus a matrix times the differences of all tokens
-    but the first from this mean. Its w is the mean of the S values.
+    A query may take S tokens from its footprint. It starts with their mean, plus a learned matrix
+    times the differences from the mean of all tokens but the first. Its w is the mean of S values.
     """
 
     name = "observed"
@@ -83,32 +83,34 @@ class ObservedQueries(Queries):
 
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
-        """N, the number of queries, spread evenly over all input photos of any number and size.
-        They fill equal tiles if tiles with nearly square cells fit every photo, else rows. Null
-        puts `per_token` queries at the centre of each token's patch."""
+        """N, the number of queries, which are spread evenly over the input photos. Each query has a
+        tile if equal tiles with nearly square cells fill every photo; otherwise queries form rows.
+        Null puts `per_token` queries at the centre of each token's patch."""
         tokens: int = Field(default=1, ge=1)
-        """S, the number of places in its footprint from which a query takes tokens and depths. It
+        """S, the number of points in its footprint at which a query takes tokens and depths. It
         has an effect only if `count` is a number."""
         per_token: int = Field(default=1, ge=1)
-        """Number of queries of each token if `count` is null. Each has its own learned vector."""
+        """Number of queries for each token if `count` is null. Each of them adds its own learned
+        vector to the token."""
         near: float = Field(default=0.2, gt=0)
-        """Least depth, world units."""
+        """Least initial depth of an anchor, world units."""
         far: float = Field(default=3.0, gt=0, validate_default=True)
-        """Largest depth, world units."""
+        """Largest initial depth of an anchor, world units."""
         sweep: int | None = Field(default=None, ge=2)
-        """D, the number of depths at which photos are compared. Null predicts the depth from the
-        token alone."""
+        """D, the number of depths at which photos are compared to find that of an anchor. Null
+        predicts the depth from the token alone."""
         window: float = Field(default=1.5, gt=0)
-        """Side of the squares that are compared, in sides of a square with 1/S of the footprint's
-        area."""
+        """Side of the squares of photos that a sweep compares. The unit is the root of 1/S of the
+        footprint's area."""
         radius: float = Field(default=1.0, gt=0)
-        """Initial radius of an anchor, in sides of its footprint at its depth."""
+        """Initial radius of an anchor. The unit is the side of its footprint, measured at the
+        anchor's depth."""
         std: float = Field(default=0.3, ge=0)
         """Initial standard deviation of the learned vectors, which are added to tokens."""
         cells: int | None = Field(default=None, ge=1)
-        """K, the number of cells of its footprint whose colours a query knows, for the Gaussians of
-        `landmark/colored`. Null writes no colours. 8 cells are rows of 2, 3 and 3 if `count` is
-        null, and 2 rows of 4 if it is a number."""
+        """K, the number of cells into which a footprint is divided. Queries store the mean colour
+        of each cell for the head `landmark/colored`. Null stores no colours. For example, 8 cells
+        form rows of 2, 3 and 3 if `count` is null, and 2 rows of 4 if it is a number."""
 
         @field_validator("far")
         @classmethod
@@ -142,21 +144,21 @@ class ObservedQueries(Queries):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return centre, raw radius, axes of the photo, footprint, and colours of cells."""
+        """Return the fields of anchors, camera axes, footprints, and colours if there are cells."""
         colors = color_field(config.cells) if config.cells else {}
         anchor = {**CENTER_FIELD, **radius_field(config), **FRAME_FIELD}
         return {**anchor, **FOOTPRINT_FIELD, **colors}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report `per_token` without effect if `count` is a number, `tokens` if it is null."""
+        """Report options without effect: `tokens` if `count` is null, otherwise `per_token`."""
         if config.count is None:
             yield from without_effect(config, ("tokens",), "`count` is null")
         else:
             yield from without_effect(config, ("per_token",), "`count` is a number")
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """Return features (B, N, D) and fields (B, N, ...), with colours if there are `cells`."""
+        """Return initial queries: features (B, N, D) and the fields of `fields_written`."""
         assert memory.grid is not None
         config = self.config
         device = memory.features.device
@@ -181,7 +183,10 @@ class ObservedQueries(Queries):
     def _swept(
         self, x_BND: Tensor, views: Views, view_N: Tensor, place_N2: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return features, with the result of the sweep added, and nearness w (B, N, 1)."""
+        """Return features (B, N, D) and nearness (B, N, 1): 0 at depth `far`, 1 at `near`.
+
+        With a sweep, both depend on the agreement of the photos at each depth.
+        """
         if self.config.sweep is None:
             return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
         match_BND = self._match(views, view_N, place_N2.expand(len(x_BND), -1, -1))
@@ -193,7 +198,7 @@ class ObservedQueries(Queries):
         return x_BND, (share_BND * nearness_D).sum(-1, keepdim=True)
 
     def _joined(self, x_BXD: Tensor, nearness_BX1: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features and nearness of queries from those of their tokens."""
+        """Merge features and nearness of the S tokens of each query."""
         tokens = self.config.tokens
         if tokens == 1:
             return x_BXD, nearness_BX1
@@ -204,7 +209,7 @@ class ObservedQueries(Queries):
         return mean_BND + self.apart_proj(apart_BNSD.flatten(2)), nearness_BNS1.mean(2)
 
     def _match(self, views: Views, view_N: Tensor, place_BN2: Tensor) -> Tensor:
-        """Return logits (B, N, D) of depths from the agreement of the photos there."""
+        """Return logits (B, N, D) of D depths, which are high where the photos agree."""
         assert self.config.sweep is not None
         depth_D = self._depth(_nearness(self.config.sweep, place_BN2.device))
         side = self.config.window * side_of(len(view_N), views.cameras.shape[1], views.cameras.size)
@@ -212,7 +217,7 @@ class ObservedQueries(Queries):
         return -self.sharpness.exp() * torch.where(seen_BND, error_BND, self.unseen)
 
     def _depth(self, nearness: Tensor) -> Tensor:
-        """Return depths for nearness w, world units."""
+        """Return depths, world units, for a nearness from 0 (`far`) to 1 (`near`)."""
         # Even steps of w are even steps of log depth.
         return self.config.far * (self.config.near / self.config.far) ** nearness
 
@@ -225,9 +230,9 @@ class ObservedQueries(Queries):
         place_N2: Tensor,
         share_2: Tensor,
     ) -> dict[str, Tensor]:
-        """Return the fields of queries at places of photos.
+        """Return the fields of queries at points `place_N2` of the photos `view_N`.
 
-        share_2: width and height of footprints, as shares of the photo's.
+        share_2: width and height of footprints, as shares of the photo's width and height.
         """
         config = self.config
         cameras = views.cameras
@@ -263,16 +268,16 @@ class ObservedQueries(Queries):
         return rows_in_square(count) if self.config.count is None else rows_in_tile(count)
 
     def support(self, state: QueryState) -> SpatialSupport:
-        """Return balls of the support radius."""
+        """Return each anchor as a ball of its support radius."""
         return ball_support(state[CENTER], support_radius(state[RAW_RADIUS], self.config))
 
 
 def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return views (N * K,) and places (N * K, 2) at K steps from each place."""
+    """Return the points (N * K, 2) at K steps from each of N points, and their views (N * K,)."""
     place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
     return view_N.repeat_interleave(len(step_K2)), place_X2
 
 
 def _nearness(count: int, device: torch.device) -> Tensor:
-    """Return evenly spaced values (count,) from 0, which is `far`, to 1, which is `near`."""
+    """Return `count` evenly spaced values from 0 (depth `far`) to 1 (depth `near`)."""
     return torch.linspace(0, 1, count, device=device)

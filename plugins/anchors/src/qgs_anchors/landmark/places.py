@@ -1,6 +1,7 @@
-"""Places in photos: their coordinates, the colours there, and the rays through them.
+"""Points of photos: their coordinates, the colours there, and the rays through them.
 
-A place is x and y as shares of a photo's width and height. `view_N` is the index of its photo.
+A point (`place`) is x and y as shares of a photo's width and height. `view_N` has the index of the
+photo of each point.
 """
 
 import math
@@ -14,16 +15,19 @@ from qgs.precision import full_precision
 from qgs.types import Cameras
 
 EPS = 1e-4
-"""Tolerance in pixels, and in logarithms of aspect ratios."""
+"""Tolerance of comparisons, in pixels or in logarithms of aspect ratios."""
 MOST_OFF = 0.35
-"""Logarithm of the largest factor, 1.4, by which tiles may miss the aspect that was asked for.
+"""Largest difference of the logarithms of a tile's aspect and the wanted one: a factor of 1.4.
 
-Tiles that were off by 2 were worse than rows: 20.1 against 20.3 dB, for untrained models with 512
-points and 4 photos in 32 validation rooms."""
+With tiles that were off by a factor of 2, PSNR was worse than with rows: 20.1 against 20.3 dB, for
+untrained models with 512 points and 4 photos in 32 validation rooms."""
 
 
 def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
-    """Return the centres (rows * columns, 2) of the patches of a photo, row by row."""
+    """Return the centres (rows * columns, 2) of a photo's patches, row by row.
+
+    They are x and y, as shares of the photo's width and height.
+    """
     y, x = ((torch.arange(n, device=device) + 0.5) / n for n in (rows, columns))
     return torch.cartesian_prod(y, x).flip(-1)
 
@@ -31,9 +35,9 @@ def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
 def patches(
     grid: tuple[int, int, int], each: int, size: tuple[int, int], device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return `each` points at the centre of every patch of a grid (V, rows, columns).
+    """Put `each` points at the centre of every patch of a grid (V, rows, columns).
 
-    The results are those of `spread`.
+    Returns the views, points and shares that `spread` returns.
     """
     photos, rows, columns = grid
     place_N2 = patch_centres(rows, columns, device).repeat(photos, 1).repeat_interleave(each, 0)
@@ -46,13 +50,14 @@ def spread(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Spread N = `count` points evenly over photos of size (H, W).
 
-    Returns the view (N,) of each point, in turn; the places (N, 2); and the width and height (2,)
-    of the part of a photo that belongs to each point, as shares of the photo.
+    Returns the photo (N,) of each point, from 0, 1, 2 in turn; the points (N, 2); and width and
+    height (2,) of the part of a photo that belongs to a point. The last two are shares of the
+    photo's width and height.
 
-    The parts are equal tiles if tiles of about `aspect` (height over width in pixels) fit every
+    The parts are equal tiles if tiles of about `aspect` (height over width in pixels) fill every
     photo. The points are then the centres of the tiles. Otherwise the points are in rows, some of
-    which have one point more, and their parts count as squares. Both ways are as even as a
-    low-discrepancy sequence. With fewer points than photos, some photos have no point.
+    which have one point more than others, and each part counts as a square. Both ways are as even
+    as a low-discrepancy sequence. With fewer points than photos, some photos have no point.
     """
     index_N = torch.arange(count, device=device)
     of_photo = size[0] / size[1]
@@ -77,24 +82,25 @@ def spread(
 
 
 def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tensor:
-    """Return width and height (2,) of a square of `side_of`, as shares of a photo's."""
+    """Return width and height (2,) of a square with side `side_of`, as shares of the photo's."""
     return side_of(count, views, size) / constant([size[1], size[0]], like)
 
 
 def side_of(count: int, views: int, size: tuple[int, int]) -> float:
-    """Return the side in pixels of `count` squares with the total area of all photos (H, W)."""
+    """Return the side in pixels of `count` equal squares with the area of all photos together."""
     return math.sqrt(views * math.prod(size) / count)
 
 
 def rows_in_square(count: int) -> int:
-    """Return the number of rows in which `count` nearly square cells fill a square."""
+    """Return the number of rows if `count` nearly square cells fill a square."""
     return round(math.sqrt(count))
 
 
 def rows_in_tile(count: int) -> int:
-    """Return the rows of a grid of `count` cells with at most twice as many columns.
+    """Return the rows of the most nearly square grid with exactly `count` cells.
 
-    If there is no such grid, return the rows of `rows_in_square`.
+    It has at most twice as many columns as rows. If there is no such grid, the result is that of
+    `rows_in_square`.
     """
     few = range(math.isqrt(count), 0, -1)
     grids = (rows for rows in few if count % rows == 0 and count <= 2 * rows**2)
@@ -102,23 +108,26 @@ def rows_in_tile(count: int) -> int:
 
 
 def aspect_of(count: int) -> float:
-    """Return height over width of a tile whose `count` cells are squares."""
+    """Return height over width of a tile that `count` square cells fill, in `rows_in_tile` rows."""
     rows = rows_in_tile(count)
     return rows**2 / count if count % rows == 0 else 1.0
 
 
 def cells(count: int, rows: int | Tensor, like: Tensor) -> Tensor:
-    """Return the centres (K, 2), x and y, of K = `count` cells in rows of a unit square about 0."""
+    """Return the centres (K, 2) of K = `count` cells of a unit square around the origin.
+
+    They are x and y, in `rows` rows, row by row.
+    """
     index_K = torch.arange(count, device=like.device)
     # A tensor: torch.compile would make a graph for each number that Python divides.
     return parts(index_K, (index_K + 1).amax(), rows).to(like) - 0.5
 
 
 def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
-    """Return the centres (N, 2), x and y, of the parts `index_N` of a unit square, row by row.
+    """Return the centres (N, 2), x and y from 0 to 1, of the parts `index_N` of a unit square.
 
-    The square has `count` parts. Rows have equal heights; their numbers of parts differ by at most
-    one.
+    The square has `count` parts in `rows` rows, numbered row by row. Rows have equal heights. The
+    numbers of parts in two rows differ by at most one.
     """
     row_N = ((index_N + 1) * rows - 1) // count
     first_N = row_N * count // rows
@@ -131,17 +140,21 @@ def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
 def sampled(
     maps_BMC: Tensor, grid: tuple[int, int, int], view_N: Tensor, place_BN2: Tensor
 ) -> Tensor:
-    """Sample values (B, N, C), bilinear between the centres of patches.
+    """Sample maps at points, bilinearly between the centres of patches, as (B, N, C).
 
-    Beyond the outer centres, values are those of the edge. maps_BMC: values of the patches of a
-    grid (V, rows, columns), by view, row and column.
+    Points beyond the outermost centres get the values at the nearest edge. maps: values of the
+    patches of a grid (V, rows, columns), by view, row and column.
     """
     maps_BVChw = maps_BMC.unflatten(1, grid).movedim(-1, 2)
     return bilinear(maps_BVChw, view_N, place_BN2[:, :, None])[..., 0].mT
 
 
 def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
-    """Sample values (B, C, N, X) at places of the maps `view_N`; outside, those of the edge."""
+    """Sample maps bilinearly at X points of each of N photos, as (B, C, N, X).
+
+    maps: one map for each photo. view: index of the photo for each of the N. place: points (B, N,
+    X, 2), x and y from 0 to 1. Points outside a map get the values at its nearest edge.
+    """
     _, photos, _, height, width = maps_BVCHW.shape
     # All maps are stacked below each other: places stay half a pixel inside their own map.
     edge_2 = constant([0.5 / width, 0.5 / height], place_BNX2)
@@ -157,10 +170,10 @@ def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
 
 @full_precision
 def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tensor) -> Tensor:
-    """Return mean RGB (B, N, 3) over squares of `side` pixels around places.
+    """Return mean RGB (B, N, 3) over squares of `side` pixels around points of photos.
 
-    There is one sample per pixel. For whole sides the mean is exact. Beyond an edge, its pixels
-    repeat.
+    There is one sample per pixel, so the mean is exact if the side is a whole number. Beyond an
+    edge of the photo, the pixels of the edge are repeated.
     """
     height, width = images_BV3HW.shape[-2:]
     place_BN2 = place_BN2.to(images_BV3HW)
@@ -170,7 +183,7 @@ def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tens
 
 
 def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return world-frame origins and directions (B, N, 3) of rays through places of photos.
+    """Return world-frame origins and directions, each (B, N, 3), of rays through points of photos.
 
     Directions have z = 1 in the frame of their camera.
     """

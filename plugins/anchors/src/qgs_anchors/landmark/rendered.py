@@ -1,4 +1,7 @@
-"""`landmark/rendered`: rounds in which image tokens know the error of their photo's rendering."""
+"""`landmark/rendered`: feedback of rendering errors to the image tokens, in rounds.
+
+In a round, the model renders the input photos and runs its last decoder layers again.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -22,16 +25,16 @@ from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 CHANNELS = 7
 """Channels of an error map: photo minus rendering (RGB), rendering (RGB), alpha."""
 ERROR_GAIN = 4.0
-"""Factor of errors: they are some tenths, while the other channels reach 1."""
+"""Factor of the errors, which are a few tenths, while the other channels reach 1."""
 
 
 class RenderedFeedback(Feedback):
     """Feedback that adds rendering errors to keys and values, and a learned vector to queries.
 
-    The error maps of a photo are averaged into `cells` x `cells` for each token. A 3 x 3
-    convolution over tokens, GELU and a linear layer turn them into keys and values, which are added
-    to those of the encoder. The rays of the tokens stay. So attention with a bias by rays finds the
-    errors where the Gaussians of an anchor are rendered.
+    In each token's patch, the errors of the rendered photo are averaged into `cells` x `cells`
+    numbers per channel. A 3 x 3 convolution over tokens, GELU and a linear layer turn them into
+    keys and values, which are added to the encoder's. The tokens keep their rays, so a query that
+    prefers rays near its anchor reads the errors where its Gaussians are rendered.
     """
 
     name = "rendered"
@@ -39,15 +42,16 @@ class RenderedFeedback(Feedback):
 
     class Config(ComponentConfig):
         rounds: int = Field(default=2, ge=1, le=16)
-        """Number of rounds in evaluation, and the largest number in a training step."""
+        """Number of rounds in evaluation, and the largest number of rounds in a training step."""
         least: int = Field(default=1, ge=1)
-        """Smallest number of rounds in a training step, which draws it from `least` to `rounds`."""
+        """Smallest number of rounds in a training step. Each step draws its number of rounds from
+        `least` to `rounds`."""
         layers: int = Field(default=2, ge=1)
-        """Number of last decoder layers that a round repeats."""
+        """Number of decoder layers, counted from the last, that a round repeats."""
         shrink: int = Field(default=2, ge=1)
         """Render the input photos at 1/`shrink` of their size."""
         cells: int = Field(default=2, ge=1)
-        """Number of error cells along each side of a token's patch."""
+        """Number of cells along each side of a token's patch over which errors are averaged."""
 
     config: Config
 
@@ -62,21 +66,24 @@ class RenderedFeedback(Feedback):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report too many layers, too few rounds, and a size that `shrink` does not divide."""
+        """Report more layers than the decoder has, `least` above `rounds`, and a bad `shrink`."""
         depth = context.dims.depth
         size = context.image_size
         if config.layers > depth:
             reason = f"a round repeats {config.layers} layers of a decoder of depth {depth}"
             yield Problem("layers", reason, f"write at most {depth}, or raise model.decoder.depth")
         if config.least > config.rounds:
-            reason = f"training draws from {config.least} to {config.rounds} rounds"
+            reason = f"the least number of rounds, {config.least}, is above `rounds`, {config.rounds}"
             yield Problem("least", reason, f"write at most {config.rounds}, or raise `rounds`")
         if size and any(side % config.shrink for side in size):
             reason = f"images of {size[0]} x {size[1]} (H x W) cannot shrink by {config.shrink}"
             yield Problem("shrink", reason, "choose a number that divides both sides")
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return `learned`; for a model without rounds, weights that ignore errors at first."""
+        """Return the weights `learned` by a checkpoint.
+
+        If the checkpoint has no feedback, return weights with which errors have no effect at first.
+        """
         # Only a checkpoint of a model with rounds has these names.
         if learned:
             return dict(learned)
@@ -88,7 +95,7 @@ class RenderedFeedback(Feedback):
         return int(torch.randint(self.config.least, self.config.rounds + 1, ()))
 
     def compared(self, views: Views) -> Views:
-        """Return photos at 1/`shrink` of their size, by averaging pixels."""
+        """Return the photos to compare with renderings: averaged to 1/`shrink` of their size."""
         by = self.config.shrink
         cameras = views.cameras
         size = (cameras.size[0] // by, cameras.size[1] // by)

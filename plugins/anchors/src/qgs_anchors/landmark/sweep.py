@@ -1,4 +1,4 @@
-"""Sweep over depths: comparison of the photos around a place of one of them."""
+"""Sweep over depths: comparison of the area around a point of a photo with the other photos."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from qgs.types import Cameras, Views
 from qgs_anchors.landmark.places import bilinear, cells, rays_at
 
 LEAST_SEEN = 0.5
-"""Least share of a window that another photo must see, or else it does not count."""
+"""Least share of a window that a photo must see to be compared with it."""
 LEAST_DEPTH = 1e-3
 """Least depth at which a camera sees a point, world units."""
 
@@ -18,12 +18,13 @@ LEAST_DEPTH = 1e-3
 def mismatch(
     views: Views, view_N: Tensor, place_BN2: Tensor, depth_D: Tensor, side: float, points: int
 ) -> tuple[Tensor, Tensor]:
-    """Return differences (B, N, D) of windows from other photos at depths, and where they exist.
+    """Compare windows of photos with the other photos, at D depths.
 
-    A window is a square of `side` pixels around a place, with points x points samples. The
-    difference is the mean of |RGB - RGB| over these and over the photos that see at least half of
-    the window at that depth. If no photo does, the difference is 0 and the second tensor (B, N, D)
-    is False. Cameras and photos get gradients.
+    A window is a square of `side` pixels around one of N points, with points x points samples.
+    Returns differences and bools, each (B, N, D). A difference is the mean of |RGB - RGB of the
+    other photo| over the samples, and over the photos that see at least half of the window at that
+    depth. If no photo does, the difference is 0 and the bool False. Cameras and photos get
+    gradients.
     """
     height, width = views.cameras.size
     place_BN2 = place_BN2.to(views.images)
@@ -53,9 +54,11 @@ def mismatch(
 def reprojected(
     cameras: Cameras, view_N: Tensor, other_N: Tensor, place_BNP2: Tensor, depth_D: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Project places at depths into other photos.
+    """Project P points of a photo, at D depths each, into another photo, for N pairs of photos.
 
-    Returns places (B, N, D, P, 2) there, and whether each is inside that photo.
+    view, other: indices of the photos of each pair. Points are x and y as shares of the photo's
+    width and height. Returns the points in the other photo (B, N, D, P, 2), and whether each is
+    inside that photo.
     """
     height, width = cameras.size
     points = place_BNP2.shape[2]
