@@ -34,7 +34,7 @@ class TensorContainer:
         return map_tensors(lambda x: x.to(*args, **kwargs), self)
 
 
-def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
+def map_tensors(function: Callable[[Tensor], Any], value: Any) -> Any:
     """Apply `function` to each tensor in containers, mappings, lists and tuples.
 
     A part in which no tensor changes is returned as it is, without a copy.

@@ -67,11 +67,10 @@ def weights(result):
 
 
 def same(first, second):
-    """Whether two mappings hold the same tensors, to the bit, and the same values."""
-    return first.keys() == second.keys() and all(
-        torch.equal(value, second[name]) if torch.is_tensor(value) else value == second[name]
-        for name, value in first.items()
-    )
+    """Whether two nested mappings hold the same tensors, to the bit, and the same values."""
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(first[n], second[n]) for n in first)
+    return torch.equal(first, second) if torch.is_tensor(first) else first == second
 
 
 def parts_of(folder):

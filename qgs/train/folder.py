@@ -16,6 +16,7 @@ from torch import Tensor
 from qgs.checkpoint.model_file import load_weights, save, unique_tensors
 from qgs.checkpoint.models import CHECKPOINT
 from qgs.checkpoint.tensors import CheckpointError, TensorFile, write_tensors
+from qgs.containers import map_tensors, named_tensors
 from qgs.domain import KEY, Domain
 from qgs.files import is_leftover, naming_full_disk, read_records, write_text
 from qgs.machine import is_out_of_memory
@@ -24,13 +25,15 @@ from qgs.recipe import Recipe, resolve
 from qgs.recipe.recipe import differing_options
 
 State: TypeAlias = Mapping[str, Any]
-"""Tensors and JSON values by name."""
+"""Tensors, JSON values and mappings of them, by name."""
 
 HISTORY = "history.jsonl"
 EVALUATIONS = "evaluations.jsonl"
 _STATES = "qgs.state"
 _RECIPE = "qgs.recipe"
 _LOCK = ".lock"
+# Stands in JSON for a tensor, which the file holds by its dotted name.
+_TENSOR = "tensor"
 
 FREE = (
     "training.steps",
@@ -214,27 +217,27 @@ class Saver:
 
 def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, State]) -> None:
     """Write `states` to `path`, completely or not at all; recipe: the resolved tree."""
-    tensors: dict[str, Tensor] = {}
-    values: dict[str, dict[str, Any]] = {}
-    for name, state in states.items():
-        values[name] = {}
-        for key, value in state.items():
-            if isinstance(value, Tensor):
-                # safetensors refuses views and tensors that share memory.
-                own = value.detach().cpu().clone(memory_format=torch.contiguous_format)
-                tensors[f"{name}/{key}"] = own
-            else:
-                values[name][key] = value
+    # safetensors refuses views and tensors that share memory.
+    tensors = {
+        place: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
+        for place, tensor in named_tensors(states)
+    }
+    values = map_tensors(lambda _: _TENSOR, states)
     write_tensors(path, tensors, {_STATES: json.dumps(values), _RECIPE: json.dumps(recipe)})
 
 
 def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
     """Read a file of `write_state`; raises FileNotFoundError, CheckpointError, RecipeError."""
     with TensorFile(path) as file:
-        states = file.mapping(_STATES)
-        for place, tensor in file.read().items():
-            name, _, key = place.partition("/")
-            states.setdefault(name, {})[key] = tensor
+        tensors = file.read()
+
+        def filled(value: Any, place: str) -> Any:
+            if isinstance(value, dict):
+                return {key: filled(item, f"{place}.{key}") for key, item in value.items()}
+            return tensors[place] if value == _TENSOR else value
+
+        with file.entry(_STATES) as text:
+            states = {name: filled(state, name) for name, state in json.loads(text).items()}
         return file.stored_recipe(_RECIPE), states
 
 

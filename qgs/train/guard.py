@@ -283,20 +283,13 @@ class GoodWeights:
         self.copies = [*self.copies, (step, copy)][-2:]
 
     def state(self) -> dict[str, Any]:
-        found: dict[str, Any] = {"psnr": self.psnr, "best": self.best}
-        found["steps"] = [step for step, _ in self.copies]
-        for number, (_, copy) in enumerate(self.copies):
-            found |= {f"{number}/{name}": tensor for name, tensor in copy.items()}
-        return found
+        return {"psnr": self.psnr, "best": self.best, "copies": dict(self.copies)}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         self.psnr = state["psnr"]
         self.best = state["best"]
-        self.copies = []
-        for number, step in enumerate(state["steps"]):
-            prefix = f"{number}/"
-            copy = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
-            self.copies.append((step, copy))
+        # The keys of JSON are strings.
+        self.copies = [(int(step), copy) for step, copy in state["copies"].items()]
 
 
 def not_finite(numbers: Mapping[str, float]) -> str:

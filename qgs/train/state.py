@@ -137,21 +137,18 @@ class RandomStates:
         own = {"torch": torch.get_rng_state()}
         if torch.cuda.is_initialized():
             own["cuda"] = torch.cuda.get_rng_state()
-        found: dict[str, Any] = {}
-        for rank, states in enumerate(gather_object([own])):
-            found |= {f"{rank}/{key}": value for key, value in states.items()}
-        return found
+        return {str(rank): states for rank, states in enumerate(gather_object([own]))}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore this process's generators; a rank without a saved state keeps its own."""
         rank = PartialState().process_index
         # A run may continue with more processes than before.
-        if rank and f"{rank}/torch" not in state:
+        if rank and str(rank) not in state:
             return
-        torch.set_rng_state(state[f"{rank}/torch"])
-        on_device = state.get(f"{rank}/cuda")
-        if torch.cuda.is_initialized() and on_device is not None:
-            torch.cuda.set_rng_state(on_device)
+        own = state[str(rank)]
+        torch.set_rng_state(own["torch"])
+        if torch.cuda.is_initialized() and "cuda" in own:
+            torch.cuda.set_rng_state(own["cuda"])
 
 
 class OptimizerState:
@@ -169,26 +166,17 @@ class OptimizerState:
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
-        """Return values by PARAMETER/KEY, and the keys of every parameter under "keys"."""
+        """Return the values of every parameter, by name."""
         kept = self._optimizer.state_dict()["state"]
-        keys: dict[str, list[str]] = {}
-        found: dict[str, Any] = {"keys": keys}
-        for place, name in enumerate(self._names):
-            values = kept.get(place, {})
-            # A parameter without a gradient has no moments; its empty list of keys records that.
-            keys[name] = list(values)
-            found |= {f"{name}/{key}": value for key, value in values.items()}
-        return found
+        # A parameter without a gradient has no moments; its empty mapping records that.
+        return {name: kept.get(place, {}) for place, name in enumerate(self._names)}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the values from `state()`; the options of the groups stay.
 
         Raises KeyError for a missing entry.
         """
-        kept: dict[int, dict[str, Any]] = {}
-        for place, name in enumerate(self._names):
-            if keys := state["keys"][name]:
-                kept[place] = {key: state[f"{name}/{key}"] for key in keys}
+        kept = {place: state[name] for place, name in enumerate(self._names) if state[name]}
         present = self._optimizer.state_dict()
         self._optimizer.load_state_dict({**present, "state": kept})
 

@@ -41,7 +41,6 @@ def test_two_processes_continue_what_one_began(tmp_path):
     assert losses(two) == pytest.approx(losses(alone), abs=1e-5)
     ours = parts_of(two)
     theirs = parts_of(alone)
-    assert ours["moments"].pop("keys") == theirs["moments"].pop("keys")
     for name in ("weights", "moments", "ema", "good"):
         torch.testing.assert_close(ours[name], theirs[name], rtol=1e-3, atol=1e-4)
 

@@ -153,10 +153,10 @@ def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
     weight = "queries.features"
     one = torch.ones(1)
     for name, changed in (
-        (f"weights/{weight}", one),
-        (f"ema/{weight}", None),
-        (f"moments/model.{weight}/exp_avg", None),
-        ("random/", None),
+        (f"weights.{weight}", one),
+        (f"ema.{weight}", None),
+        (f"moments.model.{weight}.exp_avg", None),
+        ("random.", None),
     ):
         kept = {n: tensor for n, tensor in tensors.items() if not n.startswith(name)}
         write_tensors(state, kept if changed is None else kept | {name: changed}, metadata)

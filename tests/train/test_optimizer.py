@@ -126,7 +126,7 @@ def test_a_factor_scales_the_step_and_frozen_parts_stay_and_are_not_remembered(t
     recipe = tiny("tokengs", "training.steps=1", f"optimizer={{{options}, parts: {parts}}}")
     before = recipe.build_model().state_dict()
     result = run(recipe, tmp_path)
-    moments = {key.rsplit("/", 1)[0] for key in parts_of(tmp_path)["moments"]}
+    moments = {name for name, values in parts_of(tmp_path)["moments"].items() if values}
     factors = {"queries.features": 0.5, "head.linear.weight": 1, "head.linear.bias": 2}
     for name, parameter in result.model.named_parameters():
         step = float((parameter.detach() - before[name]).abs().max())
@@ -170,9 +170,8 @@ def test_a_plugin_adds_an_optimiser_by_one_class(tmp_path, install):
     assert run(recipe, halves, resume=True).resumed_at == 2
     assert_equal_runs(through, halves)
     moments = parts_of(through)["moments"]
-    keys = {key.rsplit("/")[-1] for key in moments}
-    assert keys == {"keys", "step", "row_var", "col_var", "variance"}
-    assert not [key for key in moments if "raw_radius" in key]
+    assert set().union(*moments.values()) == {"step", "row_var", "col_var", "variance"}
+    assert not [name for name, values in moments.items() if "raw_radius" in name and values]
 
 
 class Small(nn.Module):

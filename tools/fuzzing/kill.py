@@ -19,6 +19,7 @@ import psutil
 from torch import Tensor
 
 import qgs
+from qgs.containers import map_tensors
 from qgs.files import is_leftover
 from qgs.train.folder import RunFolder, read_state
 
@@ -87,10 +88,9 @@ def saved_step(run: Path) -> int:
 
 def values_of(run: Path) -> dict[str, Any]:
     """Return all values of the state of a run by name, times aside."""
-    parts = read_state(run / "state.safetensors")[1]
-    values = {f"{part}/{name}": parts[part][name] for part in parts for name in parts[part]}
-    del values["counters/seconds"]
-    return {name: x.tolist() if isinstance(x, Tensor) else x for name, x in values.items()}
+    values = map_tensors(Tensor.tolist, read_state(run / "state.safetensors")[1])
+    del values["counters"]["seconds"]
+    return values
 
 
 def training(folder: Path, count: int) -> int:
