@@ -44,7 +44,7 @@ def test_pages_list_all_slots_with_their_defaults_and_all_commands():
     defaults = {name: [slot.default] if slot.default else [] for name, slot in SLOTS.items()}
     defaults |= {name: list(s.defaults.values()) for name, s in SECTIONS.items() if s.named}
     assert shown == defaults
-    commands = re.findall(r"^\| `qgs ([\w-]+)", text_of("commands.md"), re.MULTILINE)
+    commands = re.findall(r"^- `qgs ([\w-]+)", text_of("commands.md"), re.MULTILINE)
     assert set(commands) == {*COMMANDS, *entry_points(group=GROUP).names}
 
 
