@@ -1,1 +1,1 @@
-"""Published systems for qgs, one package each."""
+"""Published systems for qgs, with one package for each."""

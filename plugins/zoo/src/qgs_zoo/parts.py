@@ -15,7 +15,10 @@ from qgs.tokengs.blocks import merge_heads, split_heads
 from qgs.types import Cameras
 
 PIXEL_ENCODING = "camera centre; directions of z = 1: upper left corner, step across, step down"
-"""Encoding of the rays of a pixel or patch (B, N, 4, 3), which are affine in the place."""
+"""Encoding of the rays through a pixel or patch, (B, N, 4, 3).
+
+The ray through the point (u, v), from (0, 0) to (1, 1), has the direction corner + u * step across
++ v * step down."""
 
 
 def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> Tensor:
@@ -26,7 +29,7 @@ def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> T
 
 @full_precision
 def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
-    """Return the rays of images (B, V) cut into rows x columns parts.
+    """Return the rays of each part of images that are cut into rows x columns parts.
 
     They are (B, V * rows * columns, 4, 3), encoded as in PIXEL_ENCODING.
     """
@@ -49,7 +52,7 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
 
 @full_precision
 def quaternions(rotations: Tensor) -> Tensor:
-    """Return unit quaternions w x y z (..., 4), up to sign, of rotations (..., 3, 3)."""
+    """Convert rotations (..., 3, 3) to unit quaternions w x y z (..., 4) of either sign."""
     a, b, c, d, e, f, g, h, i = rotations.flatten(-2).unbind(-1)
     # 4 q q^T: each row is the quaternion times 4 times one of its numbers. The row with the
     # largest diagonal entry is the most precise.
@@ -66,10 +69,11 @@ def quaternions(rotations: Tensor) -> Tensor:
 
 
 def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], remedy: str) -> None:
-    """Call `fill` with the tensors of a weight file of the user; nothing is downloaded.
+    """Read the tensors of a weight file, and call `fill` with them. Nothing is downloaded.
 
-    file: safetensors, or torch, where tensors may be under `model` or `state_dict`. Raises
-    MissingExtraError with the `remedy` if the file is missing or `fill` fails.
+    file: a safetensors file, or a torch file, whose tensors may be in its entry `model` or
+    `state_dict`. Raises MissingExtraError, whose message ends with `remedy`, if the file is missing
+    or `fill` fails.
     """
     path = Path(file).expanduser()
     try:
@@ -88,9 +92,10 @@ def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], reme
 
 
 def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
-    """Return the mean of `outcomes`, plus `terms`, which are weighted and 0-d.
+    """Return the mean of the `outcomes` of several passes, with `terms` added to the objective.
 
-    All outcomes have the same losses. Raises ValueError if a loss has the name of a term.
+    All outcomes have the same losses. terms: losses that are already weighted, 0-d. Raises
+    ValueError if a loss in the outcomes has the name of a term.
     """
     first = outcomes[0]
     share = 1 / len(outcomes)

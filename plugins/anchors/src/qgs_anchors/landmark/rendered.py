@@ -73,7 +73,7 @@ class RenderedFeedback(Feedback):
             reason = f"a round repeats {config.layers} layers of a decoder of depth {depth}"
             yield Problem("layers", reason, f"write at most {depth}, or raise model.decoder.depth")
         if config.least > config.rounds:
-            reason = f"the least number of rounds, {config.least}, is above `rounds`, {config.rounds}"
+            reason = f"{config.least} rounds are more than the {config.rounds} of `rounds`"
             yield Problem("least", reason, f"write at most {config.rounds}, or raise `rounds`")
         if size and any(side % config.shrink for side in size):
             reason = f"images of {size[0]} x {size[1]} (H x W) cannot shrink by {config.shrink}"

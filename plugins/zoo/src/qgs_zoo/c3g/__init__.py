@@ -1,4 +1,4 @@
-"""C3G for qgs: image tokens and queries attend to each other, one Gaussian per query."""
+"""C3G for qgs: image tokens and queries attend to each other; each query gives one Gaussian."""
 
 from qgs.contracts import Plugin
 from qgs_zoo.c3g.joint import C3GHead, JointLayer

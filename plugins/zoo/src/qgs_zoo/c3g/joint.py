@@ -1,7 +1,7 @@
 """`c3g/joint`: a decoder layer in which image tokens and queries attend to each other.
 
-`c3g/head`: head from a query to its Gaussians, one by default (C3G). Axes: T = M + N tokens, image
-tokens first.
+`c3g/head`: head that turns each query into one Gaussian or several. Axes: T = M + N tokens, first
+the M image tokens, then the N queries.
 """
 
 import torch
@@ -19,10 +19,10 @@ from qgs_zoo.parts import self_attention
 
 
 class JointLayer(DecoderLayer):
-    """Decoder layer with self-attention over [image tokens; queries], then an MLP (C3G).
+    """Decoder layer with self-attention over image tokens and queries together, then an MLP (C3G).
 
-    It computes x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)), without LayerScale. Image
-    tokens and queries both change. Keys, values and rays of the memory stay.
+    It computes x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)), without LayerScale. It
+    updates the features of image tokens and queries, but not the keys, values and rays in memory.
     """
 
     name = "joint"
@@ -47,11 +47,11 @@ class JointLayer(DecoderLayer):
         self.mlp = Mlp(width, int(config.mlp_ratio * width), width)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return True: all parameters have weight decay (C3G release)."""
+        """Return True, because all parameters have weight decay (C3G release)."""
         return True
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Return queries and image tokens that have read each other, but no masked query."""
+        """Return queries and image tokens after attention. Masked queries are not read."""
         # Image tokens come first, so that slices separate them from queries.
         tokens = memory.features.shape[1]
         x_BTD = torch.cat([memory.features, state.features], 1)
@@ -77,7 +77,7 @@ CHANNELS = (3, 1, 3, 4, 3)
 
 
 class C3GHead(Head):
-    """Head with LayerNorm, a linear layer D -> K * 14 and the published activations."""
+    """Head with LayerNorm, a linear layer D -> K * 14 and the activations of the C3G release."""
 
     name = "head"
 
@@ -87,7 +87,7 @@ class C3GHead(Head):
         scale_unit: float = Field(default=0.001, gt=0)
         """Factor of the softplus of raw scales, world units."""
         quat_eps: float = Field(default=1e-8, gt=0)
-        """Lower bound of the length by which a raw quaternion is divided."""
+        """Least length by which a raw quaternion is divided to normalise it."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
         """Number that the LayerNorm adds to the variance."""
 
@@ -99,7 +99,7 @@ class C3GHead(Head):
         self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return True: all parameters have weight decay (C3G release)."""
+        """Return True, because all parameters have weight decay (C3G release)."""
         return True
 
     def forward(self, state: QueryState) -> GaussianAttributes:
@@ -109,7 +109,7 @@ class C3GHead(Head):
         return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
 
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
-        """Return attributes from raw channels (B, N, K, 14), in float32 or better."""
+        """Return attributes from raw channels (B, N, K, 14), in float32 or float64."""
         offsets, opacity, scale, rotation, sh = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         return GaussianAttributes(
             offsets=offsets,

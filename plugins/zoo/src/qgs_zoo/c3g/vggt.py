@@ -1,8 +1,9 @@
 """`c3g/vggt_features`: image tokens of VGGT, with code and weights that the user installs.
 
-Neither is free, so this distribution does not contain or download them. It assumes that
-`vggt.models.aggregator.Aggregator()` takes images (B, V, 3, H, W). The aggregator returns a list of
-tokens (B, V, P, 2048), one for each layer, and the index of the first patch token.
+Code and weights have their own licences, so this package neither contains nor downloads them. It
+assumes that `vggt.models.aggregator.Aggregator()` takes images (B, V, 3, H, W). The aggregator must
+return a list of tokens (B, V, P, 2048), one tensor for each layer, and the index of the first patch
+token.
 """
 
 from collections.abc import Mapping
@@ -21,17 +22,18 @@ WIDTH = 2048
 """Width of a token of the last layer (VGGT-1B)."""
 
 MODULE = "vggt.models.aggregator"
-"""Module that no distribution on PyPI offers, so no extra can install it."""
+"""Module of VGGT's code. It is not on PyPI, so no extra can install it."""
 
 PREFIX = "aggregator."
-"""Prefix of the weights that are read from the file of all of VGGT."""
+"""Prefix of the weights that are read. The file also has weights of other parts of VGGT."""
 
 
 class VggtFeatures(PatchEncoder):
-    """Encoder with the patch tokens of VGGT's last layer, without camera and register tokens (C3G).
+    """Encoder that returns the patch tokens of VGGT's last layer (C3G).
 
-    It reads images but no cameras. If the model's width is not 2048, a linear layer maps to it. A
-    checkpoint contains all weights, so only a new model needs the weight file.
+    VGGT's tokens for cameras and registers are left out. It reads images but no cameras. If the
+    model's width is not 2048, a linear layer maps tokens to this width. A checkpoint contains all
+    weights, so only a new model needs the weight file.
     """
 
     name = "vggt_features"
@@ -42,7 +44,7 @@ class VggtFeatures(PatchEncoder):
 
     class Config(PatchEncoder.Config):
         patch_size: Literal[14] = 14
-        """Side of a patch, pixels; VGGT has 14."""
+        """Side of a patch, pixels. VGGT supports 14 only."""
         weights: str = Field(min_length=1)
         """File of VGGT's weights: model.safetensors or model.pt."""
         images: Literal["signed", "unit"] = "signed"
@@ -59,7 +61,7 @@ class VggtFeatures(PatchEncoder):
         self.proj = nn.Identity() if own else nn.Linear(WIDTH, dims.width)
 
     def forward(self, views: Views) -> ImageMemory:
-        """Return features (B, M, D) of all patches, and their grid."""
+        """Return the features (B, M, D) of all patches, and the grid that the patches form."""
         grid = self.grid(views)
         images = views.images * 2 - 1 if self.config.images == "signed" else views.images
         outputs, first = self.aggregator(images)

@@ -1,4 +1,4 @@
-"""DINOv2 for qgs: its vision transformer, and an encoder with it for any queries."""
+"""DINOv2 for qgs: the vision transformer, and an encoder that uses it."""
 
 from qgs.contracts import Plugin
 from qgs_zoo.dinov2.vit import DinoMultiViewViT, VitConfig

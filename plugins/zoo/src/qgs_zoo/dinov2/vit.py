@@ -1,8 +1,8 @@
 """DINOv2's vision transformer (Oquab et al., arXiv 2304.07193), with its parameter names.
 
-It covers ViT-S, B and L with patches of 14, MLPs with GELU, no register tokens and no mask token.
-It follows facebookresearch/dinov2 (Apache-2.0) without its code. `dinov2/multiview_vit` adds its
-tokens to embedded rays, and runs ViT blocks over all views together.
+It covers ViT-S, B and L with patches of 14 x 14 pixels and MLPs with GELU, but no register tokens
+and no mask token. It is new code that follows facebookresearch/dinov2 (Apache-2.0). The encoder
+`dinov2/multiview_vit` adds DINOv2's tokens to embedded rays, and runs blocks over all views.
 """
 
 import math
@@ -24,22 +24,22 @@ from qgs_zoo.parts import load_weights, self_attention
 PATCH = 14
 """Side of a patch, pixels."""
 GRID = 37
-"""Patches along a side of the images on which positions were trained, 518 x 518."""
+"""Patches along a side of the images, 518 x 518, with which position embeddings were trained."""
 EPS = 1e-6
 """Number that every LayerNorm adds to the variance."""
 SHIFT = 0.1
-"""Number added to the patches along a side before positions are resized (DINOv2 release)."""
+"""Number added to the patches along a side when position embeddings are resized (release)."""
 
 
 class VitConfig(ComponentConfig):
-    """Sizes and weights of the transformer; the defaults are those of ViT-S."""
+    """Sizes and weights of the transformer, by default those of ViT-S."""
 
     width: int = Field(default=384, ge=1)
     """Width of tokens: 384 for ViT-S, 768 for ViT-B, 1024 for ViT-L."""
     depth: int = Field(default=12, ge=1, le=256)
     """Number of blocks: 12 for ViT-S and ViT-B, 24 for ViT-L."""
     heads: int = Field(default=6, ge=1)
-    """Number of attention heads, each of 64 channels: 6, 12, 16 for ViT-S, B, L."""
+    """Number of attention heads: 6 for ViT-S, 12 for ViT-B, 16 for ViT-L, of 64 channels each."""
     weights: str | None = None
     """File of pretrained weights: .safetensors, .pth or .pt. Null starts with random weights."""
 
@@ -55,7 +55,7 @@ class VitConfig(ComponentConfig):
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention with fused qkv: (X, T, C) -> (X, T, C)."""
+    """Multi-head self-attention with one layer for queries, keys and values, on (X, T, C)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class Attention(nn.Module):
 
 
 class Block(nn.Module):
-    """Pre-norm attention and MLP, each with LayerScale."""
+    """Transformer block: pre-norm attention and MLP, each with LayerScale."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -85,7 +85,7 @@ class Block(nn.Module):
 
 
 class PatchEmbed(nn.Module):
-    """Convolution 14 x 14 with stride 14: (X, 3, 14 h, 14 w) -> (X, h w, C)."""
+    """Embedding of patches of 14 x 14 pixels: (X, 3, 14 h, 14 w) -> (X, h w, C)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -96,9 +96,10 @@ class PatchEmbed(nn.Module):
 
 
 class DinoV2(nn.Module):
-    """Transformer from images (X, 3, 14 h, 14 w) to tokens of their patches.
+    """Transformer from images (X, 3, 14 h, 14 w) to tokens of their patches (X, h w, C).
 
-    Images are normalised by ImageNet's statistics. Each of the X images is processed alone.
+    Images must be normalised by ImageNet's mean and standard deviation. Each of the X images is
+    processed alone.
     """
 
     def __init__(self, width: int, depth: int, heads: int) -> None:
@@ -117,10 +118,10 @@ class DinoV2(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def forward(self, images: Tensor, blocks: Collection[int]) -> list[Tensor]:
-        """Return tokens (X, h w, C) after each of the `blocks`; 0 is the first.
+        """Return a list of tokens (X, h w, C), one tensor for each of the `blocks`.
 
-        All of them pass the norm that follows the last block (DINOv2 release). Blocks after the
-        last one of `blocks` are not run.
+        blocks: indices of blocks, from 0. Tokens of every block pass the norm that follows the last
+        block (DINOv2 release). Blocks after the largest index are not run.
         """
         grid = images.shape[-2] // PATCH, images.shape[-1] // PATCH
         x_XPC = self.patch_embed(images)
@@ -135,7 +136,10 @@ class DinoV2(nn.Module):
         return found
 
     def positions(self, rows: int, columns: int) -> Tensor:
-        """Return embeddings (1, 1 + rows*columns, C) of a grid of any size, class token first."""
+        """Return position embeddings of the class token, then of a grid of any size.
+
+        They are (1, 1 + rows * columns, C).
+        """
         if rows == columns == GRID:
             return self.pos_embed
         # The class token has its own embedding, which is not a place.
@@ -149,11 +153,11 @@ class DinoV2(nn.Module):
         return torch.cat([self.pos_embed[:, :1], resized_1PC], 1)
 
     def load(self, file: str | None) -> None:
-        """Read pretrained weights from a file; None keeps the present weights.
+        """Read pretrained weights from a file. None keeps the present weights.
 
-        Names are those of the hub, or these after a prefix, such as `pretrained.` of Depth Anything
-        V2. Other tensors of the file are ignored. Raises MissingExtraError for a file that does not
-        fit.
+        Names are those of DINOv2's files, possibly after a prefix, such as `pretrained.` in files
+        of Depth Anything V2. Further tensors in the file are ignored. Raises MissingExtraError for
+        a file that does not fit.
         """
         if file is not None:
             load_weights(
@@ -175,7 +179,10 @@ class DinoV2(nn.Module):
 
 
 class Tokens(nn.Module):
-    """DINOv2, linear layer and LayerNorm: images (X, 3, H, W) to tokens (X, H/P*W/P, D)."""
+    """DINOv2, linear layer and LayerNorm, from images (X, 3, H, W) to tokens (X, H/P * W/P, D).
+
+    P is the side of a patch.
+    """
 
     def __init__(self, config: VitConfig, width: int, patch_size: int) -> None:
         super().__init__()
@@ -194,17 +201,18 @@ class Tokens(nn.Module):
 
 
 class DinoMultiViewViT(MultiViewViT):
-    """Encoder `qgs/multiview_vit` in which DINOv2 embeds the colours, one photo at a time.
+    """Encoder `qgs/multiview_vit` with DINOv2 as the embedding of colours.
 
-    Photos are resized so that each patch has DINOv2's 14 x 14 pixels. For example, 256 x 256 photos
-    with patches of 16 are resized to 224 x 224.
+    DINOv2 sees one photo at a time, resized so that each patch has 14 x 14 pixels. For example,
+    photos of 256 x 256 with patches of 16 x 16 are resized to 224 x 224.
     """
 
     name = "multiview_vit"
 
     class Config(MultiViewViT.Config):
         patch_size: int = Field(default=16, ge=1)
-        """Side of a patch, in pixels of the photos. It must divide both sides of the image."""
+        """Side of a patch, in pixels of the photos before resizing. It must divide both sides of
+        the image."""
         vit: VitConfig
         """Sizes and weights of DINOv2. `{}` is a ViT-S with random initial weights."""
 

@@ -1,4 +1,4 @@
-"""GlobalSplat for qgs: scene tokens in two streams, gated candidates, and two passes."""
+"""GlobalSplat for qgs: scene tokens with two streams, for geometry and texture of Gaussians."""
 
 from qgs.contracts import Plugin
 from qgs_zoo.globalsplat.encoder import PosedPatches

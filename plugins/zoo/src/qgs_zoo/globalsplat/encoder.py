@@ -1,4 +1,4 @@
-"""`globalsplat/patches`: tokens of patches, their rays and their cameras, without attention."""
+"""`globalsplat/patches`: encoder that embeds patches, rays and cameras, without attention."""
 
 import math
 from typing import Any
@@ -20,29 +20,28 @@ REGISTER_STD = 0.02
 
 
 class PosedPatches(PatchEncoder):
-    """Encoder with a token for each patch, in which embedded colours and rays are concatenated.
+    """Encoder with a token for each patch: embedded colours, then embedded rays and camera.
 
-    An embedding of the camera is added to that of the rays. Features are `rgb_width` + `ray_width`
-    wide, for any width of the model. Learned registers, which belong to no patch, follow the
-    patches.
+    Both parts are concatenated, so tokens have `rgb_width` + `ray_width` channels, for any width of
+    the model. After the patches come registers: learned tokens that belong to no patch.
     """
 
     name = "patches"
 
     class Config(PatchEncoder.Config):
-        """Options with GlobalSplat's defaults, except for the patch size."""
+        """Options, with GlobalSplat's defaults except for `patch_size`."""
 
         rgb_width: int = Field(default=512, ge=1)
         """Number of channels of a token that embed the patch's colours."""
         ray_width: int = Field(default=256, ge=1)
         """Number of channels of a token that embed the patch's Plücker rays and the camera."""
         lens_width: int = Field(default=64, ge=1)
-        """Width of the embedding of focal lengths and principal point."""
+        """Number of channels that embed focal lengths and principal point of a camera."""
         bands: int = Field(default=4, ge=0)
-        """Number of frequencies in the encoding of a camera's position. 0 encodes the position
-        alone, which is always included."""
+        """Number of frequencies of sines and cosines that encode a camera's position, besides the
+        position itself. 0 encodes only the position itself."""
         registers: int = Field(default=4, ge=0)
-        """Number of learned tokens after those of the patches. 0 means none."""
+        """Number of registers: learned tokens after those of the patches. 0 means none."""
 
     config: Config
 
@@ -61,12 +60,12 @@ class PosedPatches(PatchEncoder):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return features with their own width, and a grid if there are no registers."""
+        """Return the field of features, with its width, and the grid if there are no registers."""
         features = {"memory.features": FieldSpec((config.rgb_width + config.ray_width,))}
         return features if config.registers else {**features, **memory_fields("grid")}
 
     def forward(self, views: Views) -> ImageMemory:
-        """Return the memory, with a grid if there are no registers."""
+        """Return the tokens of patches and registers, with a grid if there are no registers."""
         grid = self.grid(views)
         rgb_BVPC = _tokens(self.rgb_embedding, 2 * views.images - 1)
         ray_BVPC = _tokens(self.ray_embedding, plucker_rays(views.cameras))
@@ -90,7 +89,10 @@ def _tokens(embedding: nn.Conv2d, images: Tensor) -> Tensor:
 
 @full_precision
 def lens(cameras: Cameras) -> Tensor:
-    """Return (..., 4): log of focal lengths, then principal point, in sides of the image."""
+    """Return (..., 4): logarithms of focal lengths, then principal point of cameras.
+
+    Their unit is the width of the image for x, and its height for y.
+    """
     height, width = cameras.size
     sides = constant([width, height], cameras.intrinsics)
     focal, principal = (cameras.intrinsics / sides.repeat(2)).chunk(2, -1)
@@ -100,7 +102,10 @@ def lens(cameras: Cameras) -> Tensor:
 
 @full_precision
 def place(cameras: Cameras, bands: int) -> Tensor:
-    """Return (..., 3 + 6 bands): centre x, then sin, cos of 2^k pi x for k = 0 .. bands - 1."""
+    """Encode the centre x of each camera as (..., 3 + 6 bands).
+
+    The numbers are x, then sin and cos of 2^k pi x for k = 0 .. bands - 1.
+    """
     center = cameras.c2w[..., :3, 3]
     octaves = 2 ** torch.arange(bands, dtype=center.dtype, device=center.device)
     angles = (math.pi * octaves[:, None] * center[..., None, :]).flatten(-2)

@@ -1,4 +1,4 @@
-"""`globalsplat/merging_head`: head from two streams to candidates, merged into Gaussians.
+"""`globalsplat/merging_head`: head that decodes candidates and merges them into Gaussians.
 
 Axes: B scenes, N tokens, C candidates of a token, G Gaussians of a token.
 """
@@ -28,17 +28,18 @@ from qgs_zoo.globalsplat.streams import TEXTURE, TEXTURE_FIELD
 from qgs_zoo.parts import quaternions
 
 CHANNELS = (3, 3, 6, 1)
-"""Geometry channels per candidate: position, log scale, rotation, opacity. The gate follows."""
+"""Channels of geometry per candidate: position, log scale, rotation, opacity; then one gate."""
 
 
 class MergingHead(Head):
-    """Head whose candidates are merged, block by block, into K = 2^level Gaussians per token.
+    """Head that decodes candidates per token and merges blocks of them into 2^level Gaussians.
 
-    Geometry decodes position, log scale, 6D rotation, opacity and gate. Texture decodes the
-    coefficients of spherical harmonics. A softmax of gates averages each block: positions,
-    rotations, coefficients, log scales and logs of transmittance, which stand for opacities. Then
-    log(size of the block) / 3 is added to log scales. Between two whole levels, both levels are
-    rendered, with logs of transmittance scaled by their shares.
+    The geometry of a token gives position, log scale, 6D rotation, opacity and gate of each
+    candidate. Its texture gives coefficients of spherical harmonics. A merged Gaussian is the mean
+    of its block, weighted by the softmax of the gates. The mean is over positions, rotations,
+    coefficients, log scales and log(1 - opacity). Then log(size of the block) / 3 is added to log
+    scales. Between two whole levels, the Gaussians of both are rendered, with log(1 - opacity)
+    multiplied by the share of the level.
     """
 
     name = "merging_head"
@@ -49,22 +50,23 @@ class MergingHead(Head):
         candidates: int = Field(default=16, ge=1)
         """Number of candidates of each token, a power of two."""
         level: float = Field(default=3.0, ge=0)
-        """s: each token gives 2^s Gaussians. Between whole numbers, the Gaussians of both
-        neighbouring levels are blended."""
+        """Base-2 logarithm of the number of Gaussians per token. Between two whole numbers, the
+        Gaussians of both are rendered and blended."""
         sh_degree: int = Field(default=3, ge=0, le=3)
-        """Degree of the spherical harmonics. 0 means colours that do not depend on direction."""
+        """Degree of the spherical harmonics. 0 means colours that do not depend on the viewing
+        direction."""
         init_std: float = Field(default=0.02, gt=0)
-        """Standard deviation of the initial weights, from a truncated normal distribution."""
+        """Standard deviation of the initial weights, which have a truncated normal distribution."""
         position_std: float | None = Field(default=None, gt=0)
-        """Standard deviation of the initial weights of positions. Null means `init_std`."""
+        """Standard deviation of the initial weights that give positions. Null means `init_std`."""
         scale_bias: float = -2.0
-        """Number added to raw log scales."""
+        """Number added to raw log scales before they are bounded."""
         scale_min: float = Field(default=1e-4, gt=0)
-        """Scales of candidates are at least 1/e times this, world units."""
+        """Bound of the scales of candidates, which are at least `scale_min` / e, world units."""
         scale_max: float = Field(default=0.05, gt=0)
-        """Scales of candidates are at most e^2 times this, world units."""
+        """Bound of the scales of candidates, which are at most `scale_max` e^2, world units."""
         opacity_bias: float = -5.0
-        """Number added to the opacity logits."""
+        """Number added to the logits of opacities."""
 
     config: Config
 
@@ -101,13 +103,13 @@ class MergingHead(Head):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the field of harmonics, or no field if their degree is 0."""
+        """Return the field of spherical harmonics, or no field if their degree is 0."""
         sh = "gaussians.sh"
         return {sh: GAUSSIAN_FIELDS[sh]} if config.sh_degree else {}
 
     @property
     def gaussians_per_query(self) -> int:
-        """K at the current level; during a blend, the sum over both levels."""
+        """Number of Gaussians per token: 2^level, or between whole levels the sum over both."""
         return sum(count for count, _ in stages(self.config.level))
 
     def forward(self, state: QueryState) -> GaussianAttributes:
@@ -119,9 +121,9 @@ class MergingHead(Head):
 
     @full_precision
     def activate(self, geometry: Tensor, texture: Tensor) -> GaussianAttributes:
-        """Return attributes from raw channels (B, N, C, 14) and (B, N, C, 3 (degree + 1)^2).
+        """Merge candidates from raw channels, and return attributes in float32 or float64.
 
-        They are float32 or better.
+        geometry: (B, N, C, 14). texture: (B, N, C, 3 (degree + 1)^2).
         """
         gates = geometry[..., -1]
         candidates = torch.cat([self.bounded(geometry[..., :-1]), texture], -1)
@@ -137,7 +139,7 @@ class MergingHead(Head):
         return self._attributes(torch.cat(parts, 2))
 
     def bounded(self, raw: Tensor) -> Tensor:
-        """Turn raw candidates (..., 13) into bounded log scales and logs of transmittance."""
+        """Return candidates (..., 13) with bounded log scales, and log(1 - opacity) at the end."""
         place, log_scale, rotation, opacity = raw.split(CHANNELS, -1)
         config = self.config
         low = math.log(config.scale_min) - 1
@@ -150,7 +152,7 @@ class MergingHead(Head):
         return torch.cat([place, log_scale, rotation, clear], -1)
 
     def _attributes(self, x_BNKX: Tensor) -> GaussianAttributes:
-        """Return the attributes of merged candidates."""
+        """Return the attributes of Gaussians from the averaged channels of their candidates."""
         offsets, log_scale, rotation, clear, texture = x_BNKX.split(
             (*CHANNELS, 3 * self.coefficients), -1
         )
@@ -171,7 +173,7 @@ LEAST_LENGTH = 1e-4
 
 @full_precision
 def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
-    """Average blocks of C / count candidates with the softmax of their gates.
+    """Average C candidates in `count` blocks, weighted by the softmax of the gates of a block.
 
     candidates: (..., C, X). gates: (..., C). Returns (..., count, X).
     """
@@ -181,7 +183,7 @@ def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
 
 
 def growth(candidates: int, count: int) -> float:
-    """Return the number added to log scales so that merged Gaussians keep the total volume.
+    """Return the number to add to log scales so that merging keeps the total volume.
 
     `candidates` candidates are merged into `count` Gaussians.
     """
@@ -189,9 +191,10 @@ def growth(candidates: int, count: int) -> float:
 
 
 def stages(level: float) -> list[tuple[int, float]]:
-    """Return the numbers of Gaussians that are rendered at s = `level`, with their shares.
+    """Return the numbers of Gaussians per token that are rendered at a level, with their shares.
 
-    A whole s gives 2^s with share 1. Other s give the numbers of both neighbouring levels.
+    A whole level s gives 2^s with share 1. A level between two whole ones gives the numbers of
+    both, with shares that add up to 1.
     """
     low = math.floor(level)
     share = level - low
@@ -202,8 +205,9 @@ def stages(level: float) -> list[tuple[int, float]]:
 def rotation_6d(vectors: Tensor) -> Tensor:
     """Return unit quaternions (..., 4), w x y z, of rotations given by their first two columns.
 
-    vectors: (..., 6), two columns, which are orthonormalised in order (Zhou et al. 2019). If they
-    define no rotation (zeros, parallel columns), the quaternion still has unit length.
+    vectors: two columns (..., 6). The first is normalised, then the second is made orthonormal to
+    it (Zhou et al. 2019). If the columns are zero or parallel, they define no rotation, but the
+    quaternion still has unit length.
     """
     first, second = vectors.split(3, -1)
     first = F.normalize(first, dim=-1, eps=LEAST_LENGTH)

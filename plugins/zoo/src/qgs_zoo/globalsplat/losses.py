@@ -1,6 +1,7 @@
-"""`globalsplat/frustum`, `globalsplat/regularisers`: losses for visible, few and small Gaussians.
+"""Losses and objective of GlobalSplat.
 
-`globalsplat/two_passes`: objective by which predictions from different photos should agree.
+`globalsplat/frustum` keeps Gaussians in view, `globalsplat/regularisers` keeps them transparent and
+small. The objective `globalsplat/two_passes` makes predictions from different photos agree.
 """
 
 import math
@@ -28,7 +29,10 @@ from qgs_zoo.parts import mean_outcome
 
 
 class Frustum(Loss):
-    """Mean of `beyond_frusta` over Gaussians, with the frusta of the input cameras."""
+    """Mean distance of Gaussian means from the frusta of the input cameras.
+
+    `beyond_frusta` computes the distance.
+    """
 
     name = "frustum"
     renderings = "none"
@@ -37,9 +41,9 @@ class Frustum(Loss):
         weight: float = Field(default=0.01, ge=0)
         """Weight of the loss in the objective."""
         softness: float = Field(default=0.05, gt=0)
-        """Distance from a border of a view at which the loss starts to act, world units."""
+        """Distance from the border of a frustum at which the loss starts to act, world units."""
         near: float = Field(default=0.05, ge=0)
-        """Camera-frame z of the near plane, world units."""
+        """Depth (camera-frame z) of the near plane of a frustum, world units."""
 
     config: Config
 
@@ -52,7 +56,7 @@ class Frustum(Loss):
 
 
 class Regularisers(Loss):
-    """Mean opacity and mean scale as losses (Kheradmand et al. 2024, 3DGS as MCMC)."""
+    """Mean opacity and mean scale of the Gaussians as losses (3DGS as MCMC, Kheradmand 2024)."""
 
     name = "regularisers"
     scheduled = frozenset({"weight", "opacity_weight", "scale_weight"})
@@ -60,16 +64,16 @@ class Regularisers(Loss):
 
     class Config(Loss.Config):
         opacity_weight: float = Field(default=0.01, ge=0)
-        """Weight of the mean opacity."""
+        """Weight of the mean opacity in the loss."""
         scale_weight: float = Field(default=0.01, ge=0)
-        """Weight of the mean scale, world units."""
+        """Weight of the mean scale, which is in world units, in the loss."""
 
     config: Config
 
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
-        """Return the terms `mean_opacity` and `mean_scale`."""
+        """Return the weighted losses `mean_opacity` and `mean_scale`."""
         gaussians = prediction.gaussians
         # Means, not sums: the number of Gaussians changes with the level.
         opacity = mean_of_gaussians(gaussians.opacities, prediction)
@@ -82,12 +86,13 @@ class Regularisers(Loss):
 
 @full_precision
 def beyond_frusta(points: Tensor, cameras: Cameras, softness: float, near: float) -> Tensor:
-    """Return the smooth distances (B, P) >= 0 of points (B, P, 3) from all views, world units.
+    """Return smooth distances (B, P) >= 0 of points (B, P, 3) from the frusta of all views.
 
-    A view is the intersection of five half-spaces: four borders and the near plane. Each view sums
-    the softplus of the distance beyond each. The result is the soft minimum over views,
-    -t log mean exp(-x / t). It has a gradient everywhere, also behind a camera, and never divides
-    by a depth.
+    They are in world units, and small if a point is in any frustum. A frustum has five planes: four
+    for the borders of the image, and the near plane at depth `near`. Its distance x is the sum over
+    its planes of t softplus(y / t), with y the distance beyond the plane and t = `softness`. The
+    result is the soft minimum over frusta, -t log mean exp(-x / t). It has a gradient everywhere,
+    even behind a camera, and never divides by a depth.
     """
     x, y, z = to_camera(points, cameras).unbind(-1)
     fx, fy, cx, cy = cameras.intrinsics[..., None, :].unbind(-1)
@@ -106,28 +111,29 @@ FIX = "raise views.inputs, or choose `objective: {type: qgs/one_pass}`"
 
 
 class TwoPasses(Objective):
-    """Objective of two predictions, each from both end views and every other view between them.
+    """Objective of two predictions, each from the first, the last and every second view between.
 
-    Both get the recipe's losses. Their renderings from the target cameras are also compared in
-    alpha and depth. Each is pulled towards the other, which is held fixed.
+    The two share only the first and the last view. Both get the recipe's losses. In addition, the
+    alpha and depth of their renderings from the target cameras should agree: each is pulled towards
+    the other, which gets no gradient from this.
     """
 
     name = "two_passes"
     scheduled = frozenset({"alpha_weight", "depth_weight"})
 
     class Config(ComponentConfig):
-        """Options with GlobalSplat's defaults."""
+        """Options, with GlobalSplat's defaults."""
 
         alpha_weight: float = Field(default=1e-3, ge=0)
-        """Weight of the difference of the alphas."""
+        """Weight of the difference between the alphas of both renderings."""
         depth_weight: float = Field(default=1e-2, ge=0)
-        """Weight of the difference of the depths, world units."""
+        """Weight of the difference between the depths of both renderings, in world units."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Report too few input views for two different passes."""
+        """Report fewer input views than two different passes need."""
         if context.inputs is not None and context.inputs < LEAST_VIEWS:
             reason = (
                 f"it needs at least {LEAST_VIEWS} input views, got {context.inputs}: both passes "
@@ -136,7 +142,10 @@ class TwoPasses(Objective):
             yield Problem("", reason, FIX)
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """Return the mean outcome, with the terms `alpha_consistency`, `depth_consistency`."""
+        """Return the mean outcome of both passes, plus the losses of their disagreement.
+
+        These losses are `alpha_consistency` and `depth_consistency`.
+        """
         count = inputs.images.shape[1]
         outcomes = list[Outcome]()
         renderings = list[Rendering]()
@@ -155,16 +164,19 @@ class TwoPasses(Objective):
 
 
 def subset(count: int, part: int) -> list[int]:
-    """Return the first and the last of `count` views, and every other one between them."""
+    """Return indices of the first view, the last one, and every second view between them.
+
+    count: number of views. part: 0 begins with the view after the first, 1 with the next one.
+    """
     return [0, *range(1 + part, count - 1, 2), count - 1]
 
 
 @full_precision
 def disagreement(one: Tensor, other: Tensor) -> Tensor:
-    """Return the mean |one - other|, 0-d, as two halves in which one side gets no gradient.
+    """Return the mean of |one - other|, 0-d, whose gradient pulls each towards the fixed other.
 
-    This is the symmetric stop-gradient of the paper. It is averaged; a sum would double the
-    gradient.
+    It is the mean of two equal numbers, in which `one` or `other` gets no gradient: the symmetric
+    stop-gradient of the paper.
     """
     # If neither side were held fixed, both would drift to the blurred mean.
     held = (one - other.detach()).abs().mean(), (other - one.detach()).abs().mean()

@@ -1,6 +1,6 @@
-"""`globalsplat/slots`, `globalsplat/round`: tokens in two streams, geometry and texture.
+"""`globalsplat/slots`, `globalsplat/round`: tokens with two streams, geometry and texture.
 
-Both streams read the photos and are then mixed.
+In each round, both streams read the photos and are then mixed.
 """
 
 from collections.abc import Iterable
@@ -26,7 +26,7 @@ from qgs.tokengs.encoder import EncoderBlock, keys_and_values
 from qgs.types import ImageMemory, QueryState
 
 TEXTURE = "globalsplat.texture"
-"""State field (B, N, D) of the stream of texture. The stream of geometry is the features."""
+"""State field (B, N, D) of the tokens' texture stream. The geometry stream is their features."""
 
 TEXTURE_FIELD: Fields = {TEXTURE: FieldSpec(("D",))}
 
@@ -34,19 +34,21 @@ TEXTURE_FIELD: Fields = {TEXTURE: FieldSpec(("D",))}
 class SlotQueries(LearnedQueries):
     """N learned tokens, of which the last `extra` are masked and decode no Gaussians.
 
-    Geometry is Linear(LayerNorm(token)). Texture is another Linear(LayerNorm(token)).
+    The geometry and the texture of a token each start as a LayerNorm and a linear layer of it, with
+    separate weights.
     """
 
     name = "slots"
     writes = TEXTURE_FIELD
 
     class Config(ComponentConfig):
-        """Options with GlobalSplat's defaults."""
+        """Options, with GlobalSplat's defaults."""
 
         count: int = Field(default=2057, ge=1)
-        """N, the number of all tokens."""
+        """N, the number of all tokens, including `extra`."""
         extra: int = Field(default=9, ge=0)
-        """Number of tokens that decode no Gaussians (4 auxiliary, 1 of scale, 4 registers)."""
+        """Number of tokens that decode no Gaussians (GlobalSplat: 4 auxiliary tokens, 1 token for
+        scale, 4 registers)."""
         std: float = Field(default=0.02, gt=0)
         """Standard deviation of the initial tokens, which are normally distributed."""
 
@@ -63,13 +65,13 @@ class SlotQueries(LearnedQueries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report options with which no token decodes Gaussians."""
+        """Report an option `extra` that leaves no token to decode Gaussians."""
         if config.extra >= config.count:
             reason = f"all {config.count} tokens are extra ones, which decode no Gaussians"
             yield Problem("extra", reason, f"write at most {config.count - 1}, or raise `count`")
 
     def start(self, batch_size: int) -> QueryState:
-        """Return the two streams of all tokens, which are the same in every scene."""
+        """Return the initial geometry and texture of all tokens, the same for every scene."""
         tokens_ND = self.slots if self.extra is None else torch.cat([self.slots, self.extra])
         # A state field must stay float32 under autocast; features need not.
         streams = (self.geometry(tokens_ND), at_least_float32(self.texture(tokens_ND)))
@@ -84,23 +86,24 @@ class SlotQueries(LearnedQueries):
 class Round(DecoderLayer):
     """Decoder layer: cross-attention, MLP and ViT blocks in each stream, then a mixer of both.
 
-    `decoder.layer_scale` applies to cross-attention, MLP and mixer (GlobalSplat: 1e-3). Masked
-    tokens decode no Gaussians, but all tokens read them, as registers.
+    The streams are geometry and texture of the tokens. The mixer is an MLP that updates both from
+    both. `decoder.layer_scale` applies to cross-attention, MLP and mixer (GlobalSplat: 1e-3).
+    Masked tokens decode no Gaussians, but all tokens read them, as registers.
     """
 
     name = "round"
     writes = TEXTURE_FIELD
 
     class Config(ComponentConfig):
-        """Options with GlobalSplat's defaults."""
+        """Options, with GlobalSplat's defaults."""
 
         memory_width: int | None = Field(default=None, ge=1)
-        """Width of the image memory's features, if the encoder has its own width
-        (globalsplat/patches: rgb_width + ray_width). Null means the model's width."""
+        """Width of the encoder's features. With `globalsplat/patches` it is rgb_width + ray_width.
+        Null means the model's width."""
         blocks: int = Field(default=2, ge=0)
-        """Number of ViT blocks in each stream."""
+        """Number of ViT blocks in each of the two streams."""
         block_layer_scale: float = Field(default=0.01, gt=0)
-        """Initial value of every LayerScale factor of the ViT blocks."""
+        """Initial value of every LayerScale factor in the ViT blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width of the streams' MLPs, as a multiple of the model's width (rounded down)."""
 
@@ -118,11 +121,11 @@ class Round(DecoderLayer):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the memory's features, with the width of the options, and the texture stream."""
+        """Return the fields of the encoder's features, with their width, and of the texture."""
         return {"memory.features": FieldSpec((config.memory_width or "D",)), **TEXTURE_FIELD}
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Run one round; the memory stays unchanged."""
+        """Return tokens with updated geometry and texture, and the memory unchanged."""
         geometry_BND = self.geometry(state.features, memory.features)
         texture_BND = self.texture(state[TEXTURE], memory.features)
         # Only in the mixer do the streams see each other.
@@ -134,9 +137,9 @@ class Round(DecoderLayer):
 
 
 class Stream(nn.Module):
-    """One stream of a round: x (B, N, D) and memory (B, M, C) to x.
+    """Layers of one stream in a round: cross-attention to the memory, MLP and ViT blocks.
 
-    It is pre-norm. Each update is scaled and added.
+    They have pre-norms. Each update is multiplied by a LayerScale and added.
     """
 
     # This bias adds the same number to all logits of a query.
@@ -161,7 +164,7 @@ class Stream(nn.Module):
         )
 
     def forward(self, x_BND: Tensor, memory_BMC: Tensor) -> Tensor:
-        """Return the stream after cross-attention, MLP and blocks."""
+        """Return the updated stream (B, N, D) from the stream and the memory (B, M, C)."""
         keys, values = keys_and_values(self.memory_norm(memory_BMC), self.kv_proj, self.k_norm)
         x_BND = x_BND + self.cross_scale(self.cross_attention(x_BND, keys, values))
         x_BND = x_BND + self.mlp_scale(self.mlp(self.norm(x_BND)))

@@ -1,4 +1,4 @@
-"""GS-LRM for qgs: a transformer over the tokens of all photos, one Gaussian per pixel."""
+"""GS-LRM for qgs: a transformer over the tokens of all photos predicts a Gaussian per pixel."""
 
 from qgs.contracts import Plugin
 from qgs_zoo.gslrm.pixels import AlongRays, PixelHead, PixelQueries, Transformer

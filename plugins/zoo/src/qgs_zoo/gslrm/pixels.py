@@ -1,7 +1,7 @@
-"""`gslrm/transformer`: plain transformer over patches of colours and rays, after a linear layer.
+"""`gslrm/transformer`: encoder with self-attention over the patches of all photos.
 
-`gslrm/pixels`, `gslrm/pixel_head`, `gslrm/along_rays`: a query for each image token, a Gaussian for
-each of its pixels, and means on the rays of the pixels.
+`gslrm/pixels` makes a query of each image token, `gslrm/pixel_head` a Gaussian for each pixel of
+its patch, and `gslrm/along_rays` puts the Gaussians' means on the rays of the pixels.
 """
 
 from collections.abc import Iterable
@@ -35,11 +35,11 @@ from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
 from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, self_attention
 
 CHANNELS = 9
-"""Channels per pixel: 2 RGB - 1, moment o x d, unit direction d of its ray (section 3.1)."""
+"""Input channels per pixel: 2 RGB - 1, moment o x d, unit direction d of its ray (paper, 3.1)."""
 
 
 class Block(nn.Module):
-    """Pre-norm self-attention and MLP (exact GELU) without biases: (B, M, D) -> (B, M, D)."""
+    """Transformer block without biases: pre-norm self-attention, then an MLP with exact GELU."""
 
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
@@ -58,9 +58,10 @@ class Block(nn.Module):
 
 
 class Transformer(PatchEncoder):
-    """Encoder with self-attention over the patches of all views together.
+    """Encoder with self-attention over the patches of all views together (GS-LRM).
 
-    Its memory has features, rays and the grid, but no keys and values: GS-LRM has no decoder.
+    Its memory has features, rays and the grid of patches. It has no keys and values, because GS-LRM
+    has no decoder.
     """
 
     name = "transformer"
@@ -90,9 +91,9 @@ class Transformer(PatchEncoder):
                 nn.init.normal_(module.weight, std=config.init_std)
 
     def forward(self, views: Views) -> ImageMemory:
-        """Return features (B, M, D) before the last norm, which belongs to the head.
+        """Return features (B, M, D) of the patches, without the last norm, which the head applies.
 
-        Raises ValueError if the patch size does not divide the images.
+        Raises ValueError if the patch size does not divide the sides of the images.
         """
         patch = self.config.patch_size
         grid = self.grid(views)
@@ -112,7 +113,7 @@ PATCH_FIELD: Fields = {PATCH: FieldSpec((4, 3), frame="world", encoding=PIXEL_EN
 
 
 class PixelQueries(Queries):
-    """Queries for all image tokens, with the token's features and the rays of its patch."""
+    """One query for each image token, with the token's features and the rays of its patch."""
 
     name = "pixels"
     reads = memory_fields("features", "grid")
@@ -130,9 +131,9 @@ class PixelQueries(Queries):
 def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return world-frame origins (B, N, 1, 3) and directions (B, N, K, 3) of K = `count` rays.
 
-    Directions have z = 1 in the frame of their camera. The rays go through the centres of a grid of
-    K equal cells of the patch, row by row. Cells are as nearly square as K allows. If K is the
-    number of pixels of the patch, the cells are its pixels.
+    Directions have z = 1 in the frame of their camera. The K rays of a patch go through the centres
+    of a grid of K equal cells, row by row. Cells are as nearly square as K allows. If K is the
+    number of pixels of the patch, its cells are the pixels.
     """
     origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
     index_K = torch.arange(count, device=patch_BN43.device)
@@ -150,11 +151,11 @@ def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 class AlongRays(Centers):
-    """Means at o + t d on the ray of the Gaussian's pixel, with t = (1 - w) near + w far.
+    """Gaussian means at o + t d on the rays of pixels, with t = (1 - w) near + w far.
 
-    w is the sigmoid of the mean of the three raw offsets. d is a unit vector; with `measure: depth`
-    it has z = 1 in the camera's frame. The K Gaussians of a query lie on the rays of
-    `patch_rays_at`.
+    o is the camera's centre. w is the sigmoid of the mean of the Gaussian's three raw offsets. d is
+    a unit vector, or with `measure: depth` a vector with z = 1 in the camera's frame.
+    `patch_rays_at` gives the rays of the K Gaussians of a query.
     """
 
     name = "along_rays"
@@ -166,8 +167,8 @@ class AlongRays(Centers):
         far: float = Field(default=500.0, gt=0)
         """Largest distance from the camera, world units (500 for scenes in the paper)."""
         measure: Literal["distance", "depth"] = "distance"
-        """Measure t along the ray ("distance"), or along the camera's axis ("depth",
-        gs-lrm-unofficial)."""
+        """Measure `near`, `far` and t along the ray ("distance", paper), or along the camera's axis
+        ("depth", the repository gs-lrm-unofficial)."""
 
     config: Config
 
@@ -179,7 +180,7 @@ class AlongRays(Centers):
 
     @full_precision
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
+        """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
         config = self.config
         origins, directions = patch_rays_at(state[PATCH], offsets.shape[2])
         if config.measure == "distance":
@@ -190,23 +191,26 @@ class AlongRays(Centers):
 
 
 class PixelHead(Head):
-    """Head with a LayerNorm, then a linear layer D -> K (3 or 1 + 11), both without biases."""
+    """Head with a LayerNorm and a linear layer to K Gaussians of 12 or 14 channels, without biases.
+
+    The number of channels follows from `position_channels`.
+    """
 
     name = "pixel_head"
 
     class Config(ComponentConfig):
         gaussians_per_query: int = Field(default=64, ge=1)
-        """K, the number of Gaussians of each token. The square of the encoder's `patch_size` gives
-        one per pixel. Other numbers give fewer or more, on an even grid."""
+        """K, the number of Gaussians of each token, on an even grid over its patch. The square of
+        the encoder's `patch_size` gives one Gaussian per pixel."""
         position_channels: Literal[1, 3] = 3
-        """Number of raw numbers that place a Gaussian on its ray (paper: 1). With 3, their mean
-        counts. With 1, centres other than `gslrm/along_rays` get three equal offsets."""
+        """Number of raw offsets that the head predicts for a Gaussian (paper: 1). With 3,
+        `gslrm/along_rays` takes their mean. With 1, `model.centers` gets three equal offsets."""
         scale_bias: float = -2.3
-        """Number added to the logarithm of scales, world units."""
+        """Number added to the logarithms of scales, whose unit is that of the world."""
         scale_limit: float | None = -1.2
-        """Largest logarithm of a scale, world units. Null means no limit."""
+        """Largest logarithm of a scale in world units. Null means no limit."""
         opacity_bias: float = -2.0
-        """Number added to the opacity logit."""
+        """Number added to the logits of opacities."""
         init_std: float = Field(default=0.02, gt=0)
         """Standard deviation of the initial weights, which are normally distributed."""
 
@@ -221,11 +225,11 @@ class PixelHead(Head):
         nn.init.normal_(self.linear.weight, std=config.init_std)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Add weight decay to the linear layer (paper); other heads have none by default."""
+        """Return whether a parameter has weight decay: here the linear layer has it (paper)."""
         return parameter.ndim != 1
 
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """Return attributes of (B, N, K) Gaussians from features (B, N, D), float32 or better."""
+        """Return attributes of (B, N, K) Gaussians from features (B, N, D)."""
         raw_BNC = at_least_float32(self.linear(self.norm(state.features)))
         raw_BNKC = rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(self.channels))
         # Rows are ordered Gaussian by Gaussian, as in the weights of the public code.

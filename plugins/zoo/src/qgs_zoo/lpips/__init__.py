@@ -1,4 +1,4 @@
-"""LPIPS for qgs: the distance of rendered and true images in VGG-16, as a loss and a metric."""
+"""LPIPS for qgs: distance of rendered and true images in VGG-16 features, as loss and metric."""
 
 from qgs.contracts import Plugin
 from qgs_zoo.lpips.network import Lpips, LpipsLoss

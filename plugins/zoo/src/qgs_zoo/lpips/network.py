@@ -1,8 +1,8 @@
 """`lpips/vgg16`, a loss and a metric: LPIPS with VGG-16 (Zhang et al., 2018, arXiv 1801.03924).
 
-It is version 0.1 of the release. The learned weights of the layers come from the `lpips` package.
-Its network is not imported, because it needs torchvision, whose wheels work only with CUDA builds
-of torch.
+It computes version 0.1 of LPIPS. The learned factors of VGG-16's channels are read from a file of
+the installed package `lpips`. The package is not imported, because it needs torchvision, whose
+wheels work only with CUDA builds of torch.
 """
 
 from collections.abc import Iterable, Mapping
@@ -32,7 +32,7 @@ from qgs_zoo.parts import load_weights
 # The file of torchvision's VGG-16 in torch's cache.
 _VGG_FILE = "vgg16-397923af.pth"
 _BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
-"""Torchvision's numbers of VGG-16's convolutions; a 2x2 max pooling is between blocks."""
+"""Torchvision's indices of VGG-16's convolutions, in five blocks with 2 x 2 max pooling between."""
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPS = 1e-10
@@ -40,13 +40,14 @@ SMALLEST_SIDE = 2 ** (len(_BLOCKS) - 1)
 
 
 class PerceptualDistance(nn.Module):
-    """LPIPS of images against the truth, with fixed weights, which `load` reads."""
+    """LPIPS of rendered images against true ones, with fixed weights. Call `load` first."""
 
     @full_precision
     def forward(self, images: Tensor, truth: Tensor) -> Tensor:
-        """Return LPIPS (X,) of images (X, 3, H, W) in [0, 1]; equal images give 0.
+        """Return the LPIPS (X,) of X pairs of images, each (X, 3, H, W) in [0, 1].
 
-        Only `images` get a gradient. Raises ValueError if a side is shorter than 16 pixels.
+        Equal images have LPIPS 0. Only `images` get a gradient. Raises ValueError if a side is
+        shorter than 16 pixels.
         """
         if min(images.shape[-2:]) < SMALLEST_SIDE:
             raise ValueError(
@@ -62,7 +63,7 @@ class PerceptualDistance(nn.Module):
         return total
 
     def _features(self, images: Tensor) -> list[Tensor]:
-        """Return the outputs of the blocks; the channels of each pixel have length 1."""
+        """Return the outputs of VGG-16's blocks, with the channels of each pixel at length 1."""
         x = images * 2 - 1
         shift, scale = (x.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
         x = (x - shift) / scale
@@ -74,10 +75,10 @@ class PerceptualDistance(nn.Module):
         return found
 
     def load(self, weights: str | None) -> None:
-        """Read the weights from files; nothing is downloaded.
+        """Read the weights of VGG-16 and LPIPS from files. Nothing is downloaded.
 
-        weights: file of VGG-16 (safetensors, or torchvision's); None uses the one in torch's cache.
-        Raises MissingExtraError if files are missing or do not fit.
+        weights: file of VGG-16, safetensors or torchvision's. None uses torchvision's file in
+        torch's cache. Raises MissingExtraError if a file is missing or does not fit.
         """
         # The package is only located: importing it would import torchvision.
         package = find_spec("lpips")
@@ -115,7 +116,7 @@ def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]
 
 
 class LpipsLoss(Loss):
-    """Mean LPIPS of the views with VGG-16 (TokenGS 2026.6); nothing is downloaded."""
+    """Mean LPIPS of the rendered views with VGG-16 (TokenGS 2026.6). Nothing is downloaded."""
 
     name = "vgg16"
     renderings = "each"
@@ -124,8 +125,8 @@ class LpipsLoss(Loss):
         weight: float = Field(default=0.5, ge=0)
         """Weight of the loss in the objective."""
         weights: str | None = None
-        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth). Null uses
-        the one in torch's cache."""
+        """File of VGG-16 weights: safetensors, or torchvision's vgg16-397923af.pth. Null uses
+        torchvision's file in torch's cache."""
 
     config: Config
 
@@ -143,7 +144,7 @@ class LpipsLoss(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """Return the mean LPIPS.
+        """Return the mean LPIPS of the rendered views.
 
         Raises ValueError if a side of the images is shorter than 16 pixels.
         """
@@ -153,7 +154,10 @@ class LpipsLoss(Loss):
 
 
 class Lpips(Metric):
-    """LPIPS: distance of each view from the truth in VGG-16 features; nothing is downloaded."""
+    """LPIPS: distance of each rendered view from the true image in VGG-16 features.
+
+    Nothing is downloaded.
+    """
 
     name = "vgg16"
     definition = "VGG-16, version 0.1, images in [-1, 1]"
@@ -164,8 +168,8 @@ class Lpips(Metric):
         """Options of LPIPS."""
 
         weights: str | None = None
-        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth). Null uses
-        the one in torch's cache."""
+        """File of VGG-16 weights: safetensors, or torchvision's vgg16-397923af.pth. Null uses
+        torchvision's file in torch's cache."""
 
     config: Config
 
@@ -178,7 +182,7 @@ class Lpips(Metric):
         self.network.load(self.config.weights)
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return LPIPS (1, T) of each target view.
+        """Return the LPIPS (1, T) of each of the T target views.
 
         Raises ValueError if a side is shorter than 16 pixels.
         """
@@ -186,6 +190,6 @@ class Lpips(Metric):
 
     @torch.no_grad()
     def distance(self, images: Tensor, truth: Tensor) -> Tensor:
-        """Return LPIPS (...) of images (..., 3, H, W) clipped to [0, 1]; equal images give 0."""
+        """Return the LPIPS (...) of pairs of images (..., 3, H, W), which are clipped to [0, 1]."""
         pairs = zip(*(x.clamp(0, 1).flatten(0, -4).split(1) for x in (images, truth)), strict=True)
         return torch.cat([self.network(*pair) for pair in pairs]).reshape(images.shape[:-3])

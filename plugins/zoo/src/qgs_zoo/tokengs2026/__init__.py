@@ -1,4 +1,4 @@
-"""TokenGS 2026.6 for qgs: latents that read several encoder blocks, and moving scenes."""
+"""TokenGS 2026.6 for qgs: encoders that read several ViT blocks, and queries for moving scenes."""
 
 from qgs.contracts import Plugin
 from qgs_zoo.tokengs2026.dynamic import BlockCausalSelfAttention, DynamicObjective, DynamicQueries

@@ -1,6 +1,6 @@
-"""Queries for moving scenes: static ones, and dynamic ones for the requested time.
+"""Queries for moving scenes: static queries, and dynamic queries for the requested time.
 
-They are those of TokenGS 2026.6.
+They follow TokenGS 2026.6.
 """
 
 from collections.abc import Iterable
@@ -29,28 +29,31 @@ from qgs_zoo.parts import mean_outcome
 from qgs_zoo.tokengs2026.multiscale import TimeEmbedding, without_times
 
 MOVES = "dynamic.moves"
-"""Field (B, N), bool: True for dynamic queries, which depend on the requested time."""
+"""Name of the field (B, N), bool: True for dynamic queries, which depend on the requested time."""
 _FIELDS: Fields = {MOVES: FieldSpec((), torch.bool)}
 
 
 class DynamicQueries(Queries):
-    """N learned queries; the last ones are dynamic: the requested time is added to them."""
+    """N learned queries, static ones first, then dynamic ones, to which the time is added.
+
+    The time is the one for which the scene is requested.
+    """
 
     name = "dynamic"
     reads_cameras = False
 
     class Config(ComponentConfig):
         count: int = Field(default=1280, ge=1)
-        """N, the number of static and dynamic queries (TokenGS: 1024 and 256)."""
+        """N, the number of static and dynamic queries together (TokenGS: 1024 + 256)."""
         dynamic: int = Field(default=256, ge=0)
-        """Number of dynamic queries, which are the last of the N. With 0, all queries get the
-        time."""
+        """Number of dynamic queries, which are the last of the N. With 0, the time is added to all
+        queries."""
         std: float = Field(default=0.02, ge=0)
         """Standard deviation of the initial features, which are normally distributed."""
         time_channels: int = Field(default=2, ge=0, multiple_of=2)
         """Number of channels that encode the requested time. 0 ignores the time."""
         patch_size: int = Field(default=8, ge=1)
-        """Side of the patches that embed the time. The release uses that of the encoder."""
+        """Side of the patches, in pixels, that embed the time. The release uses the encoder's."""
 
     config: Config
 
@@ -79,9 +82,9 @@ class DynamicQueries(Queries):
         return _FIELDS if config.dynamic else {}
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """Return the queries, with the field `dynamic.moves` (B, N) if some are dynamic.
+        """Return initial queries, with the field `dynamic.moves` (B, N) if some are dynamic.
 
-        Raises ValueError for views without a target time.
+        Raises ValueError for views without a target time if the queries read it.
         """
         config = self.config
         batch = len(memory.features)
@@ -102,7 +105,10 @@ class DynamicQueries(Queries):
 
 
 class BlockCausalSelfAttention(ContentSelfAttention):
-    """Self-attention in which dynamic queries read all, and static ones only static ones."""
+    """Self-attention in which static queries read static ones only, and dynamic queries read all.
+
+    So static queries do not depend on the requested time.
+    """
 
     name = "block_causal"
     reads = _FIELDS
@@ -115,7 +121,10 @@ class BlockCausalSelfAttention(ContentSelfAttention):
 
 
 class DynamicObjective(Objective):
-    """Objective of one pass: its losses, plus losses of the dynamic Gaussians rendered alone."""
+    """Objective of one pass: the losses, plus the losses of dynamic Gaussians rendered alone.
+
+    Dynamic Gaussians are those of dynamic queries.
+    """
 
     name = "dynamic"
     reads = _FIELDS
@@ -125,13 +134,13 @@ class DynamicObjective(Objective):
 
     class Config(ComponentConfig):
         weight: float = Field(default=0.3, ge=0)
-        """Weight of the losses of dynamic Gaussians; 0 skips them. TokenGS has 0.3 for 5,000 steps,
-        then a decay to 0 over 10,000."""
+        """Weight of the losses of dynamic Gaussians rendered alone. 0 skips these losses. TokenGS
+        uses 0.3 for 5,000 steps, then a decay to 0 over 10,000 steps."""
 
     config: Config
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """Return the losses of the whole prediction, and the term `dynamic`."""
+        """Return the losses of all Gaussians, and the term `dynamic` of the dynamic ones."""
         prediction = passes.predict(inputs)
         whole = passes.judge(prediction, targets, inputs)
         added = torch.zeros_like(whole.total)
@@ -145,7 +154,10 @@ class DynamicObjective(Objective):
 
 
 def _alone(layer: LayerPrediction) -> LayerPrediction:
-    """Return the dynamic queries of a layer and their Gaussians, the same ones in all scenes."""
+    """Return the dynamic queries of a layer and their Gaussians.
+
+    The same queries must be dynamic in all scenes.
+    """
     moves_N = layer.state[MOVES][0]
     each = layer.gaussians.count // len(moves_N)
     of_gaussians = moves_N.repeat_interleave(each)
@@ -156,7 +168,7 @@ def _alone(layer: LayerPrediction) -> LayerPrediction:
 
 
 def _readable(state: QueryState) -> Tensor:
-    """Return (B, N, N): True if the query of the row may read the query of the column."""
+    """Return a mask (B, N, N): True where the query of the row may read that of the column."""
     moves_BN = state[MOVES]
     # Static queries read only static ones, so that they are the same at all times.
     readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]

@@ -1,8 +1,9 @@
-"""`tokengs2026/multiscale_vit`, `tokengs2026/latent_bottleneck`: readouts of several ViT blocks.
+"""Encoders with the outputs of several ViT blocks (TokenGS 2026.6).
 
-Keys and values come from the blocks, or from learned latents that read the blocks (TokenGS 2026.6).
+`tokengs2026/multiscale_vit` computes keys and values from the outputs of the blocks.
+`tokengs2026/latent_bottleneck` computes them from learned latents that attend to the outputs.
 
-Axes: T channels of times, L latents, C = S D the width of the image tokens' features.
+Axes: T channels that encode a time, L latents, S blocks, C = S D the width of their joined outputs.
 """
 
 import math
@@ -32,9 +33,9 @@ from qgs.types import ImageMemory, Views
 
 @full_precision
 def time_features(times: Tensor, channels: int) -> Tensor:
-    """Encode times (...) as (..., T): cos, then sin, of t exp(-ln(10000) i / (T/2)).
+    """Encode times t (...) as (..., T): the cosines of T/2 angles, then their sines.
 
-    i runs from 0 to T/2 - 1.
+    The angles are t exp(-ln(10000) i / (T/2)) for i from 0 to T/2 - 1. T is `channels`.
     """
     half = channels // 2
     rates = torch.exp(-math.log(10_000) / half * torch.arange(half, device=times.device).to(times))
@@ -43,7 +44,7 @@ def time_features(times: Tensor, channels: int) -> Tensor:
 
 
 def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
-    """Report `time_channels` if the data of the recipe have no times."""
+    """Report that `channels` encode a time if the recipe's data have no times."""
     if channels and context.inputs is not None and not context.times:
         yield Problem(
             "time_channels",
@@ -54,13 +55,13 @@ def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
 
 
 class TimeEmbedding(nn.Module):
-    """Embedding of times (B, V) as (B, V, D), which is zero at first.
+    """Embedding of times (B, V) as (B, V, D), which is zero before training.
 
-    It is a convolution of P x P equal pixels, because the release embeds a map of times.
+    It is a convolution of a patch of equal pixels, because the release embeds a map of times.
     """
 
     def __init__(self, channels: int, width: int, patch_size: int) -> None:
-        """Make the embedding. channels: T, even."""
+        """Make the embedding for T = `channels` channels per time, an even number."""
         super().__init__()
         self.proj = nn.Conv2d(channels, width, kernel_size=patch_size, stride=patch_size)
         for parameter in self.proj.parameters():
@@ -73,16 +74,17 @@ class TimeEmbedding(nn.Module):
 
 
 class MultiscaleReadout(PatchViT):
-    """Encoder whose features are the outputs of S chosen blocks, each with its own norm.
+    """Base of encoders with the outputs of S chosen ViT blocks as features, each with its own norm.
 
-    Unlike the default encoder, it can embed the times of photos.
+    Unlike the default encoder, they can embed the times of photos.
     """
 
     class Config(PatchViT.Config):
         blocks: tuple[int, ...] = Field(default=(1, 2, 3), min_length=1)
-        """Numbers of the blocks that are read, ascending. 1 is the first; the last is `depth`."""
+        """Numbers of the blocks whose outputs are read, ascending from 1 for the first block. The
+        largest must be `depth`."""
         time_channels: int = Field(default=0, ge=0, multiple_of=2)
-        """Number of channels that encode the time of a photo. 0 ignores times."""
+        """Number of channels that encode the time of a photo. 0 ignores the times of photos."""
 
         @field_validator("blocks")
         @classmethod
@@ -121,7 +123,7 @@ class MultiscaleReadout(PatchViT):
             )
 
     def embed(self, views: Views, plucker: Tensor) -> Tensor:
-        """Return the sum of the embeddings of colours, rays and times, (B, M, D).
+        """Return the sum (B, M, D) of the embeddings of colours, rays and, if any, times.
 
         Raises ValueError for views without times if times are embedded.
         """
@@ -138,9 +140,9 @@ class MultiscaleReadout(PatchViT):
         return x_BMD + times_BVD.repeat_interleave(x_BMD.shape[1] // times_BVD.shape[1], 1)
 
     def features(self, views: Views, plucker: Tensor) -> Tensor:
-        """Return features (B, M, S D), the first chosen block first.
+        """Return the joined outputs (B, M, S D) of the chosen blocks, in the order of the blocks.
 
-        views, plucker: as in `embed`.
+        plucker: rays of all pixels.
         """
         x_BMD = self.embed(views, plucker)
         outputs = []
@@ -153,7 +155,7 @@ class MultiscaleReadout(PatchViT):
 
 
 class MultiscaleViT(MultiscaleReadout):
-    """Encoder with keys and values of every image token from several blocks of a ViT."""
+    """Encoder with keys and values of image tokens, from the outputs of several ViT blocks."""
 
     name = "multiscale_vit"
 
@@ -170,9 +172,9 @@ class MultiscaleViT(MultiscaleReadout):
         return {**MEMORY_FIELDS, "memory.features": wide}
 
     def forward(self, views: Views) -> ImageMemory:
-        """Return features (B, M, S D).
+        """Return the memory, with features (B, M, S D).
 
-        Raises ValueError if the patch size does not divide the images.
+        Raises ValueError if the patch size does not divide the sides of the images.
         """
         grid = self.grid(views)
         plucker_BV6HW = plucker_rays(views.cameras)
@@ -183,7 +185,10 @@ class MultiscaleViT(MultiscaleReadout):
 
 
 class LatentBlock(nn.Module):
-    """Cross-attention to given keys and values, self-attention, MLP, each scaled and added."""
+    """Transformer block: cross-attention to given keys and values, self-attention, MLP.
+
+    The output of each is multiplied by a LayerScale and added.
+    """
 
     def __init__(
         self, width: int, heads: int, mlp_ratio: float, layer_scale: float, norm_eps: float
@@ -205,9 +210,9 @@ class LatentBlock(nn.Module):
 
 
 class LatentBottleneck(MultiscaleReadout):
-    """Encoder whose memory consists of L learned latents that read several blocks of a ViT.
+    """Encoder whose tokens are L learned latents that attend to the outputs of several ViT blocks.
 
-    The memory has no rays and no grid. It has the same size for any number of photos.
+    The memory has the same size for any number of photos. It has no rays and no grid.
     """
 
     name = "latent_bottleneck"
@@ -220,13 +225,15 @@ class LatentBottleneck(MultiscaleReadout):
         depth: int = Field(default=12, ge=1, le=256)
         """Number of ViT blocks."""
         blocks: tuple[int, ...] = Field(default=(6, 8, 10, 12), min_length=1)
-        """Numbers of the blocks that are read, ascending. 1 is the first; the last is `depth`."""
+        """Numbers of the blocks whose outputs are read, ascending from 1 for the first block. The
+        largest must be `depth`."""
         latents: int = Field(ge=1)
-        """L, the number of latents (TokenGS: 4096)."""
+        """L, the number of learned latents (TokenGS: 4096)."""
         latent_std: float = Field(default=0.02, ge=0)
         """Standard deviation of the initial latents, which are normally distributed."""
         latent_depth: int = Field(default=12, ge=1, le=256)
-        """Number of blocks over the latents. MLPs and LayerScale have the sizes of the ViT's."""
+        """Number of transformer blocks that update the latents. Their MLPs and LayerScales are
+        those of the ViT."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -247,9 +254,9 @@ class LatentBottleneck(MultiscaleReadout):
         return name != "latents" and super().decays(name, parameter)
 
     def forward(self, views: Views) -> ImageMemory:
-        """Return the latents (B, L, D) that have read all views, and their keys and values.
+        """Return the latents (B, L, D) after attention to all views, and their keys and values.
 
-        Raises ValueError if the patch size does not divide the images.
+        Raises ValueError if the patch size does not divide the sides of the images.
         """
         # Called only for this error.
         self.grid(views)
@@ -261,7 +268,7 @@ class LatentBottleneck(MultiscaleReadout):
         return self._memory(x_BLD)
 
     def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
-        """Return the memory of other latents (B, L, D)."""
+        """Return the memory, with keys and values, of the latents `features` (B, L, D)."""
         # Tuning at test time changes the latents, and then needs new keys and values.
         return self._memory(features)
 
