@@ -1,4 +1,4 @@
-"""MVSplat and DepthSplat for qgs: depth from a plane sweep, one Gaussian per pixel."""
+"""MVSplat and DepthSplat for qgs: a plane sweep finds depths; each pixel gives one Gaussian."""
 
 from qgs.contracts import Plugin
 from qgs_zoo.dinov2.vit import VitConfig
@@ -21,7 +21,7 @@ _SMALL = DepthSplatEncoder.Config(
     regressor=8,
 )
 
-_BIASES = "instance norms remove the biases of the CNN: these are stored and learn nothing"
+_BIASES = "instance norms remove the effect of biases in the CNN, so these biases learn nothing"
 
 plugin = Plugin(
     name="mvsplat",
@@ -49,15 +49,15 @@ plugin = Plugin(
     ),
     exemptions={
         MVSplatEncoder: {
-            "compiles": "the sweep reads the other photos one after another, to save memory: each "
-            "number of photos has its own graph",
+            "compiles": "to save memory, the sweep reads the other photos one after another, so "
+            "each number of photos has its own graph",
             "parameters_learn": _BIASES,
             "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "
             "the softmax over depths spread a change of a pixel over its image",
         },
         DepthSplatEncoder: {
-            "parameters_learn": f"{_BIASES}; and layers that start at zero follow each other, in "
-            "the blocks and at the end of a U-Net and of a correction: each needs a step to open",
+            "parameters_learn": f"{_BIASES}; and where two layers that start at zero follow each "
+            "other, the first gets a gradient only after a step of the second",
         },
     },
 )

@@ -1,4 +1,7 @@
-"""Colours and rotations of the pixelSplat family, converted to the basis of qgs."""
+"""Conversion of colours and rotations from the pixelSplat family of models to qgs.
+
+The family has harmonics in e3nn's basis and rotations in the camera's frame.
+"""
 
 import math
 from functools import cache
@@ -13,19 +16,19 @@ from qgs.geometry.transforms import quat_product, unit
 from qgs.precision import full_precision
 
 SH_DEGREE = 3
-"""Largest degree that the rasterisers of the released code and of qgs read."""
+"""Largest degree of harmonics that the rasterisers of the released code and of qgs render."""
 QUAT_EPS = 1e-8
 
 
 def coefficients(degree: int) -> int:
-    """Return the number of harmonics of degrees 0 to `degree`."""
+    """Return the number of spherical harmonics of degrees 0 to `degree`."""
     return (degree + 1) ** 2
 
 
 def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Return real harmonics (..., K) of degrees 0 to `degree` at unit `directions` (..., 3).
+    """Return real spherical harmonics (..., K) of degrees 0 to `degree` at unit vectors (..., 3).
 
-    The functions of each degree l are in e3nn's order: m from -l to l about the axis y, with
+    The functions of each degree l are in e3nn's order: m from -l to l, with y as the polar axis and
     azimuth from z to x. So degree 1 is (x, y, z). They are orthonormal up to one common factor.
     """
     x, y, z = directions.unbind(-1)
@@ -54,7 +57,10 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
 
 
 def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return 64 directions, the pseudo-inverse of the harmonics there, and the change of basis."""
+    """Return 64 directions, the pseudo-inverse of harmonics there, and a change of basis.
+
+    The change of basis is a matrix from e3nn's harmonics to qgs's.
+    """
     generator = torch.Generator().manual_seed(0)
     double = {"dtype": torch.float64, "device": "cpu"}
     around = F.normalize(torch.randn(64, 3, generator=generator, **double), dim=-1)
@@ -86,9 +92,9 @@ def _fixed(degree: int, device: torch.device) -> tuple[Tensor, ...]:
 def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
     """Return the Wigner matrices (..., K, K) of rotations (..., 3, 3) in e3nn's basis.
 
-    They map coefficients to those of the turned function. They are fitted in float64 to values at
-    directions all around. The fit is exact. The Euler angles of the released code lose digits for
-    small tilts.
+    They map the coefficients of a function on the sphere to those of the rotated function. They are
+    an exact fit, in float64, to values in 64 directions. The released code uses Euler angles, which
+    lose digits for small tilts.
     """
     directions, inverse, _ = _fixed(degree, rotation.device)
     turned = torch.einsum("...ij,sj->...si", rotation.double(), directions)
@@ -97,7 +103,10 @@ def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
 
 
 def band_mask(degree: int, like: Tensor) -> Tensor:
-    """Return the family's factors of raw coefficients (K): 1, then .1 / 4^l in degree l."""
+    """Return pixelSplat's factors of raw coefficients (K,).
+
+    They are 1 for degree 0, and 0.1 / 4^l for each higher degree l.
+    """
     # Higher degrees start small (pixelSplat): at first colours hardly depend on the direction.
     each = [1.0, *(0.1 * 0.25**n for n in range(1, degree + 1))]
     return constant([x for n, x in enumerate(each) for _ in range(2 * n + 1)], like)
@@ -105,22 +114,26 @@ def band_mask(degree: int, like: Tensor) -> Tensor:
 
 @full_precision
 def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
-    """Return matrices (..., K, K) from raw camera-frame coefficients to those of qgs in the world.
+    """Return matrices (..., K, K) from raw coefficients in a camera's frame to qgs's in the world.
 
-    rotation: camera to world (..., 3, 3). Degrees above SH_DEGREE stay in e3nn's basis. The turn
-    comes before the change of basis, and the two do not commute. The family turns in e3nn's basis,
-    but its rasteriser uses other signs. Published weights expect this order, and the world in which
-    they were trained (`views.frame: given`).
+    rotation: camera to world (..., 3, 3). Degrees above SH_DEGREE stay in e3nn's basis. The matrix
+    first rotates in e3nn's basis, then changes the basis; these do not commute, because the
+    family's rasteriser uses different signs than e3nn. Published weights expect this order, and the
+    world frame in which they were trained (`views.frame: given`).
     """
     turn = turn_of_harmonics(rotation, degree) * band_mask(degree, rotation)
     return _fixed(degree, rotation.device)[2].to(rotation) @ turn
 
 
 def camera_quaternions(raw_xyzw: Tensor) -> Tensor:
-    """Divide raw quaternions (..., 4), x y z w, by their lengths; zeros stay zero."""
+    """Normalise raw quaternions (..., 4), x y z w. A quaternion of zeros stays zero."""
     return raw_xyzw / (raw_xyzw.norm(dim=-1, keepdim=True) + QUAT_EPS)
 
 
 def world_quaternions(camera_xyzw: Tensor, turn_wxyz: Tensor) -> Tensor:
-    """Return unit quaternions (..., 4), w x y z, in the world; a zero one means no rotation."""
+    """Rotate Gaussians from the camera's frame to the world's: unit quaternions w x y z (..., 4).
+
+    camera_xyzw: rotation of the Gaussian in the camera's frame; zeros mean none. turn_wxyz: camera
+    to world.
+    """
     return F.normalize(quat_product(turn_wxyz, unit(camera_xyzw.roll(1, -1))), dim=-1)

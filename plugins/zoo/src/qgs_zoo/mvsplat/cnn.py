@@ -1,4 +1,4 @@
-"""CNN of GMFlow and UniMatch before the multi-view transformer, with features at 1/4 or 1/8."""
+"""CNN that gives the multi-view transformer features at 1/4 or 1/8 size (GMFlow, UniMatch)."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 WIDTHS = (64, 96, 128)
-"""Channels of the three stages (released code)."""
+"""Channels of the three stages of the CNN (released code)."""
 
 
 class Stages(NamedTuple):
-    """Maps of the three stages, and `features`, a 1x1 convolution of the last."""
+    """Maps of the CNN's three stages, and `features`, a 1 x 1 convolution of the third map."""
 
     first: Tensor
     second: Tensor
@@ -21,7 +21,7 @@ class Stages(NamedTuple):
 class ResidualBlock(nn.Module):
     """Residual block relu(skip(x) + relu(norm(conv(relu(norm(conv x)))))).
 
-    It maps (N, C, H, W) to (N, C', H/s, W/s).
+    It maps (N, C, H, W) to (N, C', H/s, W/s), with s the stride.
     """
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
@@ -45,10 +45,11 @@ class ResidualBlock(nn.Module):
 
 
 class CNN(nn.Module):
-    """CNN: 7x7 convolution to half size, three stages of two residual blocks, 1x1 convolution.
+    """CNN: 7 x 7 convolution to half size, three stages of two residual blocks, 1 x 1 convolution.
 
-    strides: of the second and third stage. widths: of the three stages. Instance norms have neither
-    parameters nor running statistics, so that training and evaluation agree.
+    width: channels of the last convolution. strides: of the second and the third stage. widths:
+    channels of the three stages. Instance norms have neither parameters nor running statistics, so
+    the CNN computes the same in training and evaluation.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class CNN(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images_N3HW: Tensor) -> Stages:
-        """Return the maps of normalised images."""
+        """Return the maps of images that are normalised by ImageNet's statistics."""
         # All stages are returned: the upsamplers take the finer ones.
         first = self.layer1(F.relu(F.instance_norm(self.conv1(images_N3HW))))
         second = self.layer2(first)

@@ -1,6 +1,7 @@
 """DepthSplat (Xu et al., arXiv 2410.13862): depth from a plane sweep and a pretrained ViT.
 
-Modules have the names of the released weights. Levels 0, 1, 2 are 1/2, 1/4, 1/8 of the images.
+Modules have the names of the released weights. Levels 0, 1 and 2 mean maps of 1/2, 1/4 and 1/8 of
+the image size. A scale is a sweep: 0 is the first.
 """
 
 from collections.abc import Sequence
@@ -39,38 +40,40 @@ Width: TypeAlias = Annotated[int, Field(ge=1)]
 Block: TypeAlias = Annotated[int, Field(ge=0)]
 
 GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
-"""Channels of a raw Gaussian: opacity, place in the pixel, scale, quaternion. Harmonics follow."""
+"""Channels of a raw Gaussian: opacity, position in the pixel, scale, quaternion; then harmonics."""
 
 
 class DepthSplatConfig(ComponentConfig):
-    """Sizes of the networks. The defaults are those of the small model on RealEstate10K."""
+    """Sizes of DepthSplat's networks, by default of its small model for RealEstate10K."""
 
     features: int = Field(default=128, ge=32, multiple_of=32)
-    """Channels of the multi-view features and of the networks of the first cost volume. The
-    networks of the second have half as many."""
+    """Channels of the multi-view features and of the networks after the first sweep. The networks
+    after a second sweep have half as many."""
     cnn: tuple[Width, Width, Width] = WIDTHS
     """Channels of the three stages of the CNN."""
     candidates: int = Field(default=128, ge=16, multiple_of=8)
     """Number of depths in the first sweep, evenly spaced in inverse depth from `far` to `near`. The
     second sweep has a quarter as many."""
     scales: Literal[1, 2] = 1
-    """Number of sweeps. A second one has twice the resolution, around the depths of the first."""
+    """Number of sweeps. A second sweep has twice the resolution, and tries depths around the result
+    of the first."""
     stride: Literal[4, 8] = 4
-    """Pixels along the side of a feature of the first sweep."""
+    """Side, in pixels of the image, of the square for which the first sweep finds a depth."""
     neighbours: int = Field(default=2, ge=1)
-    """Number of nearest views with which each view is matched if there are more than three."""
+    """Number of nearest views with which each view is compared if there are more than three views.
+    With two or three, each is compared with all others."""
     vit: VitConfig
     """Sizes and weights of DINOv2. `{}` is a ViT-S with random initial weights."""
     blocks: tuple[Block, Block, Block, Block] = Field(default=(2, 5, 8, 11), validate_default=True)
-    """Indices of the ViT blocks whose tokens are read; 0 is the first. ViT-L: 4, 11, 17, 23."""
+    """Indices of the ViT blocks whose tokens are read, from 0. With a ViT-L: 4, 11, 17, 23."""
     dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)
-    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16. ViT-B: 96, 192, 384, 768. ViT-L: 128,
-    256, 512, 1024."""
+    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16 of the image size. With a ViT-B: 96,
+    192, 384, 768. With a ViT-L: 128, 256, 512, 1024."""
     full_features: int = Field(default=64, ge=4, multiple_of=4)
-    """Channels of the full-size features. The DPT head that corrects depths has half as many.
-    ViT-B: 96, ViT-L: 128."""
+    """Channels of the full-size features from which Gaussians are predicted. The DPT head that
+    corrects depths has half as many. With a ViT-B: 96. With a ViT-L: 128."""
     regressor: int = Field(default=64, ge=1)
-    """Channels between the two networks that predict Gaussians."""
+    """Channels that the first of the two networks for Gaussians passes to the second."""
 
     @field_validator("blocks")
     @classmethod
@@ -86,26 +89,26 @@ class DepthSplatConfig(ComponentConfig):
         return blocks
 
     def level(self, scale: int) -> int:
-        """Return the level of the cost volume of a scale; 0 is 1/2."""
+        """Return the level of a sweep's cost volume; level 0 has 1/2 of the image size."""
         return self.stride.bit_length() - 2 - scale
 
     @property
     def finest(self) -> int:
-        """Level of the last cost volume."""
+        """Level of the last sweep's cost volume; level 0 has 1/2 of the image size."""
         return self.level(self.scales - 1)
 
     @property
     def cnn_levels(self) -> tuple[int, int, int]:
-        """Levels of the CNN's stages."""
+        """Levels of the CNN's three stages; level 0 has 1/2 of the image size."""
         return (0, 0, 1) if self.stride == 4 else (0, 1, 2)
 
 
 class Depths(NamedTuple):
-    """Results of the depth predictor.
+    """Results of `DepthPredictor`.
 
-    depths: camera-frame z in world units (B, V, H, W) of each scale; only the last is corrected.
-    confidence: largest probability of the last sweep (B V, 1, H, W). maps: of the ViT, (B V, C,
-    H/8, W/8). joined: other features, for a DPT head.
+    depths: camera-frame z (B, V, H, W) in world units, from each sweep; only the last is corrected
+    by the DPT head. confidence: largest probability in the last sweep (B V, 1, H, W). maps: tokens
+    of the ViT (B V, C, H/8, W/8). joined: maps that join them in a DPT head.
     """
 
     depths: list[Tensor]
@@ -115,7 +118,7 @@ class Depths(NamedTuple):
 
 
 class Pyramid(nn.Module):
-    """Maps of two scales: the input, and one with half the channels and twice the size."""
+    """Network that returns its input and a map with half the channels and twice the size."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -128,10 +131,10 @@ class Pyramid(nn.Module):
 
 
 def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
-    """Return the views (B, V, J) with which each view is matched.
+    """Return the indices (B, V, J) of the views with which each view is compared.
 
-    With up to three views, these are all others in ascending order. With more, they are the `count`
-    nearest, nearest first.
+    With up to three views, these are all other views in ascending order. With more views, they are
+    the `count` nearest, nearest first.
     """
     scenes, views = c2w_BV44.shape[:2]
     if views <= 3:
@@ -144,16 +147,16 @@ def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
 
 
 def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
-    """Return the least and largest inverse depth (B V, 1, 1), from `far` and `near`."""
+    """Return the least and the largest inverse depth of a sweep, each (B V, 1, 1)."""
     least, most = (1 / x.flatten()[:, None, None] for x in (sweep.far, sweep.near))
     return least, most
 
 
 @full_precision
 def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) -> Tensor:
-    """Return inverse depths (N, D, 2h, 2w) around those of the first scale.
+    """Return inverse depths (N, D, 2h, 2w) for a second sweep, around the result of the first.
 
-    first: number of candidates of the first scale. count: D.
+    coarse: inverse depths from the first sweep. first: its number of candidates. count: D.
     """
     height, width = coarse_N1hw.shape[-2:]
     # No gradient: the first scale learns from its own depth.
@@ -168,7 +171,7 @@ def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) 
 
 
 class DepthPredictor(nn.Module):
-    """Network from images and cameras to depths of all pixels."""
+    """Network that predicts the depths of all pixels from images and cameras."""
 
     def __init__(self, sizes: DepthSplatConfig) -> None:
         super().__init__()
@@ -199,13 +202,13 @@ class DepthPredictor(nn.Module):
         self.upsampler = dpt_head(sizes, depth=True)
 
     def candidates(self, scale: int) -> int:
-        """Return the number of depths in the sweep of a scale."""
+        """Return the number of depths that a sweep tries; scale 0 is the first sweep."""
         return self.sizes.candidates // 4**scale
 
     def forward(
         self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
     ) -> Depths:
-        """Return the depths. near, far: camera-frame z in world units."""
+        """Return the depths of all pixels. near, far: their bounds, camera-frame z, world units."""
         size = images_BV3HW.shape[-2:]
         shape = images_BV3HW.shape[:2]
         normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
@@ -237,7 +240,11 @@ class DepthPredictor(nn.Module):
     def match(
         self, cnn: Stages, multi: Sequence[Tensor], mono: Sequence[Tensor], sweep: Sweep
     ) -> tuple[list[Tensor], Tensor]:
-        """Return inverse depths (B V, 1, h, w) of all scales, largest probability of the last."""
+        """Return inverse depths (B V, 1, h, w) from all sweeps, and a confidence of the last.
+
+        The confidence of a pixel is the largest probability of its candidates. cnn: maps of the
+        CNN. multi, mono: features of the transformer and the ViT for each sweep.
+        """
         # `list[Tensor]()` would break the graph of torch.compile.
         found: list[Tensor] = []
         views = sweep.near.shape[1]
@@ -266,7 +273,7 @@ class DepthPredictor(nn.Module):
         return found, confidence
 
     def vit_maps(self, images_N3HW: Tensor) -> list[Tensor]:
-        """Return the tokens of the chosen blocks as maps (N, C, H/8, W/8)."""
+        """Return the tokens of the ViT blocks in `sizes.blocks` as maps (N, C, H/8, W/8)."""
         height, width = images_N3HW.shape[-2:]
         grid = (height // PATCH, width // PATCH)
         # The ViT has patches of 14: the image shrinks to whole patches.
@@ -278,7 +285,10 @@ class DepthPredictor(nn.Module):
     def beside(
         self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None
     ) -> list[tuple[list[Tensor], list[Tensor]]]:
-        """Return the maps that join the ViT's at 1/2, 1/4, 1/8: before and after its channels."""
+        """Return the maps that join the ViT's map in a DPT head, at 1/2, 1/4 and 1/8 size.
+
+        Each size has two lists: maps before the ViT's channels, and maps after them.
+        """
         # The order of the release: CNN, ViT, transformer, depth. If its CNN ends at 1/4, nothing
         # joins at 1/8.
         found: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in range(LEVELS)]
@@ -294,7 +304,10 @@ class DepthPredictor(nn.Module):
 
 
 def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
-    """Make a head that reads CNN, transformer and ViT; with `depth`, it reads and corrects it."""
+    """Make a DPT head that reads the maps of CNN, transformer and ViT.
+
+    depth: read inverse depth as well, and return a correction of it.
+    """
     # Channels that join at each level, for the sizes of the projections.
     others = [0] * LEVELS
     for width, level in zip((*sizes.cnn[:2], sizes.features), sizes.cnn_levels, strict=True):
@@ -307,9 +320,9 @@ def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
 
 
 class DepthSplat(nn.Module):
-    """Network from images and cameras to depths and raw Gaussians of all pixels.
+    """Network that predicts depths and raw Gaussians of all pixels from images and cameras.
 
-    harmonics: number of coefficients per colour.
+    harmonics: number of coefficients for each of the three colours.
     """
 
     def __init__(self, sizes: DepthSplatConfig, harmonics: int) -> None:
@@ -330,7 +343,10 @@ class DepthSplat(nn.Module):
     def forward(
         self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
     ) -> tuple[list[Tensor], Tensor]:
-        """Return depths (B, V, H, W) of each scale, raw Gaussians (B, V, 10 + 3 K, H, W)."""
+        """Return depths (B, V, H, W) from each sweep, and raw Gaussians (B, V, 10 + 3 K, H, W).
+
+        near, far: bounds of depth, camera-frame z, world units. K: number of harmonics per colour.
+        """
         found = self.depth_predictor(images_BV3HW, cameras, near_BV, far_BV)
         features_NFHW = self.feature_upsampler(found.maps, found.joined)
         images_N3HW = images_BV3HW.flatten(0, 1)

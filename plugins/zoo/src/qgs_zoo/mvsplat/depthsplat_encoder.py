@@ -1,4 +1,4 @@
-"""`mvsplat/depthsplat`: DepthSplat's networks as an encoder with a token for each pixel."""
+"""`mvsplat/depthsplat`: DepthSplat's networks as an encoder that gives each pixel a token."""
 
 from collections.abc import Iterable
 
@@ -17,20 +17,21 @@ from qgs_zoo.mvsplat.sweep import DepthRange, SweepEncoder
 
 
 class DepthSplatEncoder(SweepEncoder):
-    """Encoder that predicts a depth and a raw Gaussian per pixel: a plane sweep and a ViT.
+    """Encoder that predicts depth and raw Gaussian of each pixel, with a plane sweep and a ViT.
 
-    The ViT is pretrained. The memory has a token for each pixel with D numbers, the model's width:
-    those of `CHANNELS` of `pixels.py`, then harmonics. The pixel's colour is added to the constant
-    harmonic. D is 38 for degree 2 (published). A wider model has zeros after them.
+    The ViT is pretrained. The memory has a token for each pixel. Its D numbers are those of
+    `qgs_zoo.mvsplat.pixels.CHANNELS`, then harmonics, with the pixel's colour added to the constant
+    one. D is the model's width: 38 for harmonics of degree 2 (published). A wider model has zeros
+    at the end.
     """
 
     name = "depthsplat"
 
     class Config(DepthSplatConfig, DepthRange):
         coarse_depth: bool = False
-        """Store the logarithm of the first sweep's depth in the last of the D numbers, for
-        `mvsplat/exchange`. It needs two scales, and a model wider than the other numbers
-        (published: 39)."""
+        """Store the logarithm of the first sweep's depth in the last of a token's D numbers, for
+        the decoder layer `mvsplat/exchange`. This needs `scales: 2`, and one more channel in
+        `model.width` (published: 39)."""
 
     config: Config
 
@@ -41,10 +42,10 @@ class DepthSplatEncoder(SweepEncoder):
             yield Problem("coarse_depth", reason, "write false, or set scales to 2")
         if config.coarse_depth and context.dims.width in WIDTHS:
             width = context.dims.width
-            reason = f"a model of width {width} has no room for a coarse depth"
+            reason = f"the {width} numbers of a token leave none for a coarse depth"
             yield Problem("coarse_depth", reason, f"set model.width to {width + 1}")
         if config.features % (32 * config.scales):
-            reason = f"{config.features} features do not split into heads of 32 in both scales"
+            reason = f"{config.features} features do not split into heads of 32 in both sweeps"
             yield Problem("features", reason, "write a multiple of 64")
         yield from super().problems(config, context)
 
@@ -61,7 +62,7 @@ class DepthSplatEncoder(SweepEncoder):
         self.network.depth_predictor.pretrained.load(self.config.vit.weights)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return True: all parameters have weight decay (released code)."""
+        """Return True, because all parameters have weight decay (released code)."""
         return True
 
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """DPT heads (Ranftl et al., arXiv 2103.13413) of DepthSplat, from ViT tokens to full-size maps.
 
-Four maps of a ViT are resized to four resolutions, 1/2 to 1/16. Other features join them at 1/2,
-1/4 and 1/8. Coarse maps are then added to finer ones, step by step.
+Four maps of a ViT are resized to 1/2, 1/4, 1/8 and 1/16 of the image size. Features of other
+networks join them at 1/2, 1/4 and 1/8. Coarse maps are then added to finer ones, step by step.
 """
 
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from qgs_zoo.mvsplat.unet import resized, two_convolutions, zeroed
 
 LEVELS = 3
-"""Number of resolutions at which other features join: 1/2, 1/4, 1/8."""
+"""Number of resolutions at which features of other networks join the ViT's: 1/2, 1/4, 1/8."""
 
 
 class ResidualUnit(nn.Module):
-    """Residual unit x + conv(relu(conv(relu x))), 3 x 3: (X, F, h, w) -> (X, F, h, w)."""
+    """Residual unit x + conv(relu(conv(relu x))), with 3 x 3 convolutions, on (X, F, h, w)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Sum of a map and all coarser ones, resized to the next size."""
+    """Network that adds a map to the sum of all coarser maps, and resizes the result."""
 
     def __init__(self, channels: int, coarsest: bool) -> None:
         super().__init__()
@@ -37,9 +37,9 @@ class Fusion(nn.Module):
         self.resConfUnit2 = ResidualUnit(channels)
 
     def forward(self, coarse: Tensor | None, skip: Tensor, size: Sequence[int]) -> Tensor:
-        """Return the resized sum (X, F, *size).
+        """Return the sum of the map `skip` and `coarse`, resized to `size`: (X, F, *size).
 
-        coarse: sum of the coarser maps; None if `skip` is the coarsest map.
+        coarse: sum of the coarser maps, or None if `skip` is the coarsest map.
         """
         if self.resConfUnit1 is not None and coarse is not None:
             skip = coarse + self.resConfUnit1(skip)
@@ -49,7 +49,7 @@ class Fusion(nn.Module):
 
 
 class Scratch(nn.Module):
-    """Part of a head after its joined maps, with the published parameter names."""
+    """Part of a DPT head that adds maps of four resolutions, with the published parameter names."""
 
     def __init__(self, channels: Sequence[int], features: int, ends_in_depth: bool) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class Scratch(nn.Module):
         self.output_conv = _to_depth(features) if ends_in_depth else None
 
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
-        """Return a full-size map (X, F or 1, H, W) from maps of 1/2 to 1/16, finest first."""
+        """Return a full-size map (X, F or 1, H, W) from maps at 1/2, 1/4, 1/8 and 1/16 size."""
         path = None
         # From coarse to fine: each fusion doubles the size.
         for number in range(len(maps), 0, -1):
@@ -74,7 +74,7 @@ class Scratch(nn.Module):
 
 
 def _to_depth(features: int) -> nn.Sequential:
-    """Return layers that predict a correction of depth, which is 0 at first."""
+    """Return layers that predict a correction of depth, which is 0 before training."""
     return nn.Sequential(
         *two_convolutions(features, features // 2, 16, "replicate"),
         nn.GELU(),
@@ -83,10 +83,11 @@ def _to_depth(features: int) -> nn.Sequential:
 
 
 class DptHead(nn.Module):
-    """Head from four maps of a ViT at 1/8, and other features, to one full-size map.
+    """Head that makes one full-size map of four ViT maps at 1/8 size and maps of other networks.
 
-    width: channels of the ViT's maps. channels: of the four resolutions. features: F. joined: total
-    channels of the other features at 1/2, 1/4 and 1/8.
+    width: channels of the ViT's maps. channels: of the head at the four resolutions. features: F,
+    channels of the result. joined: total channels of the other networks' maps at 1/2, 1/4 and 1/8.
+    ends_in_depth: return one channel, a correction of depth.
     """
 
     def __init__(
@@ -120,9 +121,10 @@ class DptHead(nn.Module):
         maps: Sequence[Tensor],  # four of (X, C, H/8, W/8)
         joined: Sequence[tuple[Sequence[Tensor], Sequence[Tensor]]],
     ) -> Tensor:
-        """Return (X, F, H, W), or (X, 1, H, W) if the head ends in depth.
+        """Return a full-size map (X, F, H, W), or (X, 1, H, W) if the head ends in depth.
 
-        joined: for 1/2, 1/4 and 1/8, the maps before and the maps after the head's own channels.
+        joined: two lists for 1/2, 1/4 and 1/8 each, the maps to put before and those to put after
+        the ViT's.
         """
         own = [
             resize(project(x))

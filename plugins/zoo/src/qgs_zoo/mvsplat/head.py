@@ -1,4 +1,7 @@
-"""`mvsplat/gaussians`, `mvsplat/depthsplat_gaussians`: heads that activate each pixel's numbers."""
+"""`mvsplat/gaussians`, `mvsplat/depthsplat_gaussians`: heads that make Gaussians of raw numbers.
+
+Each pixel has raw numbers, from which one Gaussian gets its attributes.
+"""
 
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -33,16 +36,16 @@ SCALE_SHIFT = 4.0
 
 
 class PixelHead(Head):
-    """Head without parameters that makes one Gaussian of each query of `mvsplat/pixels`."""
+    """Base of heads without parameters that make a Gaussian of each query of `mvsplat/pixels`."""
 
     writes: ClassVar[Fields] = {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]}
 
     @abstractmethod
     def scales(self, raw: Tensor, log_depth: Tensor, state: QueryState) -> Tensor:
-        """Return scales (B, N, 1, 3), world units."""
+        """Return scales (B, N, 1, 3), world units, from raw scales and logarithms of depths."""
 
     def opacities(self, p: Tensor) -> Tensor:
-        """Return opacities from the sigmoids p of the logits."""
+        """Return opacities from p, the sigmoids of the opacity logits."""
         return p
 
     @property
@@ -70,11 +73,11 @@ class PixelHead(Head):
 
 
 class RayHead(PixelHead):
-    """MVSplat's activations.
+    """Head of MVSplat: scales follow the depth and size of the pixel.
 
-    Scales are (min + (max - min) sigmoid) * t * .1 * (1 / fx + 1 / fy), with focal lengths in
-    pixels; both axes are summed, not averaged. With p the sigmoid of the logit, opacities are
-    (1 - (1 - p)^e + p^(1 / e)) / 2 with e = 2^opacity_exponent.
+    Scales are (scale_min + (scale_max - scale_min) sigmoid(raw)) * 0.1 t (1 / fx + 1 / fy), with t
+    the depth and fx, fy the focal lengths in pixels. Opacities are (1 - (1 - p)^e + p^(1 / e)) / 2,
+    with p the sigmoid of the logit and e = 2^opacity_exponent.
     """
 
     name = "gaussians"
@@ -83,13 +86,14 @@ class RayHead(PixelHead):
 
     class Config(ComponentConfig):
         scale_min: float = Field(default=0.5, gt=0)
-        """Least standard deviation, in tenths of the width plus the height of a pixel at the
-        Gaussian's depth."""
+        """Least scale of a Gaussian. The unit is 0.1 times the sum of width and height of a pixel
+        at the Gaussian's depth."""
         scale_max: float = Field(default=15.0, gt=0)
-        """Largest standard deviation, in the same unit."""
+        """Largest scale of a Gaussian. The unit is 0.1 times the sum of width and height of a pixel
+        at the Gaussian's depth."""
         opacity_exponent: float = Field(default=0.0, ge=-10, le=10)
-        """Base-2 logarithm of the exponent e of the opacity map. 0 leaves opacities unchanged
-        (published)."""
+        """Base-2 logarithm of the exponent e in the formula of opacities. 0 gives the sigmoids of
+        the logits (published)."""
 
     config: Config
 
@@ -106,16 +110,19 @@ class RayHead(PixelHead):
 
 
 class WorldHead(PixelHead):
-    """DepthSplat's activations: scales are softplus(x - 4), for any depth and size of a pixel."""
+    """Head of DepthSplat: scales do not depend on depth or size of the pixel.
+
+    Scales are softplus(raw - 4), bounded by `scale_min` and `scale_max`.
+    """
 
     name = "depthsplat_gaussians"
     reads: ClassVar[Fields] = {TURN: PIXEL_FIELDS[TURN]}
 
     class Config(ComponentConfig):
         scale_min: float = Field(default=1e-10, gt=0)
-        """Least standard deviation, world units."""
+        """Least scale of a Gaussian, world units."""
         scale_max: float = Field(default=3.0, gt=0)
-        """Largest standard deviation, world units. The demos at 512 x 960 use 0.1."""
+        """Largest scale of a Gaussian, world units. DepthSplat's demos at 512 x 960 use 0.1."""
 
     config: Config
 
@@ -124,7 +131,7 @@ class WorldHead(PixelHead):
 
 
 def harmonics_of(features_BND: Tensor) -> Tensor:
-    """Return the coefficients (B, N, K, 3) of rendered degrees from the numbers of pixels."""
+    """Return from the features of pixels the coefficients (B, N, K, 3) of rendered harmonics."""
     degree = degree_of(features_BND.shape[-1])
     first = sum(CHANNELS)
     sh_BNC = numbers_of(features_BND)[..., first : first + 3 * coefficients(degree)]
@@ -133,7 +140,10 @@ def harmonics_of(features_BND: Tensor) -> Tensor:
 
 
 def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
-    """Return opacities for probabilities p; an exponent of 0 gives p itself."""
+    """Return opacities (1 - (1 - p)^e + p^(1 / e)) / 2 with e = 2^exponent.
+
+    An exponent of 0 returns p unchanged.
+    """
     if exponent == 0:
         return p
     # The mean of two curves, which is p for an exponent of 0 (published weights). The released code

@@ -1,4 +1,7 @@
-"""`mvsplat/mvsplat`: CNN, window transformer, plane sweep and two U-Nets (arXiv 2403.14627)."""
+"""`mvsplat/mvsplat`: MVSplat's networks as an encoder (arXiv 2403.14627).
+
+They are a CNN, a window transformer, a plane sweep and two U-Nets.
+"""
 
 from typing import Literal, NamedTuple
 
@@ -25,11 +28,11 @@ from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, group_norm, resized, tw
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 
 FACTOR = 4
-"""Side of an image over the side of its feature map."""
+"""Side of an image divided by the side of its feature map."""
 
 
 class Backbone(nn.Module):
-    """CNN and transformer that compute features of all views at 1/4 of the image size."""
+    """CNN and multi-view transformer that compute features at 1/4 of the image size."""
 
     def __init__(self, width: int, stages: tuple[int, int, int]) -> None:
         super().__init__()
@@ -44,11 +47,12 @@ class Backbone(nn.Module):
 
 
 class MVSplatEncoder(SweepEncoder):
-    """Encoder that predicts a depth and a raw Gaussian per pixel with a plane sweep.
+    """Encoder that predicts depth and raw Gaussian of each pixel with a plane sweep.
 
-    The memory has a token for each pixel, or for each square of pixels. A token has D numbers (the
-    model's width): those of `qgs_zoo.mvsplat.pixels.CHANNELS`, then harmonics. D is 86 for degree 4
-    (published). Views are compared in their order; a single view is compared with itself.
+    The memory has a token for each pixel, or for each square of pixels if `stride` is more than 1.
+    Its D numbers are those of `qgs_zoo.mvsplat.pixels.CHANNELS`, then harmonics. D is the model's
+    width: 86 for harmonics of degree 4 (published). The order of views matters. A single view is
+    compared with itself.
     """
 
     name = "mvsplat"
@@ -57,12 +61,13 @@ class MVSplatEncoder(SweepEncoder):
         cnn_widths: tuple[int, int, int] = WIDTHS
         """Channels of the three stages of the CNN."""
         features: int = Field(default=128, ge=4, multiple_of=4)
-        """Channels of the features that the sweep compares."""
+        """Channels of the features that the plane sweep compares."""
         stride: Literal[1, 2, 4] = 1
-        """Side, in pixels, of the square that each Gaussian stands for. 1 gives one Gaussian per
-        pixel (published)."""
+        """Side, in pixels, of the square of pixels that gives one Gaussian. 1 gives one Gaussian
+        per pixel (published)."""
         candidates: int = Field(default=128, ge=2)
-        """Number of depths in the plane sweep, evenly spaced in inverse depth, `near` to `far`."""
+        """Number of depths in the plane sweep, evenly spaced in inverse depth from `far` to
+        `near`."""
         cost_width: int = Field(default=128, ge=32, multiple_of=32)
         """Channels of the U-Net over the cost volume."""
         cost_levels: int = Field(default=3, ge=1, le=6)
@@ -72,8 +77,8 @@ class MVSplatEncoder(SweepEncoder):
         depth_levels: int = Field(default=5, ge=1, le=8)
         """Levels of the U-Net that refines depths. The lowest has attention over all views."""
         cost_volume: bool = True
-        """Compare views. With false, zeros replace the correlations, so that depths come from
-        features alone, with the same parameters (the paper's ablation)."""
+        """Compare views in the plane sweep. With false, zeros replace the correlations of views, so
+        depths are predicted from features alone (the paper's ablation)."""
 
     config: Config
 
@@ -96,7 +101,10 @@ class MVSplatEncoder(SweepEncoder):
 
 
 class Sweep(NamedTuple):
-    """Cameras (B, V), neighbours (B, V, J), and least and largest depths (B, V) of a sweep."""
+    """Inputs of a plane sweep: cameras (B, V), views to compare, least and largest depths (B, V).
+
+    neighbours: indices (B, V, J) of the views with which each view is compared.
+    """
 
     cameras: Cameras
     neighbours: Tensor
@@ -105,7 +113,7 @@ class Sweep(NamedTuple):
 
 
 class DepthPredictor(nn.Module):
-    """Network from features at 1/4 of the image size to depths and raw Gaussians at full size."""
+    """Network that predicts depths and raw Gaussians from features at 1/4 of the image size."""
 
     def __init__(self, config: MVSplatEncoder.Config, numbers: int) -> None:
         super().__init__()
@@ -138,7 +146,10 @@ class DepthPredictor(nn.Module):
     def forward(
         self, images_BV3HW: Tensor, cnn_BVDhw: Tensor, features_BVDhw: Tensor, sweep: Sweep
     ) -> Tensor:
-        """Return (B, V, C, H, W): logarithm of the depth, opacity logit, raw Gaussian."""
+        """Return C numbers per pixel (B, V, C, H, W).
+
+        They are the logarithm of the depth, the opacity logit and the rest of the raw Gaussian.
+        """
         views = images_BV3HW.shape[1]
         # These networks see images in [0, 1]; only the CNN sees normalised ones.
         images_N3HW = images_BV3HW.flatten(0, 1)
@@ -161,7 +172,10 @@ class DepthPredictor(nn.Module):
         return torch.cat([log_depth, logit_N1HW, raw], 1).unflatten(0, (-1, views))
 
     def match(self, features_BVDhw: Tensor, sweep: Sweep) -> tuple[Tensor, Tensor]:
-        """Return inverse depth and largest candidate probability (B V, 1, h, w) at 1/4 size."""
+        """Return inverse depths and confidences, each (B V, 1, h, w), at 1/4 of the image size.
+
+        The confidence is the largest probability of the pixel's candidates.
+        """
         count = self.regressor_residual.out_channels
         candidates_BVD = inverse_depth_candidates(sweep.near, sweep.far, count)
         size = features_BVDhw.shape[3:]
@@ -184,7 +198,7 @@ class DepthPredictor(nn.Module):
 
 @full_precision
 def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean of candidates under softmax(logits), and the largest probability."""
+    """Return the mean of candidates, weighted by softmax(logits), and the largest weight."""
     probability = logits_NDhw.softmax(1)
     # A mean, not the best candidate: it has a gradient and can lie between candidates.
     disparity = (probability * candidates_NDhw).sum(1, keepdim=True)
@@ -195,7 +209,10 @@ def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Te
 def refined_log_depth(
     disparity_N1HW: Tensor, change_N1HW: Tensor, near_BV: Tensor, far_BV: Tensor
 ) -> Tensor:
-    """Return the logarithm of the depth (B V, 1, H, W), clamped to [near, far]."""
+    """Return logarithms of depths (B V, 1, H, W), with depths clamped to [near, far].
+
+    disparity: inverse depth. change: its correction, which is added.
+    """
     # Inverse depth grows towards the camera.
     least, most = (1 / x.flatten()[:, None, None, None] for x in (far_BV, near_BV))
     fine = (disparity_N1HW + change_N1HW).clamp(least, most)

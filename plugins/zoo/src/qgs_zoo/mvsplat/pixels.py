@@ -1,4 +1,4 @@
-"""`mvsplat/pixels`, `mvsplat/on_rays`: a query for each pixel, and means on its rays."""
+"""`mvsplat/pixels`, `mvsplat/on_rays`: a query for each pixel, and Gaussian means on its rays."""
 
 from collections.abc import Iterable
 from typing import Literal
@@ -28,22 +28,23 @@ PIXEL_FIELDS: Fields = {
     PIXEL: FieldSpec((4, 3), frame="world", encoding=PIXEL_ENCODING),
     TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
 }
-"""Rays through a pixel, and the rotation of its camera."""
+"""Fields of the rays through a query's pixel, and of the rotation of its camera."""
 RAY_FIELD: Fields = {PIXEL: PIXEL_FIELDS[PIXEL]}
 
 CHANNELS = (1, 1, 2, 3, 4)
-"""Numbers per pixel: log of the depth (world units), opacity logit, raw place in the pixel, raw
-scales, raw quaternion x y z w in the camera's frame. Harmonics follow, colour by colour."""
+"""Numbers per pixel: log of the depth in world units, opacity logit, raw position in the pixel, raw
+scales, raw quaternion x y z w in the camera's frame. Coefficients of harmonics come after them, all
+of red, then green, then blue."""
 LOG_DEPTH = 20.0
-"""Bound of the logarithm of a depth, so that any features give finite places and scales."""
+"""Bound of |log of a depth|, so that any features give finite positions and scales."""
 
 
 WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 3, 4)}
-"""Degree of harmonics for which a model of each width has room."""
+"""Degree of harmonics by width of the model, for widths that the numbers of a pixel fill."""
 
 
 def degree_of(width: int) -> int:
-    """Return the degree of harmonics in the D = `width` numbers of a pixel.
+    """Return the largest degree of harmonics that fits into the D = `width` numbers of a pixel.
 
     Numbers after these harmonics are not read.
     """
@@ -51,12 +52,12 @@ def degree_of(width: int) -> int:
 
 
 def numbers_of(features_BND: Tensor) -> Tensor:
-    """Return features as numbers of pixels; a narrow model is padded with zeros."""
+    """Return features, padded with zeros if they are narrower than the numbers of a pixel."""
     return F.pad(features_BND, (0, max(0, min(WIDTHS) - features_BND.shape[-1])))
 
 
 def width_problems(context: RecipeContext) -> Iterable[Problem]:
-    """Report a model that is too narrow for the numbers of a pixel."""
+    """Report a model whose width is too small for the numbers of a pixel."""
     least = min(WIDTHS)
     if context.dims.width < least:
         reason = f"the model is {context.dims.width} wide, but a pixel has at least {least} numbers"
@@ -65,9 +66,10 @@ def width_problems(context: RecipeContext) -> Iterable[Problem]:
 
 
 class PixelQueries(Queries):
-    """Queries for all pixels, with the rays through the pixel and the rotation of its camera.
+    """One query for each pixel, with the rays through the pixel and the rotation of its camera.
 
-    Their features are the encoder's numbers, with harmonics turned into the world.
+    Its features are the encoder's numbers of the pixel, with harmonics rotated from the camera's
+    frame to the world's.
     """
 
     name = "pixels"
@@ -88,7 +90,10 @@ class PixelQueries(Queries):
 
 @full_precision
 def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
-    """Return numbers of pixels, ordered by view, with harmonics turned into the world."""
+    """Return numbers of pixels with harmonics rotated from the cameras' frames to the world's.
+
+    features: numbers of pixels in the cameras' frames, view by view. rotation: camera to world.
+    """
     numbers_BMC = numbers_of(features_BMD)
     degree = degree_of(features_BMD.shape[-1])
     views = rotation_BV33.shape[1]
@@ -102,16 +107,20 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
 
 
 def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
-    """Return PIXEL_FIELDS (B, V*rows*columns, ...) of images (B, V) of rows x columns pixels."""
+    """Return the values of PIXEL_FIELDS for images of rows x columns pixels.
+
+    They are (B, V * rows * columns, ...).
+    """
     turn = quaternions(cameras.c2w[..., :3, :3]).repeat_interleave(rows * columns, 1)
     return {PIXEL: pixel_rays(cameras, rows, columns), TURN: turn}
 
 
 class OnRays(Centers):
-    """Means at o + t d, with d the ray through the Gaussian's place in its pixel.
+    """Gaussian means at o + t d on rays through pixels, with o the camera's centre.
 
-    Offsets are two raw numbers and the logarithm of t in world units. The sigmoids of the raw
-    numbers are the place, from the upper left corner of the pixel.
+    A Gaussian's three offsets are two raw numbers and the logarithm of t in world units. The
+    sigmoids of the raw numbers are the position in the pixel, from its upper left corner, through
+    which the ray with direction d goes.
     """
 
     name = "on_rays"
@@ -120,8 +129,8 @@ class OnRays(Centers):
     class Config(ComponentConfig):
         measure: Literal["distance", "depth"] = "distance"
         """Measure t along the ray ("distance", MVSplat), or along the camera's axis ("depth",
-        DepthSplat). MVSplat's sweep finds a depth but uses it as a distance; its weights expect
-        this."""
+        DepthSplat). MVSplat's sweep finds depths, but its head uses them as distances, which its
+        published weights expect."""
 
     config: Config
 
@@ -133,9 +142,10 @@ class OnRays(Centers):
 
 
 def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:
-    """Return directions (B, N, K, 3) of rays through raw places in pixels.
+    """Return directions (B, N, K, 3) of rays through positions in pixels.
 
-    unit: with length 1; otherwise with z = 1.
+    place: logits of positions (B, N, K, 2). pixel: rays of pixels. unit: return directions of
+    length 1; with False, directions with z = 1 in the camera's frame.
     """
     _, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
     # The sigmoid keeps places inside their pixel.
@@ -145,5 +155,5 @@ def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor
 
 
 def depths(log_depth: Tensor) -> Tensor:
-    """Return depths, world units, from their logarithms."""
+    """Return depths from their logarithms, which are clamped so that depths are finite."""
     return log_depth.clamp(-LOG_DEPTH, LOG_DEPTH).exp()

@@ -1,6 +1,6 @@
-"""Plane sweep: correlation of a view's features with those of other views at each depth.
+"""Plane sweep: correlation of a view's features with the features of other views at each depth.
 
-This file also has the base of both encoders: range of depths, image sizes, a token per pixel.
+`SweepEncoder` is the base of the encoders of MVSplat and DepthSplat.
 """
 
 import math
@@ -28,15 +28,16 @@ from qgs.types import Cameras, ImageMemory, Views
 from qgs_zoo.mvsplat.pixels import width_problems
 
 MIN_DEPTH = 1e-3
-"""Least z in another camera, world units: points behind it project far outside its image."""
+"""Least z by which a projection divides, world units. Points behind the camera then project far
+outside its image."""
 MAX_SAMPLES = 1 << 24
-"""Numbers that are sampled at once (64 MiB in float32)."""
+"""Largest number of sampled values in memory at once (64 MiB in float32)."""
 PAIRS = 40
-"""Largest number of pixels per candidate for which all pairs of pixels are correlated."""
+"""Largest number of pixels per depth for which all pairs of pixels are correlated first."""
 
 
 def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
-    """Return the views (B, V, V - 1) after each view, cyclically.
+    """Return the indices (B, V, V - 1) of the views after each view; the first follows the last.
 
     A single view is its own neighbour.
     """
@@ -48,7 +49,7 @@ def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
 
 @full_precision
 def inverse_depth_candidates(near_BV: Tensor, far_BV: Tensor, count: int) -> Tensor:
-    """Return inverse depths (B, V, D), linear from 1/far to 1/near, both included."""
+    """Return D = `count` inverse depths (B, V, D), evenly spaced from 1/far to 1/near inclusive."""
     step_D = torch.linspace(0, 1, count, device=near_BV.device).to(near_BV)
     least = 1 / far_BV[..., None]
     return least + step_D * (1 / near_BV[..., None] - least)
@@ -56,7 +57,7 @@ def inverse_depth_candidates(near_BV: Tensor, far_BV: Tensor, count: int) -> Ten
 
 @full_precision
 def relative_poses(c2w_BV44: Tensor, neighbours_BVJ: Tensor) -> Tensor:
-    """Return poses (B, V, J, 4, 4) from the camera of each view to those of its neighbours."""
+    """Return poses (B, V, J, 4, 4) from each view's camera to the cameras of its neighbours."""
     scenes = torch.arange(len(c2w_BV44), device=c2w_BV44.device)[:, None, None]
     return c2w_BV44[scenes, neighbours_BVJ].inverse() @ c2w_BV44[:, :, None]
 
@@ -70,9 +71,10 @@ def feature_lenses(cameras: Cameras, size: Sequence[int]) -> Tensor:
 
 @full_precision
 def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
-    """Return positions (N, D, h, w, 2) in another view of pixels at depths, for `grid_sample`.
+    """Project pixels at given depths into another view: positions (N, D, h, w, 2).
 
-    depth_NDhw: camera-frame z, world units, with the height and width of the feature map.
+    Positions are in the units of torch's `grid_sample`. depth: camera-frame z of pixels, world
+    units. lens: fx, fy, cx, cy of both views. pose: from this camera to the other one.
     """
     height, width = depth_NDhw.shape[-2:]
     fx, fy, cx, cy = (x[:, None, None] for x in lens_N4.unbind(-1))
@@ -94,7 +96,7 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
 
 
 def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
-    """Return features (N, C, D, h, w) of another view at the places of a grid; 0 outside."""
+    """Sample features of another view at the positions `grid`: (N, C, D, h, w), 0 outside."""
     flat = grid_NDhw2.flatten(1, 2).to(features_NCHW)
     sampled = F.grid_sample(features_NCHW, flat, "bilinear", "zeros", align_corners=True)
     return sampled.unflatten(2, grid_NDhw2.shape[1:3])
@@ -107,10 +109,12 @@ def cost_volume(
     poses_BVJ44: Tensor,
     neighbours_BVJ: Tensor,
 ) -> Tensor:
-    """Return the mean correlation <f, f'> / sqrt(C) with the neighbours, (B, V, D, h, w).
+    """Correlate the features of each pixel with those of neighbour views at D depths.
 
-    Features outside of a neighbour count as 0. inverse_depth_BVDhw: candidates, 1 / world units; h
-    and w may be 1, for the same candidates in all pixels.
+    Returns the mean over neighbours of <f, f'> / sqrt(C), (B, V, D, h, w), with f the feature of
+    the pixel and f' that of the neighbour at the pixel's position there. It is 0 outside of the
+    neighbour. inverse_depth: candidates in 1 / world units; its h and w may be 1, for the same
+    candidates in all pixels.
     """
     scenes, views, channels, height, width = features_BVChw.shape
     depth_NDhw = (1 / inverse_depth_BVDhw.detach()).flatten(0, 1)
@@ -133,7 +137,7 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlate with warped features, some candidates at a time: (N, D, h, w)."""
+    """Sample the other view's features at some depths at a time, then correlate: (N, D, h, w)."""
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
@@ -145,10 +149,11 @@ def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Te
 
 
 def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Compute the same as `_of_warped`: correlate all pairs of pixels, then sample the maps.
+    """Correlate all pairs of pixels of both views, then sample the correlations: (N, D, h, w).
 
-    Warping is linear in the features, so it can follow the product. A map has one channel, and all
-    maps are one matrix product. This is faster if there are few pixels per candidate.
+    The result is that of `_of_warped`, because sampling is linear in the features. All correlations
+    are one matrix product, and sampling them handles one channel instead of C. This is faster if
+    there are few pixels per depth.
     """
     count, _, height, width = own.shape
     grid_NPD2 = warp_grid(depth, lens, pose).permute(0, 2, 3, 1, 4).flatten(1, 2)
@@ -167,7 +172,10 @@ def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose:
 
 
 def _each(part: Callable[..., Tensor], given: Sequence[tuple[Tensor, ...]]) -> list[Tensor]:
-    """Return `part` of each; to save memory, several are computed again in the backward pass."""
+    """Return the results of `part` for each tuple of tensors in `given`.
+
+    If there are several, they are computed again in the backward pass, to save memory.
+    """
     if len(given) == 1:
         return [part(*given[0])]
     return [
@@ -177,13 +185,14 @@ def _each(part: Callable[..., Tensor], given: Sequence[tuple[Tensor, ...]]) -> l
 
 
 class DepthRange(ComponentConfig):
-    """Range of depths of a plane sweep."""
+    """Range of depths in a plane sweep."""
 
     near: float = Field(gt=0)
-    """Least depth, world units. Published, for poses as given: 1 for MVSplat, 0.5 for
-    DepthSplat."""
+    """Least depth in the sweep, world units. Published models use 1 (MVSplat) or 0.5 (DepthSplat),
+    with `views.frame: given`."""
     far: float = Field(gt=0)
-    """Largest depth, world units. Published: 100, and 200 for DepthSplat on DL3DV."""
+    """Largest depth in the sweep, world units. Published models use 100, or 200 for DepthSplat on
+    DL3DV."""
 
     @field_validator("far")
     @classmethod
@@ -198,7 +207,10 @@ class DepthRange(ComponentConfig):
 
 
 class SweepEncoder(Encoder):
-    """Encoder with a token for each pixel, or square of pixels, at depths in a range."""
+    """Base of encoders that predict depths by a plane sweep, with a token for each pixel.
+
+    A token may stand for a square of pixels.
+    """
 
     # Views are matched in their order. With three or more, the mask of shifted windows depends on
     # the order too (released code).
@@ -210,14 +222,14 @@ class SweepEncoder(Encoder):
     @classmethod
     @abstractmethod
     def multiple(cls, config: DepthRange) -> int:
-        """Return the number of pixels of which image sides must be multiples.
+        """Return the number of pixels that must divide the sides of images.
 
-        Windows and the levels of U-Nets need it.
+        The windows of the transformer and the levels of the U-Nets require this.
         """
 
     @abstractmethod
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        """Return the numbers of every pixel (B, V, C, H, W), for depths from `near` to `far`."""
+        """Return C numbers of each pixel (B, V, C, H, W), with depths from `near` to `far`."""
 
     @classmethod
     def problems(cls, config: DepthRange, context: RecipeContext) -> Iterable[Problem]:
@@ -232,9 +244,9 @@ class SweepEncoder(Encoder):
             yield Problem("", reason, f"set data.image_size to {nearest}")
 
     def forward(self, views: Views) -> ImageMemory:
-        """Return the memory with one token per pixel.
+        """Return the memory with one token per pixel, or per square of pixels.
 
-        Raises ValueError for images that the U-Nets and windows do not divide.
+        Raises ValueError if the sides of images are not multiples of `multiple`.
         """
         height, width = views.cameras.size
         multiple = self.multiple(self.config)

@@ -1,8 +1,8 @@
-"""Supervision of both depths of DepthSplat: the same Gaussians, placed at either depth.
+"""Supervision of DepthSplat's coarse and final depths: the same Gaussians are placed at each.
 
-The decoder layer `mvsplat/exchange` exchanges the depths: the Gaussians of layer 1 have the coarse
-depth, those of layer 2 the final one. `mvsplat/decayed` weighs the layers. `mvsplat/depth_error`
-measures depths.
+With two decoder layers `mvsplat/exchange`, the Gaussians of layer 1 have the coarse depth, and the
+Gaussians of layer 2 the final depth. `mvsplat/decayed` sets the weights of the layers in the
+objective. The metric `mvsplat/depth_error` measures errors of depth.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,33 +17,34 @@ from qgs.types import ImageMemory, QueryState
 
 
 class Exchange(DecoderLayer):
-    """Decoder layer that exchanges a query's first and last number: its depth and the other one.
+    """Decoder layer that exchanges a query's first and last feature: coarse and final depth.
 
-    The encoder needs `coarse_depth: true`. An even number of layers ends with the final depth.
+    The first feature is the depth at which the Gaussian is placed. The encoder needs
+    `coarse_depth: true`. With an even number of these layers, the last one has the final depth.
     """
 
     name = "exchange"
     reads_layer_scale = False
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Exchange the numbers, and return the memory unchanged."""
+        """Return queries with exchanged depths, and the memory unchanged."""
         # The depth in use is first, the other one last.
         own, rest, other = state.features.tensor_split([1, state.features.shape[-1] - 1], -1)
         return state.replace(features=torch.cat([other, rest, own], -1)), memory
 
 
 class DecayedSupervision(LayerSupervision):
-    """Supervision in which each layer weighs `decay` times the next; weights add up to 1.
+    """Supervision in which the weight of each layer is `decay` times that of the next layer.
 
-    The released code does not divide by the sum, which is 1.9 for two depths. A common factor of
-    all gradients does not matter to Adam, but it does to clipping.
+    Weights add up to 1. In the released code their sum is 1.9 for two depths. This factor of all
+    gradients does not affect Adam, but it affects gradient clipping.
     """
 
     name = "decayed"
 
     class Config(LayerSupervision.Config):
         decay: float = Field(default=0.9, gt=0, le=1)
-        """Weight of a layer divided by the weight of the next one."""
+        """Weight of a supervised layer, divided by the weight of the next supervised layer."""
 
     config: Config
 
@@ -54,7 +55,7 @@ class DecayedSupervision(LayerSupervision):
 
 
 class DepthError(Metric):
-    """AbsRel: mean of |z - true z| / true z over pixels with a known depth."""
+    """AbsRel: mean of |z - true z| / true z over pixels with a known true depth z."""
 
     name = "depth_error"
     definition = "|rendered - true| / true camera-frame z, mean over known pixels of all views"
@@ -62,7 +63,10 @@ class DepthError(Metric):
     column = Column("AbsRel", "lower")
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return one number for each pixel with a true depth; 1 if nothing is rendered there."""
+        """Return |z - true z| / true z of each pixel with a known true depth.
+
+        It is 1 if nothing is rendered there.
+        """
         assert given.depth is not None
         assert given.true_depth is not None
         # Zero means that there is no measurement.

@@ -1,6 +1,6 @@
-"""Small convolutional networks, and a U-Net with attention over the tokens of all views.
+"""Small convolutional networks, and a U-Net with attention over the pixels of all views.
 
-The U-Net is that of latent diffusion without the time.
+The U-Net is that of latent diffusion, without the embedding of time.
 """
 
 from collections.abc import Sequence
@@ -17,36 +17,36 @@ Padding: TypeAlias = Literal["zeros", "replicate"]
 
 
 def conv3(inputs: int, outputs: int, padding: Padding = "zeros") -> nn.Conv2d:
-    """Make a 3x3 convolution that keeps height and width."""
+    """Make a 3 x 3 convolution that keeps height and width."""
     return nn.Conv2d(inputs, outputs, 3, padding=1, padding_mode=padding)
 
 
 def two_convolutions(
     inputs: int, hidden: int, outputs: int, padding: Padding = "zeros"
 ) -> nn.Sequential:
-    """Make a 3x3 convolution, GELU and a 3x3 convolution."""
+    """Make a sequence of a 3 x 3 convolution, a GELU and a 3 x 3 convolution."""
     return nn.Sequential(conv3(inputs, hidden, padding), nn.GELU(), conv3(hidden, outputs, padding))
 
 
 def zeroed(module: nn.Module) -> nn.Module:
-    """Set all parameters of `module` to zero, so that it adds nothing at first, and return it."""
+    """Set all parameters of `module` to zero, so that its first output is zero, and return it."""
     for parameter in module.parameters():
         nn.init.zeros_(parameter)
     return module
 
 
 def resized(x_BCHW: Tensor, size: Sequence[int]) -> Tensor:
-    """Resize bilinearly, with the centres of corner pixels in place (align_corners)."""
+    """Resize maps bilinearly to `size` (H, W), with torch's `align_corners`."""
     return F.interpolate(x_BCHW, tuple(size), mode="bilinear", align_corners=True)
 
 
 def group_norm(width: int) -> nn.GroupNorm:
-    """Make a norm with 8 groups, or 4 if `width` is not a multiple of 8."""
+    """Make a GroupNorm with 8 groups, or with 4 if 8 does not divide `width`."""
     return nn.GroupNorm(8 if width % 8 == 0 else 4, width)
 
 
 class OverViews(nn.Sequential):
-    """Sequence that passes the number of views to its U-Nets and attentions."""
+    """Sequence of modules that passes the number of views to those modules that need it."""
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
         for module in self:
@@ -56,7 +56,10 @@ class OverViews(nn.Sequential):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions and a skip, with a norm before each (`pre_norm`) or after each."""
+    """Residual block of two convolutions.
+
+    pre_norm: put a norm before each convolution; with False, after each.
+    """
 
     def __init__(self, inputs: int, outputs: int, pre_norm: bool) -> None:
         super().__init__()
@@ -78,7 +81,10 @@ class ResidualBlock(nn.Module):
 
 
 class ViewAttention(nn.Module):
-    """Attention over the tokens of all views, with heads of 32 channels and no positions."""
+    """Attention over the pixels of all views, with heads of 32 channels.
+
+    There is no embedding of positions.
+    """
 
     def __init__(self, width: int, pre_norm: bool) -> None:
         super().__init__()
@@ -89,7 +95,7 @@ class ViewAttention(nn.Module):
         zeroed(self.proj_out if pre_norm else self.norm)
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
-        """Return maps (B V, C, H, W) that have read all `views` views of their scene."""
+        """Return maps (B V, C, H, W) after attention to all V = `views` maps of their scene."""
         x_NCT = x_NCHW.flatten(2)
         raw_NCT = self.qkv(self.norm(x_NCT) if self.pre_norm else x_NCT)
         # Rows of `qkv` are ordered head by head: q, k, v of the first head, then of the second ...
@@ -102,7 +108,7 @@ class ViewAttention(nn.Module):
 
 
 class Downsample(nn.Module):
-    """Convolution 3x3 with stride 2."""
+    """3 x 3 convolution with stride 2."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -113,7 +119,7 @@ class Downsample(nn.Module):
 
 
 class Upsample(nn.Module):
-    """Resizing to twice the size (nearest neighbours), then a 3x3 convolution."""
+    """Resizing to twice the size by nearest neighbours, then a 3 x 3 convolution."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -124,10 +130,10 @@ class Upsample(nn.Module):
 
 
 class UNet(nn.Module):
-    """U-Net with one residual block per level down and two per level up.
+    """U-Net with one residual block per level on the way down and two on the way up.
 
-    It maps (B V, C, H, W) to the same shape. Only the residual blocks of the lowest level are
-    followed by attention. H and W must be multiples of 2 ** (levels - 1).
+    It maps (B V, C, H, W) to the same shape. On the lowest level, attention follows each of these
+    blocks. H and W must be multiples of 2 ** (levels - 1).
     """
 
     def __init__(self, width: int, levels: int, pre_norm: bool) -> None:
@@ -157,7 +163,7 @@ class UNet(nn.Module):
             self.out = nn.Sequential(final, group_norm(width), nn.SiLU())
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
-        """Return maps like `x_NCHW`, which has `views` views of each scene, scene by scene."""
+        """Return maps of the same shape. x: V = `views` maps of each scene, scene by scene."""
         skips = []
         for module in self.input_blocks:
             x_NCHW = module(x_NCHW, views)

@@ -1,4 +1,4 @@
-"""Multi-view transformer of GMFlow and UniMatch: attention in 2 x 2 windows of all views."""
+"""Multi-view transformer with attention in 2 x 2 windows of the views (GMFlow, UniMatch)."""
 
 import math
 
@@ -9,15 +9,18 @@ from torch import Tensor, nn
 
 LAYERS = 6
 SPLIT = 2
-"""Number of windows along each side of a map of any size."""
+"""Number of windows along each side of a map. Windows grow with the map."""
 EXPANSION = 4
 TEMPERATURE = 10_000.0
 MASKED = -100.0
-"""Number added to logits between parts of a shifted window that are not adjacent (Swin)."""
+"""Number added to logits of pixels in a shifted window that are not adjacent in the map (Swin)."""
 
 
 def positions(width: int, rows: int, columns: int, device: torch.device) -> Tensor:
-    """Return the sine embedding (D, rows, columns) of places in a window (DETR), y before x."""
+    """Return the sine embedding (D, rows, columns) of positions in a window (DETR).
+
+    The first half of the channels embeds y, the second half x.
+    """
     half = width // 2
     index_C = torch.arange(half, device=device)
     frequency_C = TEMPERATURE ** (-2 * (index_C // 2) / half)
@@ -34,7 +37,7 @@ def positions(width: int, rows: int, columns: int, device: torch.device) -> Tens
 
 
 def with_positions(x_BVCHW: Tensor) -> Tensor:
-    """Return features plus the `positions` inside each window."""
+    """Add the embedding of the position inside each window to the features."""
     width, height, columns = x_BVCHW.shape[2:]
     # Positions repeat in each window, because attention sees one window at a time.
     window = positions(width, height // SPLIT, columns // SPLIT, x_BVCHW.device).to(x_BVCHW)
@@ -42,9 +45,10 @@ def with_positions(x_BVCHW: Tensor) -> Tensor:
 
 
 def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
-    """Return numbers (4, L, L) for the logits of windows of a map rolled by half a window.
+    """Return the numbers (4, L, L) to add to logits when the map is rolled by half a window.
 
-    They are MASKED between parts that only the roll made adjacent, and 0 otherwise.
+    A rolled window may hold pixels from opposite edges of the map. Between them the number is
+    MASKED; otherwise it is 0. L is the number of pixels in each of the four windows.
     """
 
     def pieces(size: int) -> Tensor:
@@ -59,14 +63,17 @@ def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
 
 
 def in_windows(x_BVHWC: Tensor, shift: tuple[int, int]) -> Tensor:
-    """Roll (B, V, H, W, C) by minus `shift` and cut it into windows (B, V, 4, L, C)."""
+    """Roll maps (B, V, H, W, C) by minus `shift` (rows, columns), and cut them into windows.
+
+    Returns (B, V, 4, L, C), with L the number of pixels in a window.
+    """
     if any(shift):
         x_BVHWC = x_BVHWC.roll((-shift[0], -shift[1]), (2, 3))
     return rearrange(x_BVHWC, "n v (a h) (b w) c -> n v (a b) (h w) c", a=SPLIT, b=SPLIT)
 
 
 def out_of_windows(x_BVWLC: Tensor, size: tuple[int, int], shift: tuple[int, int]) -> Tensor:
-    """Invert `in_windows` for a map of `size`."""
+    """Invert `in_windows`: join windows to maps (B, V, H, W, C) of `size` (H, W)."""
     pattern = "n v (a b) (h w) c -> n v (a h) (b w) c"
     x_BVHWC = rearrange(x_BVWLC, pattern, a=SPLIT, b=SPLIT, h=size[0] // SPLIT)
     return x_BVHWC.roll(shift, (2, 3)) if any(shift) else x_BVHWC
@@ -75,8 +82,9 @@ def out_of_windows(x_BVWLC: Tensor, size: tuple[int, int], shift: tuple[int, int
 class Attention(nn.Module):
     """Attention with one head and no biases: x + message, with message = LN(merge(attention)).
 
-    With `mlp`, it is x + LN(MLP([x, message])). The MLP is W2 gelu(W1 x) with widths 2 D, 8 D, D
-    and no biases. There is no norm before attention.
+    LN is a LayerNorm and merge a linear layer. If `mlp` is true, the result is instead
+    x + LN(MLP([x, message])), with an MLP of widths 2 D, 8 D and D, GELU and no biases. There is no
+    norm before attention.
     """
 
     def __init__(self, width: int, mlp: bool) -> None:
@@ -103,7 +111,10 @@ class Attention(nn.Module):
         neighbours_BVJ: Tensor | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """Return x (B, V, 4, L, C) after each view read `source` of itself or its neighbours."""
+        """Return x (B, V, 4, L, C) after attention to windows of `source`.
+
+        Each view reads its own windows, or those of the views `neighbours` (B, V, J) if given.
+        """
         q = self.q_proj(x_BVWLC)
         k = self.k_proj(source_BVWLC)
         v = self.v_proj(source_BVWLC)
@@ -123,13 +134,16 @@ class Attention(nn.Module):
 
 
 def _of_neighbours(x_BVWLC: Tensor, neighbours_BVJ: Tensor) -> Tensor:
-    """Return windows of each view's neighbours (B, V, 4, L J, C); the view changes fastest."""
+    """Return the windows of each view's J neighbours (B, V, 4, L J, C).
+
+    The J pixels at the same position follow each other.
+    """
     scenes = torch.arange(len(x_BVWLC), device=x_BVWLC.device)[:, None, None]
     return rearrange(x_BVWLC[scenes, neighbours_BVJ], "n v j w l c -> n v w (l j) c")
 
 
 class Layer(nn.Module):
-    """Self-attention without an MLP, then cross-attention to other views with an MLP."""
+    """Transformer layer: self-attention, then cross-attention to other views and an MLP."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -143,16 +157,20 @@ class Layer(nn.Module):
 
 
 class WindowTransformer(nn.Module):
-    """Six layers over the maps of all views; every second one shifts windows by half a window."""
+    """Transformer of six layers over the maps of all views.
+
+    Every second layer shifts its windows by half a window.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.layers = nn.ModuleList(Layer(width) for _ in range(LAYERS))
 
     def forward(self, x_BVCHW: Tensor, neighbours_BVJ: Tensor) -> Tensor:
-        """Return maps (B, V, C, H, W) from maps with positions.
+        """Return updated maps (B, V, C, H, W).
 
-        neighbours_BVJ: the views that each view reads.
+        x: maps with embedded positions. neighbours: indices (B, V, J) of the views that each view
+        reads.
         """
         size = (x_BVCHW.shape[-2], x_BVCHW.shape[-1])
         shifted = (size[0] // SPLIT // 2, size[1] // SPLIT // 2)
