@@ -40,7 +40,10 @@ class OffsetOptions(ComponentConfig):
 
 
 class AnchorOffsetCenters(Centers):
-    """Gaussian means at mu + posact(offset), with mu the anchor's centre."""
+    """Gaussian means at mu + posact(offset), with mu the anchor's centre.
+
+    posact(t) is sign(t) (exp|t| - 1).
+    """
 
     name = "anchor_offset"
     reads = CENTER_FIELD
@@ -52,7 +55,7 @@ class AnchorOffsetCenters(Centers):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report limits that have no effect because posact is not used."""
+        """Report `input_limit` and `output_limit` without effect because `offset` is linear."""
         if config.offset == "linear":
             yield from without_effect(config, ("input_limit", "output_limit"), "`offset` is linear")
 
@@ -64,7 +67,7 @@ class AnchorOffsetCenters(Centers):
 class RadiusScaledCenters(AnchorOffsetCenters):
     """Gaussian means at mu + r posact(offset), with centre mu and radius r of the anchor.
 
-    This is equation (7) of the plugin's README.
+    posact(t) is sign(t) (exp|t| - 1). This is equation (7) of the plugin's README.
     """
 
     name = "radius_scaled"

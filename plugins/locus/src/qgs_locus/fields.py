@@ -35,8 +35,7 @@ class RadiusOptions(ComponentConfig):
 def radius_field(options: RadiusOptions) -> Fields:
     """Return the field of raw radii rho (B, N, 1).
 
-    Its encoding states the options, so that a recipe is refused if its components have different
-    ones.
+    Its encoding states the options. So a recipe is refused if the options of its components differ.
     """
     reading = {
         "floor": f"radius = max(softplus(x), {options.radius_min:g})",

@@ -104,6 +104,6 @@ class RayBias(AttentionBias):
 
 
 def clamped(bias_nM: Tensor, lower_n1: Tensor) -> Tensor:
-    """Return max(bias, lower). Where `lower` is returned, it gets the gradient."""
+    """Return max(bias, lower). Where the maximum is `lower`, the gradient goes to `lower`."""
     # The condition is false for NaN, so that NaN stays.
     return torch.where(bias_nM <= lower_n1, lower_n1, bias_nM)

@@ -16,8 +16,9 @@ from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, radius_field
 class AnchorRefinement(Refinement):
     """Update of anchors after each layer: mu += posact(MLP_mu(x)), rho += MLP_rho(x).
 
-    mu is the anchor's centre, rho its raw radius, x the query's features. All layers share the two
-    MLPs. This is equation (6) of the plugin's README.
+    mu is the anchor's centre, rho its raw radius, x the query's features. posact(t) is
+    sign(t) (exp|t| - 1). All layers share the two MLPs. This is equation (6) of the plugin's
+    README.
     """
 
     name = "refine"

@@ -50,7 +50,7 @@ class AnchorAwareSelfAttention(SelfAttention):
         temperature: float = Field(default=10_000.0, gt=0)
         """Approximate ratio of the longest to the shortest wavelength of the sines."""
         divisor_eps: float = Field(default=1e-6, ge=0)
-        """Number that is added to the divisor of each frequency (LocusGS release)."""
+        """Small number that is added to the divisor of each sine's argument (LocusGS release)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
         """Number that every LayerNorm adds to the variance."""
 

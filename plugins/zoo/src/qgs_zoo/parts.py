@@ -101,7 +101,7 @@ def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
     share = 1 / len(outcomes)
     # Of two equal names, the log would lose one.
     if taken := sorted(first.terms.keys() & terms.keys()):
-        raise ValueError(f"the recipe's losses have terms {taken} already; rename the others")
+        raise ValueError(f"the recipe's losses have terms {taken} already; rename these losses")
     judged = {n: share * _sum(o.terms[n] for o in outcomes) for n in first.terms}
     signs = {n: share * _sum(o.signs[n] for o in outcomes) for n in first.signs}
     # The maximum, because a mean would hide a single collapsed pass.

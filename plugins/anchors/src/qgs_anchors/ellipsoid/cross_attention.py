@@ -14,9 +14,9 @@ from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 class EllipsoidCrossAttention(RayBiasedCrossAttention):
     """Attention `locus/ray_biased` with an ellipsoid instead of a ball around the anchor's centre.
 
-    Along each axis of the ellipsoid, distances from the centre to rays are measured in its radius
-    on that axis. Options have the same meaning; `sigma_sq_min` bounds (sigma0 r)^2 on each axis.
-    With `bandwidth: fixed` the ellipsoid has no effect.
+    The distance from the centre to a ray is measured in radii of the ellipsoid: along each axis, in
+    the radius of that axis. Options mean the same as in `locus/ray_biased`; `sigma_sq_min` bounds
+    (sigma0 r)^2 on each axis. With `bandwidth: fixed` the ellipsoid has no effect.
     """
 
     name = "ray_biased"

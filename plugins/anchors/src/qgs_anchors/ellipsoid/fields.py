@@ -52,8 +52,8 @@ def anchor_axes(state: QueryState, options: RadiusOptions) -> Tensor:
 def turned(quats: Tensor, turn: Tensor) -> Tensor:
     """Turn `quats` (..., 4) about world axes by `turn` (..., 3), and return unit quaternions.
 
-    The axis of the rotation is `turn` and its angle 2 atan(|turn| / 2): about |turn| radians for
-    small ones, and always less than 180 degrees. So turn / 2 is its Gibbs vector (Cayley
+    The rotation has the axis `turn` and the angle 2 atan(|turn| / 2). Small angles are about |turn|
+    radians; 180 degrees are never reached. So turn / 2 is the Gibbs vector of the rotation (Cayley
     transform).
     """
     small = torch.cat([torch.ones_like(turn[..., :1]), turn / 2], -1)

@@ -15,9 +15,9 @@ from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape
 class EllipsoidHead(GaussianHead):
     """Head `qgs/gaussian_head` with rotations and scales relative to the anchor's ellipsoid.
 
-    A Gaussian's rotation is followed by the anchor's. Its scale along an axis is multiplied by the
-    radius of the ellipsoid in that direction, 1 / |u / r|. Here u is the unit vector of the axis in
-    the anchor's frame, and r are the three radii.
+    A Gaussian's rotation is followed by the anchor's rotation. Its scale along an axis is
+    multiplied by the radius of the ellipsoid in that direction. This radius is 1 / |u / r|, with u
+    the unit vector of the axis in the anchor's frame, and r the three radii.
     """
 
     name = "gaussian_head"
@@ -55,7 +55,7 @@ def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
 class AxisScaledCenters(RadiusScaledCenters):
     """Gaussian means at mu + R diag(r) posact(offset), for ellipsoidal anchors.
 
-    An anchor has the centre mu, the rotation R and the radii r.
+    An anchor has the centre mu, the rotation R and the radii r. posact(t) is sign(t) (exp|t| - 1).
     """
 
     name = "axis_scaled"

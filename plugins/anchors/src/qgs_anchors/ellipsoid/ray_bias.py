@@ -25,18 +25,18 @@ UPWARD = (0.0, 0.0, 1.0)
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
     """Return moments, directions and unit directions of rays (B, M, 6) as rows (B, 9, M).
 
-    direction_eps: least length |d| of a direction by which its ray is divided. A shorter direction
-    d stays shorter than 1, but its unit direction has length 1.
+    direction_eps: least length |d| of a direction by which its moment and direction are divided.
     """
     m_BM3, d_BM3 = normalised_rays(rays_BM6, direction_eps)
     return torch.cat([m_BM3, d_BM3, unit(d_BM3, UPWARD)], -1).mT.contiguous()
 
 
 class EllipsoidBias(AttentionBias):
-    """Bias gamma * max(b, bias_min), with the b of ellipsoids and rays of this module.
+    """Bias gamma * max(b, bias_min) between ellipsoidal anchors and image rays.
 
     Each query has the anchor's centre mu, the rows of cof(W) and of W, gamma / 2 and
     gamma * bias_min. Each token has moment m, direction d and unit direction d / |d| of its ray.
+    The docstring of this module defines b, W and cof(W).
     """
 
     @classmethod

@@ -34,7 +34,10 @@ def _nine(row, first):
 
 @kernel
 def _moment(mu, t, j):
-    """Return m - mu x d, with moment m and direction d of token j, and `t` the rows of tokens."""
+    """Return m - mu x d, the moment of ray j around the point mu.
+
+    t: rows of all tokens, with moments m and directions d of rays.
+    """
     return (
         t[0, j] - mu[1] * t[5, j] + mu[2] * t[4, j],
         t[1, j] - mu[2] * t[3, j] + mu[0] * t[5, j],
@@ -44,9 +47,10 @@ def _moment(mu, t, j):
 
 @kernel
 def write(queries, tokens, out):
-    """Write the bias max(-factor |cof(W) (m - mu x d)|^2 / |W u|^2, lower) to `out`.
+    """Write the bias max(-factor s, lower) to `out`, with s = |cof(W) (m - mu x d)|^2 / |W u|^2.
 
-    u is d / |d|, the unit direction.
+    s is the squared distance of anchor and ray in the metric of the ellipsoid. u is the ray's unit
+    direction d / |d|.
     """
     for n in range(queries.shape[0]):
         q = queries[n]

@@ -1,4 +1,4 @@
-"""`landmark/footprint`, `landmark/colored`: Gaussians with first places and colours of pixels.
+"""`landmark/footprint`, `landmark/colored`: Gaussians that start with rays and colours of pixels.
 
 `landmark/refine`: LocusGS's update of anchors, with steps in radii along the camera's axes.
 """
@@ -41,7 +41,8 @@ class FootprintCenters(RadiusScaledCenters):
     mu and r are centre and radius of the anchor. A footprint is the part of a photo that a query
     stands for; each of its cells has a Gaussian. (u, v) is the centre of that cell relative to the
     centre of the footprint, in units of a side: the root of the footprint's area. If the anchor's
-    radius is one side, an offset of 0 puts the Gaussian on the ray of its cell.
+    radius is one side, an offset of 0 puts the Gaussian on the ray of its cell. posact(t) is
+    sign(t) (exp|t| - 1).
     """
 
     name = "footprint"

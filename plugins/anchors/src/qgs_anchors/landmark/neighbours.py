@@ -14,7 +14,7 @@ from qgs.types import QueryState
 MAX_PAIRS = 1 << 22
 """Largest number of distances in memory at once (16 MiB in float32)."""
 PLACE = 5
-"""Numbers of a relative position: difference over reach (3), its length, log of the reach."""
+"""Numbers of a relative position: vector divided by the reach (3), its length, log of the reach."""
 EPS = 1e-6
 
 
@@ -64,7 +64,7 @@ class NeighbourAttention(SelfAttention):
         )
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        """Return the attention of `queries` to all queries, with weight 0 where not a neighbour."""
+        """Return the attention of `queries` to all queries: 0 for all but their neighbours."""
         index_BNk, _, bias_BhNk = self._near(state)
         q_BhNd, k_BhNd, _ = self.attention.project(self.norm(state.features))
         chosen = bias_BhNk[:, :, queries]
@@ -73,9 +73,9 @@ class NeighbourAttention(SelfAttention):
         return attention_weights(q_BhNd[:, :, queries], k_BhNd, hidden.scatter(-1, index, chosen))
 
     def _near(self, state: QueryState) -> tuple[Tensor, Tensor, Tensor]:
-        """Return neighbours (B, N, k), and their relative positions with these positions' logits.
+        """Return neighbours (B, N, k), their relative positions (B, N, k, 5), and a bias.
 
-        Positions are (B, N, k, 5) and logits (B, h, N, k).
+        The bias (B, h, N, k) of attention logits is computed from the positions.
         """
         index_BNk, seen_BNk = nearest(state[CENTER], self.config.count, state.mask)
         place_BNkP = relative_places(state[CENTER], index_BNk, seen_BNk)

@@ -55,20 +55,22 @@ from qgs_anchors.landmark.places import (
 from qgs_anchors.landmark.sweep import mismatch
 
 SHARPNESS = 300.0
-"""Initial 1 / t of a sweep. A difference of 1/300 in RGB makes a depth e times less likely."""
+"""Initial factor of colour differences in a sweep's logits.
+
+A depth at which the difference is larger by 1/300 (of RGB in [0, 1]) is e times less likely."""
 UNSEEN = 0.2
-"""Initial value of the difference in RGB that counts for depths that no other photo sees."""
+"""Initial value of the learned colour difference for depths that no other photo sees."""
 SAMPLES = 4
 """Number of samples along each side of the square in which photos are compared."""
 
 
 class ObservedQueries(Queries):
-    """Queries for points of the photos: each starts with the token and on the ray of its point.
+    """Queries for points of photos: each starts with the token at its point, on the ray through it.
 
     The depth of the anchor along the camera's axis is z = near^w far^(1 - w), with w the sigmoid of
     an MLP of the token. With a sweep over D depths, w is the mean of D values from 0 to 1 with
     weights softmax(MLP(token) - c / t). The cost c of a depth is the difference in colour between
-    this photo and the other photos there; t is learned.
+    this photo and the other photos at that depth; t is learned.
 
     A query's footprint is the part of its photo that it stands for, a tile or a square. The side of
     a footprint is the root of its area. The initial radius of the anchor is `radius` times this
@@ -100,8 +102,8 @@ class ObservedQueries(Queries):
         """D, the number of depths at which photos are compared to find that of an anchor. Null
         predicts the depth from the token alone."""
         window: float = Field(default=1.5, gt=0)
-        """Side of the squares of photos that a sweep compares. The unit is the root of 1/S of the
-        footprint's area."""
+        """Side of the squares of photos that a sweep compares. The unit is sqrt(A / S), with A the
+        area of the query's footprint and S the option `tokens`."""
         radius: float = Field(default=1.0, gt=0)
         """Initial radius of an anchor. The unit is the side of its footprint, measured at the
         anchor's depth."""

@@ -17,7 +17,7 @@ from qgs.types import Cameras
 EPS = 1e-4
 """Tolerance of comparisons, in pixels or in logarithms of aspect ratios."""
 MOST_OFF = 0.35
-"""Largest difference of the logarithms of a tile's aspect and the wanted one: a factor of 1.4.
+"""Largest |log(aspect of a tile / wanted aspect)| at which tiles are used: a factor of 1.4.
 
 With tiles that were off by a factor of 2, PSNR was worse than with rows: 20.1 against 20.3 dB, for
 untrained models with 512 points and 4 photos in 32 validation rooms."""

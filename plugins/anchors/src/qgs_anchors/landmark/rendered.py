@@ -66,7 +66,7 @@ class RenderedFeedback(Feedback):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report more layers than the decoder has, `least` above `rounds`, and a bad `shrink`."""
+        """Report too many `layers`, `least` above `rounds`, and sizes not divided by `shrink`."""
         depth = context.dims.depth
         size = context.image_size
         if config.layers > depth:

@@ -28,7 +28,11 @@ G = tl.constexpr(6)
 
 @jit
 def _moment(queries, tokens, step):
-    """Return the three coordinates of mu x d - m for n queries and m tokens, each (n, m)."""
+    """Return the coordinates of vectors whose length is the distance of anchor and ray.
+
+    They are three tensors (n, m). The vector is mu x d - m, with mu the anchor's centre, and m and
+    d the moment and direction of the ray.
+    """
     x = tl.load(queries)
     y = tl.load(queries + 1)
     z = tl.load(queries + 2)
@@ -43,7 +47,7 @@ def _moment(queries, tokens, step):
 
 @jit
 def _bias(queries, tokens, step):
-    """Return the bias max(-factor |mu x d - m|^2, lower) of n queries and m tokens, (n, m)."""
+    """Return the bias max(-factor D^2, lower), (n, m), with D the distance of anchor and ray."""
     e0, e1, e2 = _moment(queries, tokens, step)
     bias = -tl.load(queries + 3) * (e0 * e0 + e1 * e1 + e2 * e2)
     lower = tl.load(queries + 4)
@@ -54,7 +58,8 @@ def _bias(queries, tokens, step):
 def _bias_gradients(queries, tokens, step, gradient, sums):
     """Return `sums`, five tensors (n,), plus the gradients of the queries' five numbers.
 
-    gradient: of the bias (n, m). With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e.
+    gradient: of the bias (n, m). With e = mu x d - m, the result of `_moment`, the gradient of
+    |e|^2 to mu is 2 d x e.
     """
     e0, e1, e2 = _moment(queries, tokens, step)
     d0 = tl.load(tokens + 3 * step)

@@ -14,7 +14,10 @@ _TWO = np.float32(2)
 
 @kernel
 def write(queries, tokens, out):
-    """Write the bias max(-factor |mu x d - m|^2, lower) of queries and tokens to `out`."""
+    """Write the bias max(-factor D^2, lower) to `out`, with D = |mu x d - m|.
+
+    D is the distance of the anchor's centre mu from the ray with moment m and direction d.
+    """
     m0 = tokens[0]
     m1 = tokens[1]
     m2 = tokens[2]
@@ -41,7 +44,8 @@ def write(queries, tokens, out):
 def gradients(queries, tokens, gradient, out):
     """Write gradients of the queries' five numbers to `out`.
 
-    gradient: of the bias. With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e.
+    gradient: of the bias. The bias depends on |e|^2 with e = mu x d - m, whose gradient to the
+    anchor's centre mu is 2 d x e.
     """
     m0 = tokens[0]
     m1 = tokens[1]

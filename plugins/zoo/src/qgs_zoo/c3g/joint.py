@@ -73,7 +73,7 @@ class JointLayer(DecoderLayer):
 
 
 CHANNELS = (3, 1, 3, 4, 3)
-"""Channels per Gaussian: position, opacity, scale, rotation, harmonic of degree 0 (release)."""
+"""Channels per Gaussian: position, opacity, scale, rotation, colour (C3G release)."""
 
 
 class C3GHead(Head):
@@ -85,7 +85,7 @@ class C3GHead(Head):
         gaussians_per_query: int = Field(default=1, ge=1)
         """K, the number of Gaussians decoded from each query."""
         scale_unit: float = Field(default=0.001, gt=0)
-        """Factor of the softplus of raw scales, world units."""
+        """Factor of scales, world units: a scale is `scale_unit` times softplus(raw scale)."""
         quat_eps: float = Field(default=1e-8, gt=0)
         """Least length by which a raw quaternion is divided to normalise it."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)

@@ -28,7 +28,7 @@ GRID = 37
 EPS = 1e-6
 """Number that every LayerNorm adds to the variance."""
 SHIFT = 0.1
-"""Number added to the patches along a side when position embeddings are resized (release)."""
+"""Number added to the number of patches when position embeddings are resized, as in DINOv2."""
 
 
 class VitConfig(ComponentConfig):

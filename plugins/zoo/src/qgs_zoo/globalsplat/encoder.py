@@ -91,7 +91,7 @@ def _tokens(embedding: nn.Conv2d, images: Tensor) -> Tensor:
 def lens(cameras: Cameras) -> Tensor:
     """Return (..., 4): logarithms of focal lengths, then principal point of cameras.
 
-    Their unit is the width of the image for x, and its height for y.
+    The unit along x is the width of the image, and along y its height.
     """
     height, width = cameras.size
     sides = constant([width, height], cameras.intrinsics)

@@ -111,11 +111,11 @@ FIX = "raise views.inputs, or choose `objective: {type: qgs/one_pass}`"
 
 
 class TwoPasses(Objective):
-    """Objective of two predictions, each from the first, the last and every second view between.
+    """Objective of two predictions from different input views, which should agree.
 
-    The two share only the first and the last view. Both get the recipe's losses. In addition, the
-    alpha and depth of their renderings from the target cameras should agree: each is pulled towards
-    the other, which gets no gradient from this.
+    Both read the first and the last view. Of the views between, one prediction reads every second
+    view, and the other prediction reads the rest. Both get the recipe's losses. Two more losses
+    compare alpha and depth of both renderings from the target cameras.
     """
 
     name = "two_passes"
@@ -173,10 +173,10 @@ def subset(count: int, part: int) -> list[int]:
 
 @full_precision
 def disagreement(one: Tensor, other: Tensor) -> Tensor:
-    """Return the mean of |one - other|, 0-d, whose gradient pulls each towards the fixed other.
+    """Return the mean of |one - other|, 0-d, with gradients as if each side saw the other fixed.
 
-    It is the mean of two equal numbers, in which `one` or `other` gets no gradient: the symmetric
-    stop-gradient of the paper.
+    It is the mean of two equal terms. In the first, `other` gets no gradient; in the second, `one`
+    gets none. This is the symmetric stop-gradient of the paper.
     """
     # If neither side were held fixed, both would drift to the blurred mean.
     held = (one - other.detach()).abs().mean(), (other - one.detach()).abs().mean()

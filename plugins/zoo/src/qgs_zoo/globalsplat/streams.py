@@ -34,8 +34,8 @@ TEXTURE_FIELD: Fields = {TEXTURE: FieldSpec(("D",))}
 class SlotQueries(LearnedQueries):
     """N learned tokens, of which the last `extra` are masked and decode no Gaussians.
 
-    The geometry and the texture of a token each start as a LayerNorm and a linear layer of it, with
-    separate weights.
+    The initial geometry of a token is computed from it by a LayerNorm and a linear layer, and its
+    initial texture by another LayerNorm and another linear layer.
     """
 
     name = "slots"
@@ -86,7 +86,7 @@ class SlotQueries(LearnedQueries):
 class Round(DecoderLayer):
     """Decoder layer: cross-attention, MLP and ViT blocks in each stream, then a mixer of both.
 
-    The streams are geometry and texture of the tokens. The mixer is an MLP that updates both from
+    The streams are geometry and texture of the tokens. The mixer is an MLP that reads and updates
     both. `decoder.layer_scale` applies to cross-attention, MLP and mixer (GlobalSplat: 1e-3).
     Masked tokens decode no Gaussians, but all tokens read them, as registers.
     """

@@ -206,7 +206,7 @@ class PixelHead(Head):
         """Number of raw offsets that the head predicts for a Gaussian (paper: 1). With 3,
         `gslrm/along_rays` takes their mean. With 1, `model.centers` gets three equal offsets."""
         scale_bias: float = -2.3
-        """Number added to the logarithms of scales, whose unit is that of the world."""
+        """Number added to the logarithms of scales in world units."""
         scale_limit: float | None = -1.2
         """Largest logarithm of a scale in world units. Null means no limit."""
         opacity_bias: float = -2.0

@@ -131,9 +131,8 @@ def camera_quaternions(raw_xyzw: Tensor) -> Tensor:
 
 
 def world_quaternions(camera_xyzw: Tensor, turn_wxyz: Tensor) -> Tensor:
-    """Rotate Gaussians from the camera's frame to the world's: unit quaternions w x y z (..., 4).
+    """Convert rotations of Gaussians to unit quaternions (..., 4), w x y z, in the world's frame.
 
-    camera_xyzw: rotation of the Gaussian in the camera's frame; zeros mean none. turn_wxyz: camera
-    to world.
+    camera_xyzw: rotations in the camera's frame; zeros mean none. turn_wxyz: camera to world.
     """
     return F.normalize(quat_product(turn_wxyz, unit(camera_xyzw.roll(1, -1))), dim=-1)

@@ -38,7 +38,7 @@ class DepthSplatEncoder(SweepEncoder):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         if config.coarse_depth and config.scales == 1:
-            reason = "with one scale there is no coarse depth"
+            reason = "with `scales: 1` there is no coarse depth"
             yield Problem("coarse_depth", reason, "write false, or set scales to 2")
         if config.coarse_depth and context.dims.width in WIDTHS:
             width = context.dims.width

@@ -36,11 +36,11 @@ CHANNELS = (1, 1, 2, 3, 4)
 scales, raw quaternion x y z w in the camera's frame. Coefficients of harmonics come after them, all
 of red, then green, then blue."""
 LOG_DEPTH = 20.0
-"""Bound of |log of a depth|, so that any features give finite positions and scales."""
+"""Largest |logarithm of a depth|: larger ones are clamped, so that positions are finite."""
 
 
 WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 3, 4)}
-"""Degree of harmonics by width of the model, for widths that the numbers of a pixel fill."""
+"""Degree of harmonics by width of a model, for the widths that are just enough for a degree."""
 
 
 def degree_of(width: int) -> int:

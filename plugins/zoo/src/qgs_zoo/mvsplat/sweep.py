@@ -74,7 +74,7 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
     """Project pixels at given depths into another view: positions (N, D, h, w, 2).
 
     Positions are in the units of torch's `grid_sample`. depth: camera-frame z of pixels, world
-    units. lens: fx, fy, cx, cy of both views. pose: from this camera to the other one.
+    units. lens: fx, fy, cx, cy of both views. pose: from this view's camera to the other view's.
     """
     height, width = depth_NDhw.shape[-2:]
     fx, fy, cx, cy = (x[:, None, None] for x in lens_N4.unbind(-1))
@@ -137,7 +137,10 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Sample the other view's features at some depths at a time, then correlate: (N, D, h, w)."""
+    """Correlate features with those sampled from another view, some depths at a time.
+
+    Returns (N, D, h, w).
+    """
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))

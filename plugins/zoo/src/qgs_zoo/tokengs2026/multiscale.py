@@ -44,7 +44,7 @@ def time_features(times: Tensor, channels: int) -> Tensor:
 
 
 def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
-    """Report that `channels` encode a time if the recipe's data have no times."""
+    """Report an option `time_channels` above 0 if the data of the recipe have no times."""
     if channels and context.inputs is not None and not context.times:
         yield Problem(
             "time_channels",
@@ -118,7 +118,7 @@ class MultiscaleReadout(PatchViT):
             what = "does not exist" if last > config.depth else "leaves the blocks after it unread"
             yield Problem(
                 "blocks",
-                f"the last block that is read, {last} of a depth of {config.depth}, {what}",
+                f"the last block that is read, number {last} of {config.depth}, {what}",
                 f"set depth to {last}, or let blocks end with {config.depth}",
             )
 
