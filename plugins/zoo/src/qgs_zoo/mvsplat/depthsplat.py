@@ -108,7 +108,7 @@ class Depths(NamedTuple):
 
     depths: camera-frame z (B, V, H, W) in world units, from each sweep; only the last is corrected
     by the DPT head. confidence: largest probability in the last sweep (B V, 1, H, W). maps: tokens
-    of the ViT (B V, C, H/8, W/8). joined: maps that join them in a DPT head.
+    of the ViT (B V, C, H/8, W/8). joined: maps of other networks that join these in a DPT head.
     """
 
     depths: list[Tensor]

@@ -20,9 +20,9 @@ class DepthSplatEncoder(SweepEncoder):
     """Encoder that predicts depth and raw Gaussian of each pixel, with a plane sweep and a ViT.
 
     The ViT is pretrained. The memory has a token for each pixel. Its D numbers are those of
-    `qgs_zoo.mvsplat.pixels.CHANNELS`, then harmonics, with the pixel's colour added to the constant
-    one. D is the model's width: 38 for harmonics of degree 2 (published). A wider model has zeros
-    at the end.
+    `qgs_zoo.mvsplat.pixels.CHANNELS`, then coefficients of harmonics. The pixel's colour is added
+    to the constant coefficient. D is the model's width: 38 for harmonics of degree 2 (published).
+    A wider model has zeros at the end.
     """
 
     name = "depthsplat"
@@ -45,7 +45,9 @@ class DepthSplatEncoder(SweepEncoder):
             reason = f"the {width} numbers of a token leave none for a coarse depth"
             yield Problem("coarse_depth", reason, f"set model.width to {width + 1}")
         if config.features % (32 * config.scales):
-            reason = f"{config.features} features do not split into heads of 32 in both sweeps"
+            reason = (
+                f"{config.features} features do not split into heads of 32 channels in both sweeps"
+            )
             yield Problem("features", reason, "write a multiple of 64")
         yield from super().problems(config, context)
 

@@ -71,11 +71,13 @@ class MVSplatEncoder(SweepEncoder):
         cost_width: int = Field(default=128, ge=32, multiple_of=32)
         """Channels of the U-Net over the cost volume."""
         cost_levels: int = Field(default=3, ge=1, le=6)
-        """Levels of the U-Net over the cost volume. The lowest has attention over all views."""
+        """Number of levels of the U-Net over the cost volume. The lowest level has attention over
+        all views."""
         depth_width: int = Field(default=32, ge=32, multiple_of=32)
         """Channels of the U-Net that refines depths at full size."""
         depth_levels: int = Field(default=5, ge=1, le=8)
-        """Levels of the U-Net that refines depths. The lowest has attention over all views."""
+        """Number of levels of the U-Net that refines depths. The lowest level has attention over
+        all views."""
         cost_volume: bool = True
         """Compare views in the plane sweep. With false, zeros replace the correlations of views, so
         depths are predicted from features alone (the paper's ablation)."""

@@ -33,7 +33,7 @@ outside its image."""
 MAX_SAMPLES = 1 << 24
 """Largest number of sampled values in memory at once (64 MiB in float32)."""
 PAIRS = 40
-"""Largest number of pixels per depth for which all pairs of pixels are correlated first."""
+"""Number of pixels per depth up to which all pairs of pixels are correlated before sampling."""
 
 
 def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
