@@ -45,9 +45,7 @@ class DepthSplatEncoder(SweepEncoder):
             reason = f"the {width} numbers of a token leave none for a coarse depth"
             yield Problem("coarse_depth", reason, f"set model.width to {width + 1}")
         if config.features % (32 * config.scales):
-            reason = (
-                f"{config.features} features do not split into heads of 32 channels in both sweeps"
-            )
+            reason = f"{config.features} features do not split into heads of 32 in both sweeps"
             yield Problem("features", reason, "write a multiple of 64")
         yield from super().problems(config, context)
 
