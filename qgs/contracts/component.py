@@ -30,7 +30,7 @@ class ComponentConfig(BaseModel):
     """
 
     __component__: ClassVar["type[Component] | None"] = None
-    """Component that has these options. None for the settings of a section of a recipe."""
+    """Component class with these options. None for recipe sections such as `training`."""
 
     model_config = ConfigDict(
         # Checkpoints and hashes contain the options, so they must not change later.
@@ -47,9 +47,9 @@ class ComponentConfig(BaseModel):
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """A named tensor that one component writes and later ones read.
+    """Description of a named tensor that one component writes and later components read.
 
-    shape: the axes after the leading (batch, item) ones; a str is a symbolic size such as "D".
+    shape: sizes of the axes after the first two, batch and item; a str is a symbolic size ("D").
     frame: the coordinate frame of its numbers.
     encoding: a name for the meaning of raw numbers that could be read in several ways. Writer and
         reader must use the same one.
@@ -110,25 +110,25 @@ class Problem:
 def without_effect(
     config: ComponentConfig, options: Iterable[str], because: str
 ) -> Iterator[Problem]:
-    """Yield a problem for each of `options` that was changed although nothing reads it.
+    """Yield a problem for each of `options` that is not at its default although nothing reads it.
 
-    because: the setting in `config` that makes the option idle. Options with their default value
-    pass, because resolved recipes write them out.
+    because: the setting in `config` that disables the options. Default values are no problem,
+    because resolved recipes contain them.
     """
     for option in options:
         default = type(config).model_fields[option].get_default()
         if getattr(config, option) != default:
             # As a recipe writes it.
             word = "null" if default is None else default
-            fix = f"leave it at its default, {word}, or change what makes it idle"
+            fix = f"leave it at its default, {word}, or change the setting that disables it"
             yield Problem(option, f"`{option}` has no effect: {because}", fix)
 
 
 class Component(metaclass=ABCMeta):
     """Base of everything that a recipe selects with `type: PLUGIN/NAME`.
 
-    A slot's contract sets `slot`; a component sets `name` and nests its `Config`. Classmethods are
-    called with a valid config before anything is built.
+    The contract of a slot sets `slot`. A component sets `name` and nests a class `Config` with its
+    options. Classmethods are called with a valid config before anything is built.
 
     Rules for `forward`: The scenes of a batch are independent. It changes no inputs, parameters or
     buffers. It draws random numbers only in training, from torch's global generator. Every tensor
@@ -141,14 +141,15 @@ class Component(metaclass=ABCMeta):
     """Fields that must exist before this component runs. If they depend on options, override
     `fields_read`."""
     writes: ClassVar[Fields] = {}
-    """Fields that exist after it has run. If they depend on options, override `fields_written`."""
+    """Fields that exist after this component has run. If they depend on options, override
+    `fields_written`."""
     scheduled: ClassVar[frozenset[str]] = frozenset()
     """Numeric options that a schedule in the recipe may change from step to step. The component
     must read them from `self.config` in every call, and nowhere else."""
 
     schedules: Mapping[str, Any] = MappingProxyType({})
-    """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name. `config` holds their
-    values after `followed` steps."""
+    """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name of the option.
+    `config` holds the values of these options after `followed` training steps."""
     followed: int = 0
 
     class Config(ComponentConfig):
@@ -159,7 +160,7 @@ class Component(metaclass=ABCMeta):
         self.config = config
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Give every class a Config of its own, with a reference to the class."""
+        """Give every subclass its own Config class, with a reference to the subclass."""
         super().__init_subclass__(**options)
         # A Config stores its component, so components must not share one.
         inherited = cls.Config
@@ -184,15 +185,15 @@ class Component(metaclass=ABCMeta):
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Return problems: options that do not fit each other or the rest of the recipe."""
+        """Return the problems of options that do not fit each other or the rest of the recipe."""
         return ()
 
     def load_pretrained(self) -> None:  # noqa: B027 (most have no such files)
         """Read weights from files that options name.
 
-        Called once after the component is built. Not called on the meta device, or if a checkpoint
-        brings all weights. Raises MissingExtraError for a missing file or package; its message says
-        what to do.
+        Called once after the component is built, except on the meta device, or if a checkpoint
+        contains all weights. Raises MissingExtraError for a missing file or package; the message
+        says what to do.
         """
 
 
@@ -213,10 +214,11 @@ class ModelComponent(Component, torch.nn.Module):
         return parameter.ndim != 1
 
     def adapted(self, learned: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Return a state dict for this component, made from `learned`, which may be empty.
+        """Return a state dict for this component, made from the weights of another model.
 
-        `init_from` calls this for encoder, feedback and head. Weights that cannot be brought to
-        this component's shapes are returned as they are; loading then refuses them.
+        learned: the other model's state dict of the same slot; it may be empty. `init_from` calls
+        this for encoder, feedback and head. Weights that cannot be brought to this component's
+        shapes are returned unchanged; loading then refuses them.
         """
         return dict(learned)
 

@@ -1,4 +1,4 @@
-"""Contracts of the slots `data` (the source of scenes) and `view_sampler` (the frames to use)."""
+"""Contracts of the slots `data` (source of scenes) and `view_sampler` (choice of frames)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -23,24 +23,25 @@ Side: TypeAlias = Annotated[int, Field(ge=1)]
 class Scene(ABC):
     """The frames of one scene; images are decoded on demand.
 
-    Frames are numbered from 0, and missing images are not counted. Indices, held-out lists,
-    options, tables and messages all use this number.
+    Frames are numbered from 0, and missing images are not counted. Options, files, tables and
+    messages all use these numbers.
     """
 
     name: str
     held_out: Sequence[int] = ()
     """Frames that training never sees. Evaluation can use them as targets."""
     missing: Sequence[str] = ()
-    """Listed images that do not exist. They do not count as frames, so later frames move up."""
+    """Names of images that the data lists but that do not exist. They get no frame number."""
     times: Tensor | None = None
     """Times (F,) of the frames, float64, in any unit. None for a static scene."""
 
     @property
     @abstractmethod
     def cameras(self) -> Cameras:
-        """Cameras (F,) of all frames, for the delivered image size, in the scene's own frame.
+        """Cameras (F,) of all frames, in the coordinate frame of the data.
 
-        Poses are float64 where the data has that precision, because normalising loses digits.
+        Intrinsics are for images of the size that `images` returns. Poses are float64 where the
+        data has that precision, because the normalisation of poses loses digits.
         """
 
     @abstractmethod
@@ -48,7 +49,7 @@ class Scene(ABC):
         """Return images (len(frames), 3, H, W), float32 in [0, 1]."""
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """Return masks (len(frames), 1, H, W) in [0, 1], 1 on the object; None without masks."""
+        """Return masks (len(frames), 1, H, W), 1 on the object, 0 off it; None without masks."""
         return None
 
     def frame_name(self, frame: int) -> str:
@@ -56,11 +57,11 @@ class Scene(ABC):
         return str(frame)
 
     def label(self, frame: int) -> str:
-        """Return number and name of a frame, for messages."""
+        """Return the number and the name of a frame, as text for messages."""
         return numbered(frame, self.frame_name(frame))
 
     def stored_size(self, frame: int) -> tuple[int, int] | None:
-        """Return (H, W) of the photo as stored; None if images are made at the delivered size."""
+        """Return (H, W) of the stored photo; None if images are generated at any size."""
         return None
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
@@ -76,38 +77,38 @@ class Scene(ABC):
 
 
 class SceneSourceConfig(ComponentConfig):
-    """Options of all sources. A source adds the option `path`, the location of its data."""
+    """Options of all data sources. A source adds the option `path`, the location of its data."""
 
     image_size: tuple[Side, Side] = (64, 64)
-    """(H, W) of every delivered image, in pixels."""
+    """Size (H, W), in pixels, to which all images are brought."""
 
 
 class SceneSource(Component):
     """A collection of scenes with a training and a test split.
 
-    Opening a source reads only what it needs to list its scenes. It raises FileNotFoundError or
-    ValueError, whose message names the path and a fix. `Scene.images` decodes images.
+    The constructor reads only what it needs to list the scenes; `Scene.images` decodes images.
+    The constructor raises FileNotFoundError or ValueError; the message names the path and a fix.
     """
 
     slot: ClassVar[str] = "data"
     not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path"})
-    """Options that change no scene, image or camera, such as paths and caching. Hashes of
-    evaluation protocols leave them out."""
+    """Options that change no scene, image or camera, such as paths and caching. They are not part
+    of an evaluation protocol's hash."""
     split_options: ClassVar[frozenset[str]] = frozenset()
     """Options that only split scenes and frames into training and test. If an evaluation index
-    names scenes and frames, hashes of protocols leave these options out too."""
+    names scenes and frames, these options are not part of the evaluation protocol's hash."""
     tells_times: ClassVar[bool] = False
-    """True if scenes may have `Scene.times`. A model that reads times needs such a source; a recipe
-    with another one is refused."""
+    """True if scenes may have `Scene.times`. A recipe whose model reads times is refused if this is
+    False."""
 
     class Config(SceneSourceConfig):
-        """Options of this source; by default only the common ones."""
+        """Options of this source; by default only those of all data sources."""
 
     config: SceneSourceConfig
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Return whether the existing `path` looks like data of this source, judged by file names.
+        """Return whether file names at the existing `path` look like data of this source.
 
         `qgs reconstruct` and `qgs data` use this to open data without a recipe. Default: False.
         """
@@ -115,7 +116,10 @@ class SceneSource(Component):
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
-        """Return whether training data at `root` is or contains `path`, a scene; both absolute."""
+        """Return whether the training data at `root` contains the scene at `path`.
+
+        Both paths are absolute; they may be equal.
+        """
         # Sources with scenes in files below the root override this.
         return path == root
 
@@ -123,10 +127,10 @@ class SceneSource(Component):
     def config_for(
         cls, path: str, image_size: tuple[int, int], trained: SceneSourceConfig | None
     ) -> SceneSourceConfig:
-        """Return options that open all frames of `path` for a model trained on other data.
+        """Return options that open all frames at `path` for a model trained on other data.
 
-        trained: the options of the training data, of any source. Options that also hold for `path`
-        are copied from it.
+        trained: the options of the training data, of any source; None if unknown. Options that make
+        sense for `path` too are copied from it.
         """
         # Only the look of photos also holds for other data.
         options: dict[str, object] = {"path": path, "image_size": image_size}
@@ -137,18 +141,18 @@ class SceneSource(Component):
 
     @abstractmethod
     def scenes(self, split: Split) -> Sequence[Scene]:
-        """Return the scenes of a split; indexing must be cheap and deterministic."""
+        """Return the scenes of a split; indexing the sequence must be cheap and deterministic."""
 
     def names(self, split: Split) -> Sequence[str]:
-        """Return the names of `scenes(split)`; override it to avoid opening the scenes."""
+        """Return the names of `scenes(split)`; the default opens all scenes for their names."""
         # Correct for any source, but slow if opening a scene reads files.
         return [scene.name for scene in self.scenes(split)]
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
         """Return the indices of `scenes(split)`, grouped by storage, such as one group per file.
 
-        Training visits groups in random order, and then the scenes of each group in random order,
-        so that it reads a file once per epoch. A single group shuffles all scenes together.
+        Training visits the groups in random order, and the scenes within each group in random
+        order, so that it reads each file once per epoch. Default: one group of all scenes.
         """
         return [range(len(self.scenes(split)))]
 
@@ -156,8 +160,8 @@ class SceneSource(Component):
 class ViewSampler(Component):
     """Sampler of the input and target frames of a scene.
 
-    Sample k of a training run is a function of (seed, k). So `draw` may read only its arguments
-    and `config`, and all randomness must come from `rng`.
+    Sample number k of a training run depends only on the seed and k. So `draw` may read only its
+    arguments and `config`, and all randomness must come from `rng`.
     """
 
     slot: ClassVar[str] = "view_sampler"
@@ -168,9 +172,10 @@ class ViewSampler(Component):
     ) -> tuple[Frames, Frames]:
         """Draw input frames, ascending, and target frames; raise ValueError for too few frames.
 
-        There are at most `views.inputs` inputs, equally many in all samples of a step. Held-out
-        frames are never drawn. step: number of optimiser steps before the sample is used;
-        `qgs.contracts.schedule.END` in evaluation.
+        There are at most `views.inputs` input frames, equally many in all samples of a step.
+        Held-out frames are never drawn.
+        step: number of optimiser steps before the sample is used; `qgs.contracts.schedule.END` in
+        evaluation.
         """
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
@@ -181,5 +186,5 @@ class ViewSampler(Component):
         return []
 
     def options(self, step: int) -> Any:
-        """Return `config` with the values of scheduled options after `step` steps."""
+        """Return `config`, its scheduled options with their values after `step` training steps."""
         return at_step(self.config, self.schedules, step)

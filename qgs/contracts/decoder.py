@@ -22,12 +22,12 @@ LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 
 @dataclass(frozen=True)
 class AttentionWeights(TensorContainer):
-    """Attention of Q chosen queries to T tokens, for pictures.
+    """Attention of Q chosen queries to T tokens, for visualisation.
 
     content: (B, h, Q, T) logits from content alone, finite.
     geometry: the bias added to `content`, (B, 1, Q, T), or (B, h, Q, T) for one per head; -inf for
         masked tokens. None without a bias.
-    weights: (B, h, Q, T) softmax of the sum.
+    weights: (B, h, Q, T) softmax over the tokens of `content` + `geometry`.
     """
 
     content: Tensor
@@ -37,9 +37,9 @@ class AttentionWeights(TensorContainer):
 
 @dataclass(frozen=True)
 class LayerParts:
-    """Parts for building a decoder layer.
+    """Parts from which a decoder layer is built.
 
-    sublayers: the components, by slot, for the slots that the layer's class names.
+    sublayers: the component for each slot that the layer's class lists in `sublayers`.
     layer_scale: the option `decoder.layer_scale`.
     """
 
@@ -49,16 +49,16 @@ class LayerParts:
 
 
 class DecoderLayer(ModelComponent):
-    """Decoder layer: (QueryState, ImageMemory) -> both, as the next layer reads them.
+    """Decoder layer: (QueryState, ImageMemory) -> the state and memory for the next layer.
 
-    A layer may update features and write fields that it declares. It may return a memory with other
-    features, if image tokens change from layer to layer. It keeps the fields of the state and all
-    parts of the memory that it does not change.
+    A layer may update the features of the state and write fields that it declares in `writes`. It
+    may also return a memory with new features, if image tokens change from layer to layer. It
+    returns all other fields and parts unchanged.
 
     sublayers: the slots inside this layer, some of `cross_attention`, `self_attention` and
-        `feed_forward`. A recipe that fills another one is refused.
-    reads_layer_scale: True if the layer uses `decoder.layer_scale`. A recipe that sets it is
-        refused if no layer uses it.
+        `feed_forward`. A recipe that fills a sublayer slot not listed here is refused.
+    reads_layer_scale: True if the layer uses the option `decoder.layer_scale`. A recipe that sets
+        this option is refused if no layer uses it.
     """
 
     slot: ClassVar[str] = "layer"
@@ -70,7 +70,7 @@ class DecoderLayer(ModelComponent):
 
     @abstractmethod
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Run the layer, without the refinement."""
+        """Run the layer, without the refinement that follows it."""
 
 
 class CrossAttention(ModelComponent):
@@ -96,7 +96,7 @@ class CrossAttention(ModelComponent):
         memory: ImageMemory,
         queries: Tensor,  # (Q,) indices
     ) -> AttentionWeights | None:
-        """Return the attention weights of `queries`, for pictures; None if none."""
+        """Return the attention weights of `queries` to visualise; None if there are none."""
         return None
 
 
@@ -113,7 +113,7 @@ class SelfAttention(ModelComponent):
         """Return the update of the query features, before LayerScale."""
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights | None:
-        """Return the attention weights of `queries` (Q,), indices, for pictures; None if none."""
+        """Return the attention weights to visualise, or None. queries: indices (Q,)."""
         return None
 
 
@@ -133,7 +133,7 @@ class FeedForward(ModelComponent):
 class Refinement(ModelComponent):
     """Refinement after each layer: QueryState -> QueryState with refined fields, same features.
 
-    shared_by_layers: True if layers with equal options share one module (as in LocusGS).
+    shared_by_layers: True if all layers with equal options use the same module (as in LocusGS).
     """
 
     slot: ClassVar[str] = "refinement"
@@ -147,10 +147,11 @@ class Refinement(ModelComponent):
 class Feedback(ModelComponent):
     """Feedback: (QueryState, ImageMemory, Rendering, Views) -> state and memory of the next round.
 
-    A round renders the last layer's Gaussians from the cameras of the photos, without gradients.
-    Then the last `layers` decoder layers run again and update the state once more. The memory is
-    the one that the first of these layers read in the first pass.
+    A round renders the last layer's Gaussians from the cameras of the input photos, without
+    gradients. Then the last decoder layers run again and update the state once more. Their memory
+    is the one that the first of them read in the first pass.
 
+    layers: number of decoder layers that run again in each round.
     rounds: number of rounds in an evaluation; it may be changed on a built model.
     """
 
@@ -164,14 +165,14 @@ class Feedback(ModelComponent):
         return self.rounds
 
     def compared(self, views: Views) -> Views:
-        """Return the input photos at the size to render and compare; smaller ones are faster."""
+        """Return the input photos, scaled to the size at which a round renders."""
         return views
 
     @abstractmethod
     def forward(
         self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
     ) -> tuple[QueryState, ImageMemory]:
-        """Return the input of the first repeated layer.
+        """Return the state and memory from which the first repeated layer starts.
 
         photos: views (B, V) from `compared`, of the same shape as `rendering`.
         """

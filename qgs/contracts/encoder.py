@@ -1,4 +1,4 @@
-"""Contract of the slot `encoder`, from posed photos to image memory."""
+"""Contract of the slot `encoder`, which turns posed photos into an image memory."""
 
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ MEMORY_FIELDS: Fields = {
 
 
 def memory_fields(*names: str) -> Fields:
-    """Return some of MEMORY_FIELDS, such as `memory_fields("keys", "values")`."""
+    """Return entries of MEMORY_FIELDS by name, such as `memory_fields("keys", "values")`."""
     return {f"memory.{name}": MEMORY_FIELDS[f"memory.{name}"] for name in names}
 
 
@@ -42,7 +42,7 @@ class Encoder(ModelComponent):
     ordered_views: True if the order of the views matters. If False, permuting the views permutes
         the tokens.
     reads_cameras: True if it reads `views.cameras`. If False, it also accepts `Photos`.
-    tunable: True if it has `project`, which test-time tuning needs.
+    tunable: True if it implements `project`, which test-time tuning needs.
     """
 
     slot: ClassVar[str] = "encoder"
@@ -50,14 +50,15 @@ class Encoder(ModelComponent):
     reads_cameras: ClassVar[bool] = True
     tunable: ClassVar[bool] = False
     writes = MEMORY_FIELDS
-    """Parts of the ImageMemory that it fills (default: all). The features may have a width of their
-    own."""
+    """Parts of the ImageMemory that the encoder fills (default: all). The features may have another
+    width than the model."""
 
     @classmethod
     def size_multiple(cls, config: ComponentConfig) -> int | None:
-        """Return a number that must divide both image sides; None for the trained size only.
+        """Return a number that must divide both sides of an image.
 
-        With a number, photos of a user keep their aspect ratio and are not cropped.
+        None means that only the image size of the training works; photos are then cropped to it.
+        Otherwise photos of a user keep their aspect ratio.
         """
         return None
 
@@ -66,19 +67,19 @@ class Encoder(ModelComponent):
         """Encode all views of each scene together."""
 
     def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
-        """Return `memory` recomputed from other `features` of its shape, for test-time tuning.
+        """Return `memory` recomputed from new `features` of equal shape, for test-time tuning.
 
         `project(memory.features, memory)` must give an equal memory. Raises NotImplementedError
         unless the encoder is `tunable`.
         """
         # Recipes that need it are refused, see `tunable`.
         raise NotImplementedError(
-            f"{type(self).__name__} cannot recompute a memory from other features"
+            f"{type(self).__name__} cannot recompute a memory from new features"
         )
 
 
 class PatchEncoder(Encoder):
-    """An encoder that cuts every photo into square patches, one token each."""
+    """An encoder that cuts every photo into square patches and makes one token of each patch."""
 
     class Config(ComponentConfig):
         patch_size: int = Field(default=8, ge=1)

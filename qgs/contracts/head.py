@@ -1,4 +1,4 @@
-"""Contracts of the slots `head` and `centers`, from query features to Gaussians."""
+"""Contracts of the slots `head` and `centers`, which turn query features into Gaussians."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -13,13 +13,13 @@ GAUSSIAN_FIELDS: Fields = {
     "gaussians.sh": FieldSpec(("C", 3)),
     "gaussians.features": FieldSpec(("F",)),
 }
-"""Optional outputs of a head. Every Gaussian has the other attributes."""
+"""Optional outputs of a head. It must output all other attributes of `GaussianAttributes`."""
 
 
 class Head(ModelComponent):
     """Head: QueryState -> GaussianAttributes of K Gaussians per query, in their valid ranges.
 
-    The ranges also hold with initial parameters, for nonzero features. A head that outputs `sh` or
+    Untrained heads keep to the ranges too, for nonzero features. A head that outputs `sh` or
     `features` declares them in `writes`, see GAUSSIAN_FIELDS, so that losses can require them.
     """
 
@@ -27,7 +27,7 @@ class Head(ModelComponent):
 
     @property
     def gaussians_per_query(self) -> int:
-        """Number K of Gaussians per query: the option of this name, if there is one."""
+        """Number K of Gaussians per query; the default reads the option `gaussians_per_query`."""
         return getattr(self.config, "gaussians_per_query")  # noqa: B009 (an option of subclasses)
 
     @abstractmethod
@@ -42,8 +42,8 @@ class Head(ModelComponent):
 class Centers(ModelComponent):
     """Centers: (raw offsets (B, N, K, 3), QueryState) -> means (B, N, K, 3), world frame, float32.
 
-    The state comes from after the refinement of the decoded layer. Finite offsets give finite
-    means. Raises KeyError for a field that the state lacks (the composer prevents this).
+    The state is that of the decoded layer, after its refinement. Finite offsets give finite means.
+    Raises KeyError for a field that the state lacks (the composer prevents this).
     """
 
     slot: ClassVar[str] = "centers"
@@ -54,4 +54,4 @@ class Centers(ModelComponent):
         offsets: Tensor,  # (B, N, K, 3) raw
         state: QueryState,
     ) -> Tensor:
-        """Return world-frame means."""
+        """Return the means (B, N, K, 3) of all Gaussians in the world frame."""

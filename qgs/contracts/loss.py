@@ -1,4 +1,4 @@
-"""Contracts of the slots `losses` and `supervision` (the layers that losses apply to)."""
+"""Contracts of the slots `losses` and `supervision` (the decoder layers that losses apply to)."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -15,22 +15,23 @@ from qgs.types import LayerPrediction, Rendering, Views
 class Loss(Component, torch.nn.Module):
     """Loss: (LayerPrediction, Rendering, target Views, input Views) -> one term or several.
 
-    A loss defines `term`; this class applies `weight` and its schedule. Training calls the loss for
-    each supervised layer, with a rendering from the target cameras and all input views of the
-    prediction. It minimises the sum of all terms, weighted by layer. Term names are unique within a
-    recipe. Every term has a gradient in the prediction or in the rendering.
+    A loss implements `term`; this class multiplies it by the option `weight`. Training calls the
+    loss for each supervised layer, with a rendering from the target cameras and all input views of
+    the prediction. It minimises the sum of all terms, weighted by layer. Term names are unique
+    within a recipe. Every term is differentiable in the prediction or in the rendering.
 
-    renderings: the views that a call needs, since training may render few at a time
-        (`training.render_views`). "each": a term is a mean over views, so the loss is called with
-        some views at a time and averaged. "all": all target views at once. "none": the loss reads
-        no rendering; it gets all target views and a rendering of no views, (B, 0, ...).
+    renderings: the target views that one call needs, because training may render few at a time
+        (`training.render_views`). "each": a term is a mean over views, so training may call the
+        loss with a few views at a time and average the results. "all": the loss needs all target
+        views at once. "none": the loss reads no rendering; it gets all target views and a rendering
+        of no views, (B, 0, ...).
     """
 
     slot: ClassVar[str] = "losses"
     renderings: ClassVar[Literal["each", "all", "none"]] = "all"
     scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     reads_depths: ClassVar[bool] = False
-    """True if it reads `Views.depths`. Training then decodes them, if the data has depth maps."""
+    """True if the loss reads `Views.depths`. Training then loads depth maps if the data has any."""
 
     class Config(ComponentConfig):
         weight: float = Field(default=1.0, ge=0)
@@ -51,7 +52,10 @@ class Loss(Component, torch.nn.Module):
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
-        """Return the weighted terms by name, none for weight 0. A single term has `name`."""
+        """Return the weighted terms by name; none for weight 0.
+
+        A single term without a name gets the component's `name`.
+        """
         weight = self.config.weight
         # A weight of 0 takes no time: the term is not even computed.
         if not weight:

@@ -27,7 +27,7 @@ class Column:
 
     @property
     def title(self) -> str:
-        """Heading with an arrow: up if higher values are better, else down."""
+        """Column heading with an arrow: up if higher values are better, else down."""
         return f"{self.heading} {'↑' if self.better == 'higher' else '↓'}"
 
     def shown(self, value: float | None) -> str:
@@ -41,7 +41,7 @@ class Column:
         return (max if self.better == "higher" else min)(known, default=None)
 
     def beats(self, value: float | None, other: float | None) -> bool:
-        """Return whether `value` is better than `other`, in the digits that tables show."""
+        """Return whether `value` is better than `other` when both are rounded as in tables."""
         # 14.463 and 14.457 both show as 14.46; ranking them would confuse readers
         if other is None or self.shown(value) == self.shown(other):
             return False
@@ -54,7 +54,7 @@ class MetricInput(TensorContainer):
 
     images: (1, T, 3, H, W) as rendered, not clipped.
     targets: the true Views (1, T).
-    gaussians: (1, G), `gaussians_per_query` for each query in turn; None for a baseline.
+    gaussians: (1, G), ordered query by query, `gaussians_per_query` each; None for a baseline.
     depth: like `Rendering.depth`, (1, T, 1, H, W); None for a baseline.
     true_depth: depth maps of the data, in the model's units, 0 where unknown; None without maps, or
         if no metric needs them.
@@ -74,14 +74,16 @@ class MetricInput(TensorContainer):
 
 
 class Metric(Component, torch.nn.Module):
-    """Metric: MetricInput -> values. Called without gradients, for every sample and method.
+    """Metric: MetricInput -> values.
 
-    definition: a text that says what is measured. It is part of the evaluation protocol, like the
-        options; change it when values change.
+    Called without gradients, for every sample, with the images of the model and of each baseline.
+
+    definition: a text that says what is measured. Like the options, it is part of the evaluation
+        protocol's hash; change it whenever the metric's values change.
     not_in_protocol: options that change no value, such as a path.
-    needs: parts of the input without which there is no value.
-    column: display of the value.
-    unavailable: the reason if there are no values, such as a file that `load_pretrained` misses.
+    needs: fields of MetricInput that must not be None for the metric to have a value.
+    column: display of the value in tables.
+    unavailable: reason why the metric has no values, such as a missing file of weights; else "".
     """
 
     slot: ClassVar[str] = "metrics"
@@ -92,16 +94,17 @@ class Metric(Component, torch.nn.Module):
     unavailable: str = ""
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the columns by key; override it for several values or headings by option.
+        """Return the table columns by key; the default is `column` with the key "".
 
-        A value has the metric's name in the recipe, followed by `_KEY` unless the key is "".
+        Override it if the metric has several values, or a heading that depends on options. In
+        results, a value has the metric's name in the recipe, plus `_KEY` unless the key is "".
         """
         return {"": self.column}
 
     @abstractmethod
     def forward(self, given: MetricInput) -> Tensor | Mapping[str, Tensor]:
-        """Return a tensor such as (1, T), one number per view, or several by keys of `columns`.
+        """Return a tensor such as (1, T), one number per view, or a tensor for each of `columns`.
 
-        The value of a sample is the mean of all its numbers, in float64. The value of a scene is
-        the mean over its samples.
+        The value of a sample is the mean over the tensor, in float64. The value of a scene is the
+        mean over its samples.
         """

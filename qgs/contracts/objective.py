@@ -1,4 +1,4 @@
-"""Contract of the slot `objective`: the model passes of a training step, and its loss."""
+"""Contract of the slot `objective`: the forward passes of a training step, and the step's loss."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -13,12 +13,13 @@ from qgs.types import Cameras, Gaussians, Prediction, Rendering, Views
 
 @dataclass(frozen=True)
 class Outcome:
-    """The loss that is minimised, and numbers about it; all 0-d.
+    """The loss that training minimises, and numbers to log; all tensors are 0-d.
 
     total: the sum of the terms, with gradients.
     terms: the terms by name, weighted and detached.
-    signs: numbers with which training detects collapse: the means "psnr" and "alpha", and
-        "deviation", the largest of the views' mean distances to the background.
+    signs: numbers by which training detects collapse: "psnr" and "alpha" are means over the
+        renderings. "deviation" is the mean distance of a rendering to the background colour, the
+        largest over views.
     """
 
     total: Tensor
@@ -36,22 +37,23 @@ class Passes(Protocol):
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
         """Compute the recipe's losses of every supervised layer, rendered from `targets`' cameras.
 
-        inputs: the views that `prediction` was made from. This computes the losses' gradients layer
-        by layer, `training.render_views` views at a time, so that memory grows with neither.
-        `total` passes the gradients on.
+        inputs: the views that `prediction` was made from. The gradients of the losses are computed
+        in this call, for one layer and `training.render_views` views at a time, so that memory does
+        not grow with the number of layers or views. The backward pass of `total` uses them.
         """
         ...
 
     def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render with gradients, like `judge`: few views' graphs exist at a time."""
+        """Render with gradients; as in `judge`, autograd graphs exist for few views at a time."""
         ...
 
 
 class Objective(Component):
     """Computation of a training step: (input Views, target Views) -> Outcome.
 
-    It has no parameters and keeps no state. Each extra pass of the model costs as much as another
-    step. Names of its own terms must differ from those of the recipe's losses.
+    An objective has no parameters and keeps no state. Each extra pass of the model costs about as
+    much as an extra step. If it adds terms, their names must differ from those of the recipe's
+    losses.
 
     judges_inputs: True if input views may be targets too, see `training.judge_inputs`.
     """
@@ -61,4 +63,4 @@ class Objective(Component):
 
     @abstractmethod
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """Predict from `inputs` or some of them, compute losses, and add terms of its own."""
+        """Predict from `inputs`, or from some of these views, and compute the losses."""

@@ -1,4 +1,4 @@
-"""The plugin: a distribution's components for recipes."""
+"""Contract of plugins: the components that an installed distribution offers to recipes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,17 +14,17 @@ ENTRY_POINT_GROUP = "qgs.plugins"
 
 @dataclass(frozen=True)
 class Plugin:
-    """Components under one name. Importing a plugin must have no side effects.
+    """Components of one distribution. Importing a plugin must have no side effects.
 
     name: the part of `type: NAME/component` before the slash.
     contract_version: the CONTRACT_VERSION that the components were written for.
-    components: component classes; a `name` is unique within its slot.
+    components: component classes; the `name` of each is unique within its slot.
     examples: options that `qgs check-plugin` tries in addition to the defaults of every component.
     models: files of trained models by name, relative to the folder of the module that the entry
-        point names. Every command accepts PLUGIN/NAME in place of the path. A card in the same
-        folder describes the model: models/mine.md for models/mine.safetensors.
-    exemptions: checks of the contract suite that a component is known to fail, with the reason.
-        The key is the class, or options if the component passes with other options.
+        point names. Commands accept PLUGIN/NAME in place of such a path. A Markdown file of the
+        same name describes each model: models/mine.md for models/mine.safetensors.
+    exemptions: known failures of the contract tests, {component class or options: {check:
+        reason}}. Use options as the key if the component passes with other options.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Contract of the slot `queries`, the initial state of a scene."""
+"""Contract of the slot `queries`, which makes the initial query state of a scene."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -18,11 +18,11 @@ class Queries(ModelComponent):
     """Queries: (ImageMemory, Views) -> QueryState of N queries.
 
     The state has features (B, N, D) and the fields in `writes`. Spatial fields are (B, N, ...)
-    float32 in the world frame. Queries that read the memory list the parts in `reads`, such as
-    `memory.features`. Scenes are independent. A state whose scenes have different numbers of
-    queries has a mask.
+    float32 in the world frame. Queries that read the memory list the parts that they read in
+    `reads`, such as `memory.features`. Scenes are independent. If scenes have different numbers of
+    queries, the state has a mask.
 
-    reads_cameras: True if they read `views.cameras`. If False, they also accept `Photos`.
+    reads_cameras: True if the component reads `views.cameras`. If False, it also accepts `Photos`.
     """
 
     slot: ClassVar[str] = "queries"
@@ -30,7 +30,7 @@ class Queries(ModelComponent):
 
     @property
     def count(self) -> int | None:
-        """Number N of queries: the option `count`; None if it depends on the views."""
+        """Number N of queries; None if it depends on the views. Default: the option `count`."""
         return getattr(self.config, "count", None)
 
     @abstractmethod
@@ -42,9 +42,10 @@ class Queries(ModelComponent):
     ) -> dict[str, Tensor]:
         """Return a state dict for these queries, made from one with another number of queries.
 
-        learned: the old state dict, on the CPU. Shapes differ from ours only in the first axis, the
-        queries. Shrinking keeps the first N queries. Growing keeps all; new query i copies query i
-        modulo their number, plus noise N(0, 0.01) on all parameters (LocusGS release, finetuning).
+        learned: the old state dict, on the CPU. Its shapes differ from the new ones only in the
+        first axis, the queries. Shrinking keeps the first N queries. Growing keeps all n old ones;
+        new query i is a copy of old query i modulo n, plus noise of standard deviation 0.01 on all
+        parameters (LocusGS release, finetuning).
         """
         own = {name: values.shape for name, values in self.state_dict().items()}
         return {
@@ -69,7 +70,7 @@ class LearnedQueries(Queries):
 
     @abstractmethod
     def start(self, batch_size: int) -> QueryState:
-        """Return the initial state, expanded to `batch_size` scenes."""
+        """Return the initial state for `batch_size` scenes, the same in each."""
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Return the initial state of every scene in the memory."""
@@ -77,7 +78,7 @@ class LearnedQueries(Queries):
 
 
 def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Return the first `count` items of `values`, or all of them and then noisy copies in turn."""
+    """Cut `values` to `count` items along the first axis, or append noisy copies of its items."""
     if count <= len(values):
         return values[:count]
     # In turn, so that all learned queries get equally many copies.

@@ -16,7 +16,7 @@ Channel: TypeAlias = Annotated[float, Field(ge=0, le=1)]
 
 
 class RendererConfig(ComponentConfig):
-    """Splatting options of every renderer (defaults: both releases, gsplat 1.5.3)."""
+    """Splatting options of every renderer (defaults: TokenGS, LocusGS and gsplat 1.5.3)."""
 
     near: float = Field(default=0.025, gt=0)
     """Drop Gaussians nearer than this camera-frame z, in world units."""
@@ -25,9 +25,9 @@ class RendererConfig(ComponentConfig):
     dilation: float = Field(default=0.3, ge=0)
     """Number added to the diagonal of the projected covariance, in pixel^2. 0 adds nothing."""
     alpha_min: float = Field(default=1 / 255, gt=0, lt=1)
-    """Skip contributions to a pixel below this alpha."""
+    """Skip a Gaussian at pixels where its alpha is below this."""
     alpha_cap: float = Field(default=0.999, gt=0, lt=1)
-    """Largest alpha of one Gaussian at a pixel."""
+    """Largest alpha of one Gaussian at a pixel. Larger values are lowered to it."""
     transmittance_min: float = Field(default=1e-4, ge=0, lt=1)
     """Stop adding Gaussians to a pixel before its transmittance falls to this."""
     background: tuple[Channel, Channel, Channel] = (0.5, 0.5, 0.5)
@@ -50,13 +50,14 @@ class Renderer(Component, torch.nn.Module):
     """EWA splatting: (Gaussians (B, G), Cameras (B, V), background) -> Rendering (B, V).
 
     Colours come from `Gaussians.sh`, along the direction from the camera's centre to the mean.
-    `Gaussians.features` are blended with the same weights as colours, over 0. The rendering is
-    differentiable in all Gaussian parameters. Images and gradients are finite, even without
-    Gaussians and for Gaussians behind the camera, off screen or huge.
+    `Gaussians.features` are blended with the same weights as colours, over a background of 0. The
+    rendering is differentiable in all Gaussian parameters. Images and gradients are finite, even
+    without Gaussians and for Gaussians behind the camera, off screen or huge.
 
     devices: types of torch devices that it renders on, such as "cpu", "cuda", "mps".
-    camera_gradients: "c2w" and "intrinsics", if they get gradients on all these devices (c2w along
-        rotations and translations). If another one requires a gradient, a ValueError is raised.
+    camera_gradients: the tensors of `Cameras` that get gradients on all these devices: "c2w" (for
+        rotations and translations), "intrinsics", both or none. If a tensor not named here requires
+        a gradient, `forward` raises ValueError.
     """
 
     slot: ClassVar[str] = "renderer"
@@ -65,7 +66,7 @@ class Renderer(Component, torch.nn.Module):
     camera_gradients: ClassVar[tuple[str, ...]] = ("c2w", "intrinsics")
 
     class Config(RendererConfig):
-        """Options of this renderer; by default only the common ones."""
+        """Options of this renderer; by default only those of all renderers."""
 
     config: RendererConfig
     writes: ClassVar[Fields] = {
@@ -83,9 +84,9 @@ class Renderer(Component, torch.nn.Module):
     ) -> Rendering:
         """Render every scene from each of its cameras.
 
-        background: RGB; None for the option `background`.
+        background: RGB (3,); None uses the option `background`.
         Raises ValueError for Gaussians and cameras of different batch sizes or devices, and for
-        cameras that require a gradient outside of `camera_gradients`.
+        cameras that require a gradient not listed in `camera_gradients`.
         """
 
 
@@ -112,7 +113,7 @@ def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 
 
 def raise_precision(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """Convert both to float64 if the means are float64, else to float32."""
+    """Convert Gaussians and cameras to float64 if the means are float64, else to float32."""
     # Half precision would move the projection of a Gaussian by pixels.
     dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
     return gaussians.to(dtype), cameras.to(dtype)
@@ -133,7 +134,7 @@ def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
 def background_of(
     background: Tensor | None, configured: tuple[float, float, float], like: Tensor
 ) -> Tensor:
-    """Return the background RGB (3,) in the dtype and on the device of `like`."""
+    """Return `background`, or else `configured`, as RGB (3,) in the dtype and device of `like`."""
     if background is None:
         # A tensor of Python numbers would make the GPU wait for a copy.
         return constant(configured, like)

@@ -1,4 +1,7 @@
-"""Options that change with the steps of training; the kinds are in `qgs.tokengs.schedules`."""
+"""Contract of schedules, for options that change during training.
+
+The kinds of schedules are in `qgs.tokengs.schedules`.
+"""
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
@@ -13,23 +16,23 @@ END = 2**53
 
 
 class Schedule(ComponentConfig):
-    """A number as a function of the optimiser steps made so far (0 in the first step)."""
+    """A number as a function of the count of finished optimiser steps (0 in the first step)."""
 
     schedule: str
     """Kind of schedule."""
 
     @abstractmethod
     def number(self, step: int) -> float:
-        """Return the number after `step` steps."""
+        """Return the value of the schedule after `step` optimiser steps."""
 
     @property
     def corners(self) -> tuple[int, ...]:
-        """Steps (without 0) between which the number is monotonic; its extremes are at these."""
+        """Steps after 0 between which the number is monotonic, so extremes lie there or at 0."""
         return ()
 
 
 def at_step(config: ConfigT, schedules: Mapping[str, Schedule], step: int) -> ConfigT:
-    """Return `config` with the scheduled values after `step` steps; integer options are rounded."""
+    """Return `config` with the values of `schedules` after `step` steps, rounded for integers."""
     numbers = {name: schedule.number(step) for name, schedule in schedules.items()}
     for name in numbers:
         if isinstance(getattr(config, name), int):

@@ -12,7 +12,7 @@ Tuned: TypeAlias = Literal["queries", "latents"]
 
 
 class ViewsConfig(ComponentConfig):
-    """Settings for drawing views from a scene and moving them into the model's frame.
+    """Settings for choosing views of a scene and for moving their cameras to the model's frame.
 
     The defaults are those of the TokenGS release.
     """
@@ -22,25 +22,26 @@ class ViewsConfig(ComponentConfig):
     targets: int = Field(default=4, ge=1)
     """Target views per sample, drawn between the first and the last input."""
     gap: tuple[int, int] = (10, 40)
-    """Distance from the first to the last input, [min, max] in frames. Neighbours have distance 1.
-    Scenes with times count distinct times instead of frames. Shorter scenes use the distance that
-    they have, with a warning below min."""
+    """Distance from the first to the last input, [min, max] in frames. Neighbouring frames have
+    distance 1. In scenes with times the unit is a distinct time, not a frame. A scene shorter than
+    max uses at most its own length; one shorter than min logs a warning."""
     frame: Literal["first_cam", "mean_cam", "given"] = "first_cam"
-    """Camera that becomes the identity: "first_cam" is the first input, "mean_cam" the mean of the
-    inputs. "given" keeps the poses of the data."""
+    """Camera whose pose becomes the identity: "first_cam" is the first input, "mean_cam" the mean
+    of the inputs. "given" keeps the poses of the data."""
     scale: Literal["constant", "distance", "auto", "search"] = "constant"
     """Rule for scaling camera positions. "constant" multiplies them by `scale_factor`. "distance"
-    first divides them by the largest distance from the first input camera to another one. "auto"
-    computes one factor per scene: it brings the point nearest to all optical axes to depth 1.
-    "search" takes the factor at which the model renders photos best, in reconstructions only."""
+    first divides them by the largest distance from the first input camera to any other. "auto"
+    computes one factor per scene, which brings the point nearest to all optical axes to depth 1.
+    "search" takes the factor at which the model renders photos best; only for reconstructions."""
     scale_factor: float = Field(default=0.15, gt=0)
     """Factor for all camera positions, see `scale`. It has no effect with "auto" and "search"."""
     mirror: float = Field(default=0.5, ge=0, le=1)
-    """Probability of mirroring a training sample in x."""
+    """Probability of mirroring a training sample left to right (x axis)."""
     pose_noise: float = Field(default=0.0, ge=0, le=45)
-    """Noise on the input poses in training and evaluation: standard deviation in degrees, about
-    each axis, of the rotation and of the direction from the first input. The first input and the
-    targets stay exact. Reconstructions ignore this option. Default 0: no noise."""
+    """Standard deviation of noise on the input poses in training and evaluation, in degrees about
+    each axis. A random rotation turns each camera; another one turns its position about the first
+    input. The first input and the targets stay exact. Reconstructions ignore this option. 0: no
+    noise."""
 
     @field_validator("gap")
     @classmethod
@@ -61,13 +62,13 @@ class TrainingConfig(ComponentConfig):
     steps: int = Field(default=150_000, ge=1)
     """Number of optimiser steps."""
     seconds: float | None = Field(default=None, gt=0)
-    """Time budget. Training ends when this or `steps` is used up. null: no time limit."""
+    """Time budget in seconds. Training ends when this or `steps` is used up. null: no limit."""
     batch_size: int = Field(default=16, ge=1)
-    """Scenes per optimiser step, over all processes. It must be a multiple of the number of
+    """Scenes per optimiser step, summed over all processes. It must be a multiple of the number of
     processes times `accumulate`."""
     accumulate: int = Field(default=1, ge=1)
-    """Batches into which each process splits its scenes of a step. It computes them one after the
-    other, so a larger number needs less memory."""
+    """Number of batches into which each process splits its scenes of a step. It computes the
+    batches one after the other, so a larger number needs less memory."""
     clip: float = Field(default=1.0, gt=0)
     """Largest norm of the gradient. A larger gradient is scaled down to it."""
     precision: Precision = "bf16"
@@ -75,29 +76,32 @@ class TrainingConfig(ComponentConfig):
     save_every: int = Field(default=1000, ge=0)
     """Steps between checkpoints. 0 saves only at the end and before evaluations."""
     collapse_window: int = Field(default=50, ge=10, le=100)
-    """Stop training after this many steps in a row with empty renderings or without a gradient."""
+    """Stop training after this many steps in a row in which renderings are empty or the gradient
+    vanishes."""
     workers: int = Field(default=0, ge=0)
     """Number of processes that load data. 0 uses a thread of the training process."""
     render_views: int = Field(default=0, ge=0)
-    """Target views rendered at a time. Fewer need less memory; gradients stay the same. 0: all."""
+    """Number of target views rendered at a time. Smaller numbers need less memory; gradients stay
+    the same. 0: all."""
     judge_inputs: bool = False
     """Render the input views too, after the target views, and compute the losses on both."""
     ema: float | None = Field(default=None, gt=0, lt=1)
-    """Decay of a moving average of the weights, which is saved and evaluated too. null: none."""
+    """Decay per step of a moving average of the weights. The average is saved and evaluated in
+    addition to the weights. null: no average."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
-    """Stop, or skip the step, when the loss or a gradient is NaN or infinite. The message names the
-    first bad tensor."""
+    """Stop training, or skip the step, when the loss or a gradient is NaN or infinite. The message
+    names the first bad tensor."""
     on_bad_sample: Literal["stop", "skip"] = "stop"
-    """Stop, or skip the sample, when one fails to load (a damaged image, for example). "skip" takes
-    one of the next scenes instead, with a warning."""
+    """Stop training, or skip the sample, when a sample fails to load, for example because of a
+    damaged image. "skip" takes a sample of one of the next scenes and logs a warning."""
     evaluate_every: int = Field(default=0, ge=0)
-    """Steps between evaluations with pictures. 0: none."""
+    """Steps between evaluations during training, which also save pictures. 0: none."""
     trackers: tuple[str, ...] = ()
-    """Trackers that also get all numbers and pictures: tensorboard, wandb, or one of a plugin. The
-    folder of the run always gets them."""
+    """Trackers that get all numbers and pictures, in addition to the run's folder: tensorboard,
+    wandb, or a tracker of a plugin."""
 
     def scenes_per_batch(self, processes: int) -> int:
-        """Return the number of scenes in a batch of a process; ValueError for an uneven split."""
+        """Return the scenes per batch of one process; raise ValueError for an uneven split."""
         parts = processes * self.accumulate
         scenes, left = divmod(self.batch_size, parts)
         if left:
@@ -116,29 +120,29 @@ class EvaluationConfig(ComponentConfig):
     """Settings of `qgs eval`: the views to score, and test-time tuning. See also `metrics`."""
 
     scenes: int = Field(default=32, ge=1)
-    """Largest number of test scenes, and of windows of a scene with held-out frames. It has no
-    effect if `index` is set."""
+    """Largest number of test scenes to score, and of windows (input and target views) per scene
+    with held-out frames. It has no effect if `index` is set."""
     samples: int = Field(default=1, ge=1)
-    """Samples drawn from each scene. It has no effect if `index` is set, or for scenes with
-    held-out frames."""
+    """Number of samples drawn from each scene. It has no effect if `index` is set, or for scenes
+    with held-out frames."""
     seed: int = Field(default=0, ge=0)
-    """Seed for drawing the samples (default 0). It has no effect where `samples` has none."""
+    """Seed for drawing the samples. It has no effect where `samples` has no effect."""
     index: str | None = None
     """JSON file with the views to score, relative to the working directory, in pixelSplat's format:
     {scene: null | {"context": [frames], "target": [frames]}}. null draws the views."""
     protocol: str | None = None
-    """Name of these settings in tables. null uses the name of the index file."""
+    """Name of these evaluation settings in tables. null uses the name of the index file."""
     tuning: Tuned = "queries"
     """Part that tuning fits to a scene's input views: its queries, or the features of its image
     memory ("latents"). "latents" needs an encoder that recomputes keys and values from features."""
     tuning_steps: int = Field(default=0, ge=0)
-    """Tuning steps on the input views of each scene before it is scored, with the recipe's
-    photometric loss (TokenGS: 50). 0: no tuning."""
+    """Number of tuning steps on the input views of each scene before it is scored, with the
+    recipe's photometric loss (TokenGS: 50). 0: no tuning."""
     tuning_rate: float | None = Field(default=None, gt=0)
     """Learning rate of tuning (Adam). null: as in TokenGS, 1e-4 for queries, 1e-2 for latents."""
 
     @property
     def rate(self) -> float:
-        """Learning rate of tuning: `tuning_rate`, or the default of the tuned part."""
+        """Learning rate of tuning: `tuning_rate`, or the default for the part in `tuning`."""
         # TokenGS tunes features with a hundred times the rate of queries.
         return self.tuning_rate or {"queries": 1e-4, "latents": 1e-2}[self.tuning]
