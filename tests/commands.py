@@ -24,6 +24,11 @@ def run_qgs(*words):
     return CliRunner().invoke(app, [*map(str, words)])
 
 
+def typed(line):
+    """What a line without quotes gives."""
+    return run_qgs(*line.split())
+
+
 def done(*words):
     """The result of a command that must end well."""
     result = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)

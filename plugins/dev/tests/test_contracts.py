@@ -1,7 +1,6 @@
 """Every component of this repository keeps its contract, and its weights keep their names."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -19,24 +18,18 @@ WITHOUT_CASE = {"vggt_features"}
 """Components that need weights of their own, which the tests of their plugin make."""
 
 
-def all_runs() -> Iterator[CaseRun]:
-    for plugin, pinned in PINNED.items():
-        for run in runs_of(plugin):
-            run.case = replace(run.case, state_dict=pinned.get(run.case.label))
-            yield run
+RUNS: list[CaseRun] = []
+for plugin, pinned in PINNED.items():
+    for run in runs_of(plugin):
+        run.case = replace(run.case, state_dict=pinned.get(run.case.label))
+        RUNS.append(run)
 
 
-RUNS = list(all_runs())
+MARKED = [pytest.param(run, marks=[pytest.mark.slow] * (run.case.slot == "data")) for run in RUNS]
 
 
-@pytest.mark.parametrize("run", [run for run in RUNS if run.case.slot != "data"], ids=str)
+@pytest.mark.parametrize("run", MARKED, ids=str)
 def test_contract(run: CaseRun) -> None:
-    run.check(["core"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("run", [run for run in RUNS if run.case.slot == "data"], ids=str)
-def test_contract_of_data(run: CaseRun) -> None:
     run.check(["core"])
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from contract_mutants import sound
 from contract_mutants.mutant import MUTANTS, Mutant
-from qgs_dev import CHECKS, Case, checks_for, run_check
+from qgs_dev import CHECKS, Case, CaseRun, run_check
 
 from qgs.contracts import Component, ModelDims
 from qgs.renderers import TorchRenderer
@@ -42,12 +42,9 @@ SOUND = [
 
 @pytest.mark.parametrize("component", SOUND)
 def test_a_sound_component_passes(component: type[Component]) -> None:
-    case = Case(component.Config())
-    results = [run_check(check, case) for check in checks_for(case, ["core"])]
-    assert not [result.message for result in results if not result.ok]
+    CaseRun(Case(component.Config())).check(["core"])
 
 
-FAR = sound.SeesFar.Config(depth=8, layer_scale=1.0)
 GRID = ("tokens_are_those_of_the_grid",)
 GRADIENTS = ("render_gradients_match_differences", "camera_gradients_match_differences")
 
@@ -55,7 +52,7 @@ GRADIENTS = ("render_gradients_match_differences", "camera_gradients_match_diffe
 @pytest.mark.parametrize(
     ("checks", "case"),
     [
-        (GRID, Case(FAR)),
+        (GRID, Case(sound.SeesFar.Config(depth=8, layer_scale=1.0))),
         *[
             (GRID, Case(encoder.Config(patch_size=patch), image_size=size))
             for encoder in (sound.ConvolvesByThree, sound.ConvolvesByFour)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from commands import run_qgs
+from commands import done, run_qgs
 from qgs_dev.new_command import check_name, rendered
 
 from qgs.contracts import ModelDims
@@ -28,11 +28,9 @@ def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
-    result = run_qgs("new-plugin", "far-sighted")
-    assert result.exit_code == 0, result.output
+    done("new-plugin", "far-sighted")
     folder = tmp_path / "qgs-far-sighted"
-    written = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-    assert written == {
+    assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == {
         ".gitignore",
         "README.md",
         "pyproject.toml",
@@ -52,16 +50,13 @@ def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
     run_qgs("new-plugin", "tidy")
     for command in (["check", "--select", "E,F,W,I,UP,B"], ["format", "--check"]):
         ruff = [sys.executable, "-m", "ruff", *command, "--no-cache", "qgs-tidy"]
-        done = subprocess.run(ruff, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout
-
-
-WORDS = ["no", "on", "yes", "off", "n", "inf", "nan"]
-"""What other readers of YAML take for values."""
+        checked = subprocess.run(ruff, cwd=tmp_path, capture_output=True, text=True)
+        assert checked.returncode == 0, checked.stdout
 
 
 def test_names_that_are_taken_as_they_are() -> None:
-    for name in ("a", "wide", "far-sighted", "far_sighted", "view2d", *WORDS):
+    values = ("no", "on", "yes", "off", "n", "inf", "nan")  # for other readers of YAML
+    for name in ("a", "wide", "far-sighted", "far_sighted", "view2d", *values):
         check_name(name)
         (text,) = [text for path, text in rendered(name) if path.name == "recipe.yaml"]
         assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name
@@ -70,14 +65,13 @@ def test_names_that_are_taken_as_they_are() -> None:
 def test_names_that_are_refused(tmp_path: Path) -> None:
     names = ("Far Sighted", "../escape", "", "locus", "class", "torch")
     errors = {name: run_qgs("new-plugin", "--", name).exception for name in names}
-    assert [name for name, error in errors.items() if not isinstance(error, ValueError)] == []
-    assert list(tmp_path.iterdir()) == []
+    assert not [name for name, error in errors.items() if not isinstance(error, ValueError)]
+    assert not list(tmp_path.iterdir())
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    result = run_qgs("new-plugin", "wide", "--out", "mine")
-    assert isinstance(result.exception, FileExistsError)
+    assert isinstance(run_qgs("new-plugin", "wide", "--out", "mine").exception, FileExistsError)
     assert list(tmp_path.rglob("*")) == [tmp_path / "mine"]
 
 

@@ -22,12 +22,6 @@ def case(kind=RayBias, dtype=torch.float32, width=8):
     return torch.randn(2, 3, 5, width, dtype=dtype), bias
 
 
-def on_cuda(q):
-    """A tensor, as far as the choice looks, that says it is on CUDA."""
-    known = {name: getattr(q, name) for name in ("shape", "dtype", "element_size")}
-    return SimpleNamespace(**known, device=SimpleNamespace(type="cuda"))
-
-
 @pytest.fixture
 def chosen(monkeypatch):
     """What a GPU chooses of which a layer may take `memory` bytes, with this version of Triton."""
@@ -37,7 +31,10 @@ def chosen(monkeypatch):
         monkeypatch.setattr(attention_choice, "triton_version", lambda: version)
         q, bias = case(**options)
         bias.tokens.requires_grad_(learnt)
-        return chosen_kernel(on_cuda(q), bias, kernel)
+        # a tensor, as far as the choice looks, that says it is on CUDA
+        known = {name: getattr(q, name) for name in ("shape", "dtype", "element_size")}
+        on_cuda = SimpleNamespace(**known, device=SimpleNamespace(type="cuda"))
+        return chosen_kernel(on_cuda, bias, kernel)
 
     return of
 

@@ -22,15 +22,13 @@ import torch
 from attending import case, exact, found, wrong
 from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.ray_bias import RayBias
+from tables import assert_equal
 from torch.testing import assert_close
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 DEVICE = "cuda" if torch.cuda.is_available() and not INTERPRETED else "cpu"
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not find_spec("triton"), reason="needs triton"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not find_spec("triton"), reason="needs triton")]
 runs = pytest.mark.skipif(
     DEVICE == "cpu" and not INTERPRETED, reason="runs on a GPU, or with TRITON_INTERPRET=1"
 )
@@ -80,12 +78,11 @@ def test_bits_are_the_same_each_time_and_what_is_frozen_gets_no_gradient():
     attention = partial(biased_attention, kernel="triton")
     given = _on_device(case((1, 2, 70, 70, 16)))
     whole, again = (found(attention, RayBias, given, LEARNT) for _ in range(2))
-    assert_close(again, whole, rtol=0, atol=0)
+    assert_equal(again, whole)
     for learnt in (*zip(LEARNT, strict=True), ("k", "v"), ("q", "queries")):
         expected = {name: whole[name] for name in ("read", *learnt)}
         # on a GPU other products and sums are fused
-        seen = found(attention, RayBias, given, learnt)
-        assert_close(seen, expected, rtol=1e-5, atol=1e-6)
+        assert_close(found(attention, RayBias, given, learnt), expected, rtol=1e-5, atol=1e-6)
 
 
 @runs
@@ -141,8 +138,7 @@ def test_kernels_compile_for_gpus_that_are_not_here(
 
     def halved(q, k, v, bias):
         halves = (x.to(dtype) for x in (q, k, v))
-        read = attention.apply(*halves, bias.queries, bias.tokens)
-        return read.float()
+        return attention.apply(*halves, bias.queries, bias.tokens).float()
 
     found(halved, RayBias, case(sizes), learnt)
     needed = {"_backward_queries": {"q", "queries"}, "_backward_tokens": {"k", "v"}}

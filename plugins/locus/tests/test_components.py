@@ -14,11 +14,6 @@ from qgs import QueryState
 from qgs.recipe import resolve
 
 
-def _state():
-    fields = {CENTER: torch.randn(2, 5, 3), RAW_RADIUS: torch.randn(2, 5, 1)}
-    return QueryState(torch.randn(2, 5, 16), fields)
-
-
 def test_a_radius_is_read_in_two_ways_and_made_raw():
     radii = torch.tensor([0.05, 0.3, 1.0, 30.0])
     raw = torch.tensor([raw_radius_of(radius) for radius in radii.tolist()] + [-20.0])
@@ -45,7 +40,8 @@ def test_frustum_centers_lie_in_the_frustum():
 
 
 def test_linear_offsets_count_in_radii():
-    state = _state()
+    fields = {CENTER: torch.randn(2, 5, 3), RAW_RADIUS: torch.randn(2, 5, 1)}
+    state = QueryState(torch.randn(2, 5, 16), fields)
     offsets = torch.randn(2, 5, 3, 3)
     means = made(RadiusScaledCenters, offset="linear")(offsets, state)
     radius = F.softplus(state[RAW_RADIUS])[:, :, None]
@@ -82,7 +78,7 @@ model.queries.center_init={kind: frustum, depth: [-1, 1]}
 
 
 def test_options_without_effect_or_sense_are_refused():
-    assert wrong_refusals(RECIPE, REFUSED) == []
+    assert not wrong_refusals(RECIPE, REFUSED)
 
 
 def test_idle_options_at_their_defaults_compose_again():

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 import yaml
 from commands import MODEL
+from qgs_dev.modules import seeded
 from qgs_viewer.opening import ModelSource
 from qgs_viewer.scenes import scenes_of
 from walk import Walk
@@ -36,43 +37,42 @@ RECIPE = {"model": MODEL, **yaml.safe_load(REST)}
 
 def stand_in(file, queries=8):
     """Write an untrained model of RECIPE that knows on what views it was trained; its name."""
-    ranges = "{baseline: [0.1, 0.3], turn: [2.0, 20.0], depth: [1.0, 2.0]}"
-    domain = Domain(yaml.safe_load(ranges), 48)
+    ranges = yaml.safe_load("{baseline: [0.1, 0.3], turn: [2.0, 20.0], depth: [1.0, 2.0]}")
     model = resolve(RECIPE, [f"model.queries.count={queries}"]).build_model()
-    qgs.save(model, file, extra={KEY: domain.text, "step": "7000"})
+    qgs.save(model, file, extra={KEY: Domain(ranges, 48).text, "step": "7000"})
     return str(file)
 
 
 def cloud(count):
     """Gaussians (1, G) in a cube of side 2 around the origin."""
-    make = torch.Generator().manual_seed(3)
-    means = torch.rand(1, count, 3, generator=make) * 2 - 1
-    quats = F.normalize(torch.randn(1, count, 4, generator=make), dim=-1)
-    scales = 0.04 + 0.08 * torch.rand(1, count, 3, generator=make)
-    opacities = torch.rand(1, count, generator=make) * 0.7 + 0.2
-    return Gaussians(means, scales, quats, opacities, torch.rand(1, count, 3, generator=make))
+    with seeded(3):
+        means = torch.rand(1, count, 3) * 2 - 1
+        quats = F.normalize(torch.randn(1, count, 4), dim=-1)
+        scales = 0.04 + 0.08 * torch.rand(1, count, 3)
+        opacities = torch.rand(1, count) * 0.7 + 0.2
+        return Gaussians(means, scales, quats, opacities, torch.rand(1, count, 3))
 
 
 @cache
 def model_of(kind, *overrides):
     """Untrained, with QUERIES queries."""
-    torch.manual_seed(0)
     settings = [f"model.queries.count={QUERIES}", *overrides]
-    return resolve(f"recipes/tiny/{kind}.yaml", settings).build_model().eval()
+    with seeded(0):
+        return resolve(f"tiny/{kind}.yaml", settings).build_model().eval()
 
 
-def sample_of(inputs=(1, 4), targets=(2, 3)):
+def sample_of(inputs=(1, 4)):
     """The walk as a model sees it."""
-    return make_sample(Walk(), inputs, targets, VIEWS, mirror=False)
+    return make_sample(Walk(), inputs, (2, 3), VIEWS, mirror=False)
 
 
 @cache
 def model_scenes_of(kind):
     """The walk by the small model, with refinements that move anchors, as trained ones do."""
     model = deepcopy(model_of(kind))
-    random = torch.Generator().manual_seed(2)
-    for parameter in model.refinements.parameters():
-        parameter.data += 0.03 * torch.randn(parameter.shape, generator=random)
+    with seeded(2):
+        for parameter in model.refinements.parameters():
+            parameter.data += 0.03 * torch.randn(parameter.shape)
     return scenes_of(kind, model, [sample_of(), sample_of((0, 5))])
 
 

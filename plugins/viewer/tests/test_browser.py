@@ -112,27 +112,14 @@ def assert_alone(page, file):
     assert [r for r in page.requests if r.startswith("file:")] == [file.as_uri()]
 
 
-def page_of_two_scenes(folder):
-    names = [stand_in(folder / f"{kind}.safetensors") for kind in PAIR]
-    models = open_models(names, None, "cpu")
-    return report_html(Comparison(models, {}, {}), model_scenes(models, 2))
-
-
 def test_a_report(page, tmp_path):
+    names = [stand_in(tmp_path / f"{kind}.safetensors") for kind in PAIR]
+    models = open_models(names, None, "cpu")
     file = tmp_path / "report.html"
-    file.write_text(page_of_two_scenes(tmp_path))
+    file.write_text(report_html(Comparison(models, {}, {}), model_scenes(models, 2)))
     page.open(file.as_uri())
     page.until("the script", "document.readyState == 'complete' && !!window.theme.textContent")
-    _choose(page)
-    _slide(page)
-    _zoom(page)
-    _darken(page)
-    _turn(page)
-    assert not page.errors
-    assert_alone(page, file)
 
-
-def _choose(page):
     shown = "[...document.querySelectorAll('article')].map(a => a.checkVisibility())"
     assert page.evaluate(shown) == [True, False]
     page.evaluate("document.querySelectorAll('.scenes > label')[1].click()")
@@ -140,6 +127,30 @@ def _choose(page):
     page.evaluate("document.querySelector('.scenes > input:checked').focus()")
     page.key("ArrowLeft", 37)
     assert page.evaluate(shown) == [True, False]
+
+    slide(page)
+    zoom(page)
+    paper = "getComputedStyle(document.body).backgroundColor"
+    white = "rgb(255, 255, 255)"
+    press = "document.getElementById('theme').click()"
+    assert page.evaluate(paper) == white
+    page.evaluate(press)
+    assert page.evaluate(paper) != white
+    page.evaluate(press)
+    assert page.evaluate(paper) == white
+
+    assert not page.evaluate("!!document.querySelector('iframe')")
+    page.evaluate("document.querySelector('.open').click()")
+
+    def drawn():
+        left, top, width = box_of(page, "iframe")
+        shot = page.picture()[top + 160 : top + 400, left : left + width]
+        # the scene sorts its Gaussians in a worker
+        return page.targets.count("worker") == 1 and shot.std() > 8
+
+    page.until("the scene", drawn, 180)
+    assert not page.errors
+    assert_alone(page, file)
 
 
 def box_of(page, element):
@@ -149,7 +160,7 @@ def box_of(page, element):
     return [int(page.evaluate(f"{box}.{side}")) for side in ("left", "top", "width")]
 
 
-def _slide(page):
+def slide(page):
     left, top, width = box_of(page, ".compare > div")
 
     def shown():
@@ -166,7 +177,7 @@ def _slide(page):
     assert abs(truth - render).mean() > 10
 
 
-def _zoom(page):
+def zoom(page):
     opened = "document.getElementById('zoom').open"
     alt = "document.querySelector('#zoom img').alt"
     page.evaluate("document.querySelector('.kinds img').focus()")
@@ -178,27 +189,3 @@ def _zoom(page):
     assert page.evaluate("document.querySelector('#zoom img').clientHeight") > 400
     page.key("Escape", 27)
     assert not page.evaluate(opened)
-
-
-def _darken(page):
-    paper = "getComputedStyle(document.body).backgroundColor"
-    white = "rgb(255, 255, 255)"
-    press = "document.getElementById('theme').click()"
-    assert page.evaluate(paper) == white
-    page.evaluate(press)
-    assert page.evaluate(paper) != white
-    page.evaluate(press)
-    assert page.evaluate(paper) == white
-
-
-def _turn(page):
-    assert not page.evaluate("!!document.querySelector('iframe')")
-    page.evaluate("document.querySelector('.open').click()")
-
-    def drawn():
-        left, top, width = box_of(page, "iframe")
-        shot = page.picture()[top + 160 : top + 400, left : left + width]
-        # the scene sorts its Gaussians in a worker
-        return page.targets.count("worker") == 1 and shot.std() > 8
-
-    page.until("the scene", drawn, 180)

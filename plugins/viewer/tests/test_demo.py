@@ -204,16 +204,16 @@ def room(tmp_path_factory):
 
 def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path):
     """With the same score too, of the one window that is judged."""
-    (result,) = open_models([MODEL], str(room), "cpu")
+    (result,) = opened([MODEL], room)
     (score,) = result.evaluation.scores
     (_, inputs, compared), found = next(iter(result.search.found.items()))
     done("reconstruct", MODEL, room, "--out", tmp_path / "out")
     record = json.loads((tmp_path / "out/cameras.json").read_text())
     assert record["to_photos"]["scale"] == pytest.approx(found.factor)
     assert record["to_photos"]["search"] == json.loads(json.dumps(asdict(found)))
-    opened = open_source(MODEL, photos=str(room))
-    assert tuple(opened.frames) == inputs
-    assert opened.views.scale_factor == pytest.approx(found.factor)
+    source = open_source(MODEL, photos=str(room))
+    assert tuple(source.frames) == inputs
+    assert source.views.scale_factor == pytest.approx(found.factor)
     quality = [view["psnr"] for view in record["views"] if view["kind"] == "novel"]
     assert sum(quality) / len(quality) == pytest.approx(score.values["model_psnr"], abs=0.01)
     trained = resolve(qgs.load(MODEL).recipe).views.scale_factor

@@ -68,8 +68,7 @@ def test_attention_is_that_of_the_query_that_was_asked_for():
 
 def test_files_are_of_the_width_of_a_page_with_text_and_no_date(tmp_path):
     figure = grid(attention([model_scenes_of("locus")], Detail(side=32)))
-    shown = [np.asarray(axis.images[0].get_array()).shape[0] for axis in figure.axes]
-    assert shown == [16] * 3
+    assert [np.asarray(axis.images[0].get_array()).shape[0] for axis in figure.axes] == [16] * 3
     write_figure(figure, tmp_path, "a")
     text = (tmp_path / "a.pdf").read_bytes()
     assert b"/FontFile2" in text

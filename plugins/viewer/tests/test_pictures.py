@@ -28,8 +28,7 @@ def test_an_outline_touches_the_outermost_of_the_projected_surface_points(camera
     for query in range(5):
         ball = F.normalize(torch.randn(20000, 3), dim=-1)
         surface = centers[0, query] + ball @ support.axes[0, query].mT
-        in_camera = to_camera(surface[None], camera)[0, 0]
-        pixels = to_pixels(in_camera, camera.intrinsics[0, 0])
+        pixels = to_pixels(to_camera(surface[None], camera)[0, 0], camera.intrinsics[0, 0])
         reach = (queries.outline(support, query, camera) @ directions).amax(0)
         size = reach + reach.roll(32)
         torch.testing.assert_close(
@@ -71,10 +70,9 @@ def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(
 
 def test_a_query_picture_is_grey_but_for_its_queries(model, gaussians, cameras):
     camera = finer(cameras[:, :1], 64)
-    chosen = queries.notable_queries(model, gaussians, camera, 1)
     drawn, none = (
         np.ptp(queries.query_picture(model, gaussians, some, camera).astype(int), axis=-1)
-        for some in (chosen, [])
+        for some in (queries.notable_queries(model, gaussians, camera, 1), [])
     )
     assert drawn.shape == (64, 64)
     assert 0 < (drawn > 60).mean() < 0.6
@@ -96,9 +94,6 @@ def test_attention_maps_share_one_scale_and_show_what_a_mask_hides_as_nothing():
     colors = np.ptp(pictures.astype(int), axis=-1)[:, ::8, ::8].ravel()
     assert colors[[5, 6]].min() > 100 > colors[1] > 0
     assert not colors[[0, 2, 4, 7]].any()
-
-
-AHEAD = np.array([0.0, 0.0, 1.0])
 
 
 def test_covariances_are_those_of_points_that_were_placed_one_by_one():
@@ -131,4 +126,4 @@ def test_a_click_hits_what_the_renderer_shows_there():
             assert hit(found, eye, way / np.linalg.norm(way)) == numbers[0]
             checked += 1
     assert checked > 20
-    assert hit(found, np.array([9.0, 0, 0]), AHEAD) is None
+    assert hit(found, np.array([9.0, 0, 0]), np.array([0.0, 0, 1])) is None

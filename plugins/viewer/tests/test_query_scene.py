@@ -10,6 +10,7 @@ from qgs_viewer.placement import Placement
 from qgs_viewer.queries import attention_pictures_of
 from qgs_viewer.query_scene import QueryScene
 from small import BY_DISTANCE, KINDS, cloud, model_scenes_of, source_of
+from tables import assert_equal
 from torch.testing import assert_close
 from walk import SIDE, arc, pinhole
 
@@ -46,7 +47,7 @@ def test_lines_end_on_the_patches_that_are_read_most():
     scene = model_scenes_of("locus").scene
     reading = scene.strongest(3, 2, 5, 0.4)
     shares = scene.attention(3, 2).weights[0, :, 0].mean(0).topk(5)
-    assert_close(reading.shares, shares.values, rtol=0, atol=0)
+    assert_equal(reading.shares, shares.values)
     tokens = shares.indices
     _, rows, columns = scene.grid
     patches = torch.stack([tokens % columns, tokens // columns % rows], -1)
@@ -54,8 +55,7 @@ def test_lines_end_on_the_patches_that_are_read_most():
     seen = to_camera(reading.points[None], views)[0]
     place = tokens // (rows * columns), torch.arange(5)
     pixels = to_pixels(seen, views.intrinsics[0])[place]
-    expected = (patches + 0.5).double() * SIDE / columns
-    assert_close(pixels, expected, rtol=0, atol=1e-3)
+    assert_close(pixels, (patches + 0.5).double() * SIDE / columns, rtol=0, atol=1e-3)
     assert seen[place][:, 2].tolist() == pytest.approx([0.4] * 5)
 
 

@@ -54,13 +54,6 @@ def nodes(panel):
     return {name for name in names if panel.server.scene.get_handle_by_name(f"/{name}")}
 
 
-def controls(gui, kind):
-    waiting = [*gui._container_handle_from_uuid["root"]._children.values()]
-    for handle in waiting:
-        waiting += getattr(handle, "_children", {}).values()
-    return [handle for handle in waiting if isinstance(handle, kind)]
-
-
 def test_a_query_is_picked_and_followed_through_the_layers(server, panel):
     assert nodes(panel) == BASE | {"anchors"}
     panel.pick(3)
@@ -93,7 +86,10 @@ def test_text_is_shown_as_it_is(server):
     source.title = f"title {text}"
     source.notes = (f"note {text}",)
     panel_of(server, source)
-    contents = "".join(text.content for text in controls(server.gui, viser.GuiMarkdownHandle))
+    handles = [*server.gui._container_handle_from_uuid["root"]._children.values()]
+    for handle in handles:
+        handles += getattr(handle, "_children", {}).values()
+    contents = "".join(x.content for x in handles if isinstance(x, viser.GuiMarkdownHandle))
     assert "title " in contents
     assert "note " in contents
     assert "<script" not in contents
@@ -111,9 +107,8 @@ def test_a_click_beside_everything_lets_a_query_go(panel):
 def test_gaussians_stand_before_the_background_of_their_model(server):
     """In a browser and in pages alike: what a scene serialises is what a page draws."""
     background = (0.0, 0.25, 1.0)
-    Drawing(server.scene).put(
-        replace(model_scenes_of("locus").scene, background=background), Choice()
-    )
+    scene = replace(model_scenes_of("locus").scene, background=background)
+    Drawing(server.scene).put(scene, Choice())
     messages = server._websock_server._broadcast_buffer.message_from_id.values()
     (sent,) = [m for m in messages if type(m).__name__ == "BackgroundImageMessage"]
     assert sent.format == "png"
@@ -185,9 +180,7 @@ def test_a_prediction_shows_its_picture_where_something_lies_before_the_origin()
     png = replace(prediction, gaussians=two)._repr_png_()
     picture = np.asarray(Image.open(BytesIO(png)))[:, :192].astype(int)
     redder = picture[..., 0] - picture[..., 1]
-    red = np.nonzero(redder > 70)[1]
-    green = np.nonzero(redder < -70)[1]
-    assert red.max() < 96 < green.min()
+    assert np.nonzero(redder > 70)[1].max() < 96 < np.nonzero(redder < -70)[1].min()
     assert prediction_png(prediction.to("meta")) is None
 
 
@@ -239,46 +232,39 @@ def test_a_page_never_replaces_a_file(ply, opened, tmp_path):
     assert not opened
 
 
-@pytest.fixture(scope="module")
-def port():
-    with quiet_server() as server:
-        yield server.get_port()
-
-
-def connected(port, origin=None):
+def connected(server, origin=None):
     protocol = f"viser-v{viser.__version__}"
-    return connect(f"ws://127.0.0.1:{port}", origin=origin, subprotocols=[protocol])
+    return connect(f"ws://127.0.0.1:{server.get_port()}", origin=origin, subprotocols=[protocol])
 
 
-def status(port, host):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request("GET", "/", headers={"Host": host.format(port)})
-    return connection.getresponse().status
+def test_the_page_is_served_under_names_of_this_machine_alone(server):
+    port = server.get_port()
+    for hosts, status in (
+        (("localhost:{}", "127.0.0.1:{}", "[::1]:{}", "192.168.1.7:{}"), 200),
+        (("rebound.example:{}", "127.0.0.1.example:{}", ""), 403),
+    ):
+        for host in hosts:
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+            connection.request("GET", "/", headers={"Host": host.format(port)})
+            assert connection.getresponse().status == status, host
 
 
-def test_the_page_is_served_under_names_of_this_machine_alone(port):
-    for host in ("localhost:{}", "127.0.0.1:{}", "[::1]:{}", "192.168.1.7:{}"):
-        assert status(port, host) == 200, host
-    for host in ("rebound.example:{}", "127.0.0.1.example:{}", ""):
-        assert status(port, host) == 403, host
-
-
-def test_its_own_page_alone_reads_the_scene(port):
-    with connected(port, f"http://127.0.0.1:{port}") as socket:
+def test_its_own_page_alone_reads_the_scene(server):
+    with connected(server, f"http://127.0.0.1:{server.get_port()}") as socket:
         assert socket.recv(10)
     for origin in ("http://127.0.0.1:1", "https://page.example", "null"):
         with pytest.raises(InvalidStatus):
-            connected(port, origin)
+            connected(server, origin)
 
 
-def test_a_broken_message_ends_its_connection_alone(port, capfd, caplog):
+def test_a_broken_message_ends_its_connection_alone(server, capfd, caplog):
     for message in (b"\xc1", b"", b"\x81\xa4type\xa4None", "text", b"\x00" * 99):
-        with connected(port) as socket, suppress(TimeoutError, ConnectionClosed):
+        with connected(server) as socket, suppress(TimeoutError, ConnectionClosed):
             socket.send(message)
             while True:
                 socket.recv(0.5)
         time.sleep(0.1)
-        with connected(port) as socket:
+        with connected(server) as socket:
             assert socket.recv(10)
     assert "Traceback" not in "".join(capfd.readouterr())
     assert not [record for record in caplog.records if record.exc_info]

@@ -34,14 +34,13 @@ def inside(primitive, points):
     cube = abs(np.stack([x, y, z])).max(0) - 1
     field = MAPS[int(extra)]
     places = (np.stack([x, y]) + 1) / 2 * (len(field) - 1)
-    relief = map_coordinates(field, places, order=1, mode="nearest")
     return {
         s.ELLIPSOID: x * x + y * y + z * z - 1,
         s.BOX: cube,
         s.FRUSTUM: np.maximum(abs(z) - 1, flat - (1 + extra + (extra - 1) * z) / 2),
         s.CAPSULE: np.hypot(flat, z - np.clip(z, -extra, extra)) - 1,
         s.TORUS: np.hypot(flat - 1 + extra, z) - extra,
-        s.HEIGHT: np.maximum(cube, z - relief),
+        s.HEIGHT: np.maximum(cube, z - map_coordinates(field, places, order=1, mode="nearest")),
     }[primitive.kind]
 
 

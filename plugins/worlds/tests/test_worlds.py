@@ -79,8 +79,7 @@ def test_what_is_drawn_is_spread(scenes):
     shapes = np.concatenate([scene.drawn.world.shapes for scene in scenes])
     assert {*shapes["body"]["kind"]} == {*range(6)}
     assert (shapes["cut"]["kind"] >= 0).mean() > 0.05
-    roll = np.degrees(np.arcsin(c2w[..., 2, 0]))
-    assert 3 < np.abs(roll).max() < 20
+    assert 3 < np.abs(np.degrees(np.arcsin(c2w[..., 2, 0]))).max() < 20
 
 
 def test_complexity_rations_the_shapes(scenes):

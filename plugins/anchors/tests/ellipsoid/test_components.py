@@ -56,8 +56,7 @@ def test_queries_give_what_they_learned_in_the_form_that_they_promise():
     assert_close(queries.features.std().item(), 2.0, rtol=0.1, atol=0)
     assert (queries.center[:, 2] >= 0.3).all()
     at_first = queries.support(queries.start(2))
-    expected = torch.diag(torch.tensor([0.15, 0.25, 0.45]))
-    assert_close(at_first.axes, expected.expand(2, 500, 3, 3))
+    assert_close(at_first.axes, torch.diag(torch.tensor([0.15, 0.25, 0.45])).expand(2, 500, 3, 3))
     decaying = [name for name, p in queries.named_parameters() if queries.decays(name, p)]
     assert decaying == ["features", "center", "raw_radii"]
     state = shaken(queries, 1.0).start(2)
@@ -88,8 +87,7 @@ def test_centers_follow_their_formula():
     offsets = torch.randn(2, 6, 3, 3)
     local = F.softplus(state[RAW_RADII])[:, :, None] * posact(offsets)
     steps = torch.einsum("bnij,bnkj->bnki", quat_to_matrix(state[ROTATION]), local)
-    means = made(AxisScaledCenters)(offsets, state)
-    assert_close(means, state[CENTER][:, :, None] + steps)
+    assert_close(made(AxisScaledCenters)(offsets, state), state[CENTER][:, :, None] + steps)
 
 
 def test_a_radius_along_a_direction_reaches_the_surface():
@@ -126,7 +124,7 @@ model.centers={type: ellipsoid/axis_scaled, radius_bound: offset}
 
 
 def test_options_without_effect_or_sense_are_refused():
-    assert wrong_refusals(yaml.safe_load(ELLIPSOID), REFUSED) == []
+    assert not wrong_refusals(yaml.safe_load(ELLIPSOID), REFUSED)
 
 
 ELLIPSOID = """
@@ -196,7 +194,7 @@ def test_a_trained_locusgs_is_where_a_model_that_turns_can_start():
     absent = turning.load_state_dict(from_locus(locus.state_dict()), strict=False)
     mlps = {name.rpartition(".fc")[0] for name in absent.missing_keys}
     assert mlps == {"refinements.0.rotation_mlp"}
-    assert absent.unexpected_keys == []
+    assert not absent.unexpected_keys
     photos = odd_views(2, 32, 40)
     theirs, ours = (model(photos).gaussians.means for model in (locus, turning))
     assert_close(ours, theirs)

@@ -47,8 +47,7 @@ def bias(inputs, bias_min=-20.0):
     center, sigma_sq, gamma, quats, *_ = inputs
     rays = rays_of(inputs)
     if sigma_sq.shape[-1] == 1:
-        tokens = locus.ray_tokens(rays)
-        return locus.RayBias.of(center, sigma_sq, tokens, bias_min, gamma).dense()
+        return locus.RayBias.of(center, sigma_sq, locus.ray_tokens(rays), bias_min, gamma).dense()
     place = center, anchor_rotation(quats), sigma_sq
     return EllipsoidBias.of(*place, ray_tokens(rays), bias_min, gamma).dense()
 
@@ -84,8 +83,7 @@ def test_the_bias_is_by_the_least_distance_along_the_ray(radii):
 def test_the_text_of_locusgs_says_the_same():
     inputs = double(drawn(50, 200, 1))
     center, sigma_sq, gamma, *_ = inputs
-    text = gamma * locus.dense_bias(center, sigma_sq, rays_of(inputs), -20.0)
-    assert_close(text, bias(inputs))
+    assert_close(gamma * locus.dense_bias(center, sigma_sq, rays_of(inputs), -20.0), bias(inputs))
 
 
 def test_a_needle_is_measured_exactly():

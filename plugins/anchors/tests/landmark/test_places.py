@@ -7,24 +7,18 @@ import torch
 import torch.nn.functional as F
 import yaml
 from qgs_anchors.landmark.observed import ObservedQueries
-from qgs_anchors.landmark.places import (
-    cells,
-    colors_at,
-    patch_centres,
-    sampled,
-    spread,
-)
+from qgs_anchors.landmark.places import cells, colors_at, patch_centres, sampled, spread
 from qgs_anchors.landmark.sweep import mismatch
 from qgs_locus.fields import CENTER
 from small_parts import made
 from torch.testing import assert_close
+from walk import pinhole
 
 from qgs.geometry.rays import camera_rays
-from qgs.types import Cameras, ImageMemory, Views
+from qgs.types import ImageMemory, Views
 
 GRID = (3, 4, 6)
 """Views, rows, columns."""
-SIZE = (16, 24)
 CPU = torch.device("cpu")
 
 
@@ -92,7 +86,7 @@ def within(pixels, at, side):
 
 
 def test_colours_are_means_of_squares():
-    images = torch.rand(2, 3, 3, *SIZE).double()
+    images = torch.rand(2, 3, 3, 16, 24).double()
     for x, y, side in ((15, 7, 2), (23, 15, 2), (1, 1, 2), (8.4, 8, 3), (14.7, 6.4, 3)):
         place = torch.tensor([x / 24, y / 16]).double().expand(2, 3, 2)
         found = colors_at(images, side, torch.arange(3), place)
@@ -113,8 +107,7 @@ def photos(count=2):
     skew = torch.tensor([[0, 0, -0.08, 0], [0] * 4, [0.08, 0, 0, 0], [0] * 4]).double()
     c2w = torch.linalg.matrix_exp(number[:, None, None] * skew)
     c2w[:, 0, 3] = 0.2 * number
-    lens = torch.tensor([30.0, 30.0, 16.0, 12.0]).double().expand(1, count, 4)
-    cameras = Cameras(c2w[None], lens, WALL_SIZE)
+    cameras = pinhole(c2w, (30.0, 30.0, 16.0, 12.0), WALL_SIZE)[None]
     origin, direction = camera_rays(cameras)
     far = (WALL - origin[..., 2:]) / direction[..., 2:]
     x, y, _ = (origin + far * direction).unbind(-1)
@@ -127,8 +120,7 @@ def test_differences_are_those_of_each_sample_alone():
     c2w = torch.eye(4).double().repeat(1, 2, 1, 1)
     c2w[0, 1, 0, 3] = 0.2
     ramps = torch.tensor([0.01, 0.02])[:, None, None, None] * (torch.arange(32) + 0.5)
-    images = ramps.double().expand(1, 2, 3, *WALL_SIZE)
-    given = Views(images, photos().cameras.replace(c2w=c2w))
+    given = Views(ramps.double().expand(1, 2, 3, *WALL_SIZE), photos().cameras.replace(c2w=c2w))
     place = torch.full((1, 2, 2), 0.5).double()
     error, _ = mismatch(given, torch.tensor([0, 1]), place, DEPTHS, 5.0, 3)
     at = 16 + 5 * cells(9, 3, place)[:, 0]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from contract_mutants.mutant import mutant
 from contract_mutants.slots import ChangedEncoder, Loss
-from contract_mutants.spatial import AtPlaces, PlacesByALayer
+from contract_mutants.spatial import AtPlaces, Extended, PlacesByALayer
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 from torch import nn
 
@@ -20,15 +20,7 @@ from qgs.tokengs import (
 )
 
 
-class ExtendedMlp(MlpFeedForward):
-    """A sound component, to which mutants add parts when it is built."""
-
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        self.add(dims)
-
-    def add(self, dims):
-        pass
+class ExtendedMlp(Extended, MlpFeedForward): ...
 
 
 @mutant("builds", "RuntimeError: no kernel for width 32")
@@ -47,10 +39,9 @@ class FixedNumberOfQueries(ExtendedMlp):
 
 
 @mutant("sizes_vary", "in a model of width 48 with 3 heads, RuntimeError")
-class FixedNumberOfHeads(ContentCrossAttention):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        self.core = CrossAttentionCore(dims.width, 2, config.norm_eps)
+class FixedNumberOfHeads(Extended, ContentCrossAttention):
+    def add(self, dims):
+        self.core = CrossAttentionCore(dims.width, 2, self.config.norm_eps)
 
 
 @mutant("unmet_requirement_fails_at_compose", "view size is not")
@@ -108,8 +99,7 @@ class ReadsItsWeightOnce(Opacity):
         self.weight = config.weight
 
     def term(self, prediction, rendering, target, inputs):
-        opacities = prediction.gaussians.opacities
-        return self.weight * -(opacities + self.config.eps).log().mean()
+        return self.weight * -(prediction.gaussians.opacities + self.config.eps).log().mean()
 
 
 PINNED = {
@@ -182,11 +172,10 @@ class HasAnUnusedLayer(ExtendedMlp):
 
 
 @mutant("parameters_learn", "shift: no gradient reaches it")
-class ShiftsAllLogits(ContentCrossAttention):
+class ShiftsAllLogits(Extended, ContentCrossAttention):
     """What is added to all logits alike changes no weight: its gradient is a rounding error."""
 
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+    def add(self, dims):
         self.shift = nn.Parameter(torch.zeros(1, 1, 1))
 
     def forward(self, state, memory):

@@ -44,11 +44,7 @@ def named(component: C) -> C:
 
 
 def mutant(
-    check: str,
-    seen: str,
-    *,
-    options: Mapping[str, Any] = NONE,
-    case: Mapping[str, Any] = NONE,
+    check: str, seen: str, *, options: Mapping[str, Any] = NONE, case: Mapping[str, Any] = NONE
 ) -> Callable[[C], C]:
     """Register a component as a mutant."""
 

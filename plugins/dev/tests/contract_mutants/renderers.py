@@ -74,8 +74,7 @@ class PaintsWithFeatures(ChangedRenderer):
     def given(self, gaussians, cameras):
         if gaussians.features is None:
             return gaussians, cameras
-        colors = gaussians.colors + gaussians.features[..., :3]
-        return replace(gaussians, colors=colors), cameras
+        return replace(gaussians, colors=gaussians.colors + gaussians.features[..., :3]), cameras
 
 
 @mutant(GAUSSIANS, "`gaussians.means`")

@@ -5,8 +5,10 @@ from dataclasses import replace
 import torch
 from contract_mutants.mutant import mutant
 from contract_mutants.sound import StridedConvolutions
+from contract_mutants.spatial import Extended
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck
 from torch import Tensor, nn
+from walk import pinhole
 
 from qgs.contracts import (
     MEMORY_FIELDS,
@@ -31,7 +33,7 @@ from qgs.tokengs import (
     OnePass,
 )
 from qgs.tokengs.blocks import CrossAttentionCore, split_heads
-from qgs.types import Cameras, ImageMemory, Views
+from qgs.types import ImageMemory, Views
 
 
 class ChangedEncoder(MultiViewViT):
@@ -98,8 +100,7 @@ class NoiseScene(Scene):
 
     @property
     def cameras(self):
-        lens = torch.tensor([16.0, 16.0, 12.0, 8.0]).expand(2, 4)
-        return Cameras(torch.eye(4).expand(2, 4, 4), lens, (16, 24))
+        return pinhole(torch.eye(4).expand(2, 4, 4), (16.0, 16.0, 12.0, 8.0), (16, 24))
 
     def images(self, frames):
         return torch.rand(len(frames), 3, 16, 24)
@@ -214,11 +215,10 @@ class ProjectsInSecret(LatentBottleneck):
 
 
 @mutant("memo_is_of_the_memory_alone", "depends on a weight")
-class SharesItsProjection(CrossAttention):
+class SharesItsProjection(Extended, CrossAttention):
     """Keys and values by the weights of whichever layer comes first."""
 
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+    def add(self, dims):
         self.core = CrossAttentionCore(dims.width, dims.heads)
         self.kv = nn.Linear(dims.width, 2 * dims.width)
 

@@ -8,20 +8,13 @@ import torch
 import torch.nn.functional as F
 from contract_mutants.mutant import named
 from contract_mutants.renderers import RefusesWhatItDeclares
-from contract_mutants.spatial import BiasedAttention, PlacesByALayer
+from contract_mutants.spatial import BiasedAttention, Extended, PlacesByALayer
 from einops import rearrange
 from torch import nn
 
-from qgs.contracts import (
-    MEMORY_FIELDS,
-    PatchEncoder,
-)
+from qgs.contracts import MEMORY_FIELDS, PatchEncoder
 from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.tokengs import (
-    ContentCrossAttention,
-    MlpFeedForward,
-    MultiViewViT,
-)
+from qgs.tokengs import ContentCrossAttention, MlpFeedForward, MultiViewViT
 from qgs.tokengs.blocks import merge_heads
 from qgs.tokengs.encoder import keys_and_values
 from qgs.types import ImageMemory
@@ -63,14 +56,13 @@ class FusesInHalf(ContentCrossAttention):
 
 
 @named
-class SeesFar(MultiViewViT):
+class SeesFar(Extended, MultiViewViT):
     """Convolutions over 19 pixels, before patches of 8 are cut."""
 
     class Config(MultiViewViT.Config):
         depth: int = 1
 
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+    def add(self, dims):
         layers = [(3, 16), (16, 16), (16, 3)]
         self.stem = nn.Sequential(
             *(nn.Sequential(nn.Conv2d(i, o, 7, padding=3), nn.Tanh()) for i, o in layers)
@@ -81,17 +73,16 @@ class SeesFar(MultiViewViT):
         return super().embed(replace(views, images=seen), plucker)
 
 
-class StridedConvolutions(PatchEncoder):
+class StridedConvolutions(Extended, PatchEncoder):
     """Each halves the sides. Kernels of 3 put a token's centre nearly half a patch off."""
 
     class Config(PatchEncoder.Config):
         kernel: int = 3
         patch_size: Literal[4, 8, 16] = 8
 
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        sizes = pairwise([9, *[dims.width] * (config.patch_size.bit_length() - 1)])
-        layers = [(nn.Conv2d(i, o, config.kernel, 2, padding=1), nn.GELU()) for i, o in sizes]
+    def add(self, dims):
+        sizes = pairwise([9, *[dims.width] * (self.config.patch_size.bit_length() - 1)])
+        layers = [(nn.Conv2d(i, o, self.config.kernel, 2, padding=1), nn.GELU()) for i, o in sizes]
         self.layers = nn.Sequential(*(part for layer in layers for part in layer))
         self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
         self.k_norm = nn.LayerNorm(dims.width // dims.heads)

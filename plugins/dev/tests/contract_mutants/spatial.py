@@ -25,6 +25,14 @@ CHECK = "reads_within_requires"
 PLACE: Fields = {"place.center": FieldSpec((3,), frame="world")}
 
 
+class Extended:
+    """A sound component with parts that are added when it is built."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.add(dims)
+
+
 class AtPlaces:
     """A component that reads centres."""
 
@@ -33,21 +41,19 @@ class AtPlaces:
         return PLACE
 
 
-class PlacesByALayer(AtPlaces, ContentSelfAttention):
+class PlacesByALayer(Extended, AtPlaces, ContentSelfAttention):
     """Attention that has a layer for centres."""
 
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+    def add(self, dims):
         self.place = nn.Linear(3, dims.width)
 
 
-class Steps(AtPlaces, Refinement):
+class Steps(Extended, AtPlaces, Refinement):
     """Sound: it moves the centres by a layer."""
 
     name = "steps"
 
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+    def add(self, dims):
         self.step = nn.Linear(dims.width, 3)
 
     @classmethod
@@ -121,9 +127,6 @@ CHECK = "geometry_is_float32_under_autocast"
 TURN = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
 
 
-RADIUS = {"place.radius": FieldSpec((1,))}
-
-
 @mutant(CHECK, "bfloat16, not float32")
 class GivesHalf(FreeCenters):
     def forward(self, offsets, state):
@@ -151,12 +154,10 @@ class BiasedAttention(ContentCrossAttention):
     """Attention with the bias that a subclass computes."""
 
     def forward(self, state, memory):
-        bias = self.bias(state, memory)
-        return self.core(state.features, memory.keys, memory.values, bias)
+        return self.core(state.features, memory.keys, memory.values, self.bias(state, memory))
 
     def explain(self, state, memory, queries):
-        bias = self.bias(state, memory)
-        return self.core.explain(state.features, memory.keys, queries, bias)
+        return self.core.explain(state.features, memory.keys, queries, self.bias(state, memory))
 
 
 @mutant(CHECK, "explain.geometry")
@@ -168,8 +169,7 @@ class BiasesInHalf(BiasedAttention):
 
     def bias(self, state, memory):
         center = state["place.center"]
-        directions = memory.patch_rays[..., 3:]
-        return (center @ directions.mT).to(center)
+        return (center @ memory.patch_rays[..., 3:].mT).to(center)
 
 
 @mutant("updates_are_explained", "of them is unexplained")
@@ -186,9 +186,8 @@ class ExplainsNoBias(BiasesInHalf):
 
 @mutant("forward_keeps_no_state", "in training changes a parameter or buffer")
 @mutant("batch_independence", "in training, scene 0 has a gradient")
-class BatchNormed(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+class BatchNormed(Extended, MlpFeedForward):
+    def add(self, dims):
         self.statistics = nn.BatchNorm1d(dims.width)
 
     def forward(self, features):

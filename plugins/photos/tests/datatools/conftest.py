@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from planted import Planted, good_sets
+from planted import HASH, Planted, Room, record, save
 from qgs_photos.datatools import geometry
 from textured_room import walk
 
@@ -36,8 +36,15 @@ def shots():
 
 @pytest.fixture(scope="session")
 def good(tmp_path_factory, shots):
+    """A nerfstudio folder, chunks with two scenes and an index, and an archive, all sound."""
     root = tmp_path_factory.mktemp("good")
-    good_sets(root, shots)
+    Room(shots).write(root / "room")
+    shutil.make_archive(str(root / "archives" / HASH), "zip", root / "room")
+    save(root / "chunks/test/0.torch", [record("a", shots), record("b", shots[:3])])
+    (root / "chunks/test/index.json").write_text('{"a": "0.torch", "b": "0.torch"}')
+    (root / "chunks/evaluation.json").write_text(
+        '{"a": {"context": [0, 5], "target": [2]}, "b": {"context": [0, 2], "target": [1]}}'
+    )
     return root
 
 

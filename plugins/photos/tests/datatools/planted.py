@@ -1,20 +1,18 @@
 """Sound data sets of several formats, and scenes to plant faults in."""
 
 import json
-import shutil
 from fnmatch import fnmatchcase
 
 import numpy as np
 import torch
-from photo_formats import encoded
+from photo_formats import encoded, opengl
 from qgs_photos.datatools.check import Options, check
 from textured_room import INTRINSICS, SIZE
 from upath import UPath
 
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 HASH = "0123456789abcdef" * 4
 ALL = "frames 0-5 (images/0.jpg to images/5.jpg): "
-CAMERA = dict(zip(("fl_x", "fl_y", "cx", "cy", "h", "w"), INTRINSICS + SIZE, strict=True))
+CAMERA = ("fl_x", "fl_y", "cx", "cy", "h", "w")
 
 
 class Room:
@@ -24,7 +22,7 @@ class Room:
         self.files = {f"images/{n}.jpg": shot.encoded() for n, shot in enumerate(shots)}
         self.frames = [{"file_path": name} for name in self.files]
         self.poses = np.stack([shot.c2w for shot in shots])
-        self.camera = dict(CAMERA)
+        self.camera = dict(zip(CAMERA, INTRINSICS + SIZE, strict=True))
 
     def mask(self, masks):
         for number, mask in enumerate(masks):
@@ -32,8 +30,8 @@ class Room:
             self.frames[number]["mask_path"] = f"masks/{number}.png"
 
     def write(self, folder):
-        for frame, pose in zip(self.frames, self.poses @ FLIP, strict=True):
-            frame["transform_matrix"] = pose.tolist()
+        for frame, pose in zip(self.frames, opengl(self.poses), strict=True):
+            frame["transform_matrix"] = pose
         listing = json.dumps({**self.camera, "frames": self.frames})
         for name, data in {**self.files, "transforms.json": listing.encode()}.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -72,19 +70,9 @@ def alike(lines, patterns):
     return len(lines) == len(patterns) and all(map(fnmatchcase, lines, patterns))
 
 
-def told(path, index=(), geometry=1):
-    return [*map(str, check(UPath(path), Options(geometry), index).findings)]
-
-
-def good_sets(root, shots):
-    """A nerfstudio folder, chunks with two scenes and an index, and an archive, all sound."""
-    Room(shots).write(root / "room")
-    shutil.make_archive(str(root / "archives" / HASH), "zip", root / "room")
-    save(root / "chunks/test/0.torch", [record("a", shots), record("b", shots[:3])])
-    (root / "chunks/test/index.json").write_text('{"a": "0.torch", "b": "0.torch"}')
-    (root / "chunks/evaluation.json").write_text(
-        '{"a": {"context": [0, 5], "target": [2]}, "b": {"context": [0, 2], "target": [1]}}'
-    )
+def assert_told(path, patterns, index=(), geometry=1):
+    found = [*map(str, check(UPath(path), Options(geometry), index).findings)]
+    assert alike(found, patterns), found
 
 
 def record(key, shots):

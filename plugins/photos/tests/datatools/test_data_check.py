@@ -3,11 +3,11 @@
 import re
 import shutil
 
-from commands import run_qgs
+from commands import typed
 
 
 def run(words):
-    result = run_qgs("data", "check", *words.split())
+    result = typed(f"data check {words}")
     return result.output, result.exit_code
 
 

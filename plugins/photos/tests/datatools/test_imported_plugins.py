@@ -3,7 +3,7 @@
 import re
 import sys
 
-from commands import run_qgs
+from commands import typed
 from qgs_photos.datatools import sources
 
 ALL = {
@@ -38,11 +38,11 @@ def test_commands_import_the_plugins_that_are_asked_for(install, tmp_path, monke
     imported = []
     for words in (*ALL, *SOME):
         sources._imported.cache_clear()
-        run_qgs(*words.split())
+        typed(words)
         if sys.modules.pop("_test_marked", None):
             imported.append(words)
     sources._imported.cache_clear()
     assert imported == [*ALL]
     for command in ALL.values():
-        words = re.findall(r"\w+", run_qgs(*command.split(), "--help").output)
+        words = re.findall(r"\w+", typed(f"{command} --help").output)
         assert "mports every" in " ".join(words)

@@ -8,7 +8,7 @@ import numpy as np
 import photo_formats
 import pytest
 import torch
-from commands import run_qgs
+from commands import done
 from photo_formats import row_of_frames
 from PIL import Image
 from qgs_photos.datasets.chunks import ChunksSource
@@ -40,7 +40,7 @@ CHANGED = {
 """Scenes whose photos keep their bytes, and others."""
 
 
-def noise(seed, kind="RGB"):
+def noise(seed, kind):
     pixels = np.random.default_rng(seed).integers(0, 256, (48, 64, 4), np.uint8)
     return Image.fromarray(pixels).convert(kind)
 
@@ -92,16 +92,12 @@ def kinds(tmp_path_factory):
     return root
 
 
-def scenes(folder, count):
-    """A source of scenes s0, s1 ... of two photos."""
-    for number in range(count):
-        photos(folder / f"scenes/s{number}", frames=2)
-    return source(folder / "scenes")
-
-
 @pytest.fixture
 def six(tmp_path):
-    return scenes(tmp_path, 6)
+    """A source of scenes s0, s1 ... of two photos."""
+    for number in range(6):
+        photos(tmp_path / f"scenes/s{number}", frames=2)
+    return source(tmp_path / "scenes")
 
 
 def test_chunks_read_as_their_source_does(kinds, tmp_path):
@@ -182,12 +178,11 @@ def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path
     result = pack(six, tmp_path / "others", leave_out_broken=True)
     assert result.scenes["train"] == 5
     assert "images/1.png" in result.left_out["s3"]
-    alone = {"train": {"s3": ("train", 3)}, "test": {}}
     must_refuse(
         "no scene to pack: s3: ",
         packing.pack,
         six,
-        alone,
+        {"train": {"s3": ("train", 3)}, "test": {}},
         UPath(tmp_path / "none"),
         {},
         leave_out_broken=True,
@@ -200,8 +195,7 @@ def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path
     same(six, packed(out))
 
 
-def test_an_interrupted_packing_goes_on(tmp_path):
-    before = scenes(tmp_path, 4)
+def test_an_interrupted_packing_goes_on(six, tmp_path):
     out = tmp_path / "chunks"
     for last in range(1, 4):
 
@@ -210,21 +204,19 @@ def test_an_interrupted_packing_goes_on(tmp_path):
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            pack(before, out, chunk_bytes=1, progress=interrupted)
+            pack(six, out, chunk_bytes=1, progress=interrupted)
         assert len([*out.rglob("*.torch")]) == last
         assert not list(out.rglob("index.json"))
         (out / "train/.000009.torch.1.tmp").touch()  # as a killed process leaves
-    result = pack(before, out, chunk_bytes=1)
-    assert (result.resumed, result.frames) == (3, 2)
+    result = pack(six, out, chunk_bytes=1)
+    assert (result.resumed, result.frames) == (3, 6)
     names = sorted(file.name for file in out.rglob("*.*"))
-    assert names == [*(f"00000{number}.torch" for number in range(4)), "index.json"]
-    same(before, packed(out))
+    assert names == [*(f"00000{number}.torch" for number in range(6)), "index.json"]
+    same(six, packed(out))
 
 
 def command(words):
-    result = run_qgs("data", "pack", *words.split())
-    assert result.exit_code == 0, result.output
-    return result.output
+    return done("data", "pack", *words.split()).output
 
 
 def test_the_command(six, tmp_path):

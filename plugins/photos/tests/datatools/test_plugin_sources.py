@@ -6,14 +6,10 @@ import numpy as np
 import photo_formats
 import pytest
 import tape_source
-from commands import run_qgs
+from commands import typed
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools import sources
 from tape_source import Tape
-
-
-def run(words):
-    return run_qgs("data", *words.split())
 
 
 @pytest.fixture
@@ -27,17 +23,17 @@ def tapes(tmp_path, monkeypatch):
 
 
 def test_check(tapes):
-    commands = [f"check {tapes} --quick --format {format}" for format in ("auto", "tapes/tape")]
-    for good in map(run, commands):
+    commands = [f"data check {tapes} --quick --format {kind}" for kind in ("auto", "tapes/tape")]
+    for good in map(typed, commands):
         assert good.exit_code == 0, good.output
         assert "2 scenes, 0 errors" in good.output
-    refused = str(run(f"check {tapes} --format rooms/procedural").exception)
+    refused = str(typed(f"data check {tapes} --format rooms/procedural").exception)
     assert refused.startswith("there is no format 'rooms/procedural': use one of auto, nerfstudio")
     arrays = dict(np.load(tapes / "b.tape"))
     arrays["c2w"][3] = np.nan
     with (tapes / "b.tape").open("wb") as file:
         np.savez(file, **arrays)
-    for bad in map(run, commands):
+    for bad in map(typed, commands):
         assert bad.exit_code == 1
         assert "error: b, frame 3 (3): the pose has NaN" in bad.output
 
@@ -45,7 +41,7 @@ def test_check(tapes):
 def test_missing_images_are_told_and_counted(tapes, monkeypatch):
     monkeypatch.setattr(Tape, "missing", ("2.png", "4.png"))
     (tapes / "index.json").write_text('{"a": {"context": [0, 6], "target": [2]}}')
-    output = run(f"check {tapes} --quick").output
+    output = typed(f"data check {tapes} --quick").output
     assert re.search("a +tapes/tape +8 +6 +2 ", output)
     assert (
         "error: a: listed images that do not exist: 2.png, 4.png; later frames move up in an "
@@ -67,14 +63,14 @@ def test_a_source_that_fails_is_told_and_the_others_go_on(tapes, monkeypatch):
 
         with monkeypatch.context() as patch:
             patch.setattr(Tape, method, fails)
-            output = run(f"check {tapes} --quick").output
+            output = typed(f"data check {tapes} --quick").output
         assert f"error: {line}" in output
         assert re.search("b +tapes/tape +6 +6 +0 ", output)
         assert "2 scenes, 1 error" in output
 
 
 def test_pack(tapes):
-    packed = run(f"pack {tapes} --out {tapes}/chunks --set image_size=[16,16]")
+    packed = typed(f"data pack {tapes} --out {tapes}/chunks --set image_size=[16,16]")
     assert packed.exception is None, packed.output
     scenes = photo_formats.opened(tapes / "chunks", (16, 16), ChunksSource).scenes("train")
     told = [(scene.name, len(scene), scene.held_out) for scene in scenes]

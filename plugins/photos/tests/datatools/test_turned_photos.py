@@ -64,8 +64,7 @@ def test_cameras_and_pixels_are_the_upright_ones(written, shots):
         read = scene(folder, SIZE)
         assert_allclose(read.cameras.c2w, [s.c2w for s in shots[:4]], 1e-7, 1e-7)
         assert_allclose(read.cameras.intrinsics, [INTRINSICS] * 4, 1e-7)
-        image = read.images([1])[0].permute(1, 2, 0) * 255
-        assert_allclose(image, shots[1].image, 1e-6)
+        assert_allclose(read.images([1])[0].permute(1, 2, 0) * 255, shots[1].image, 1e-6)
         assert_allclose(read.masks([1])[0, 0], shots[1].image[..., 0] > 128)
         assert read.stored_size(0) == SIZE
         report = check(UPath(folder), Options(threads=1))
@@ -78,8 +77,7 @@ def test_a_lens_turns_with_its_photo(written, shots):
     stored = scene(written(6, "stored", k1=0.05, p1=0.004, p2=-0.003), SIZE)
     folder = written(6, "upright", k1=0.05, p1=-0.003, p2=-0.004)
     (folder / "images/0.jpg").write_bytes(encoded(shots[0].image))
-    upright = scene(folder, SIZE)
-    found, expected = (read.images([0]) for read in (stored, upright))
+    found, expected = (read.images([0]) for read in (stored, scene(folder, SIZE)))
     assert torch.allclose(found, expected, 0, 1.5 / 255)
 
 

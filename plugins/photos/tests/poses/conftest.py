@@ -5,7 +5,7 @@ import pytest
 import textured_room
 from PIL import Image
 from qgs_photos.poses.making import Options, make_poses
-from walked import PHOTOS, SCALE, cut, quiet
+from walked import PHOTOS, QUIET, SCALE, cut
 
 
 @pytest.fixture(scope="session")
@@ -51,4 +51,4 @@ def walk(images, tmp_path_factory):
 def made(walk, tmp_path_factory):
     """A folder, and its poses, of copies of the photos that are smaller than they are."""
     folder = tmp_path_factory.mktemp("made") / "poses"
-    return folder, make_poses(walk, folder, Options(side=240), quiet())
+    return folder, make_poses(walk, folder, Options(side=240), QUIET)

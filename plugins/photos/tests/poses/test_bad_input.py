@@ -67,8 +67,7 @@ def test_what_cannot_be_written_is_named(walk, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(making, "prepare", full)
-    result = run_qgs("poses", walk, "--out", tmp_path / "out")
-    assert "free space" in str(result.exception)
+    assert "free space" in str(run_qgs("poses", walk, "--out", tmp_path / "out").exception)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from qgs_photos.poses.making import Options, make_poses
 from qgs_photos.poses.photos import PosesError
 from tables import must_refuse
 from upath import UPath
-from walked import PHOTOS, SCALE, quiet, write_photos, write_video
+from walked import PHOTOS, QUIET, SCALE, write_photos, write_video
 
 import qgs
 from qgs.data.photos import formats_of, read_listing
@@ -75,14 +75,14 @@ def test_other_folders_are_left_alone(walk, made, tmp_path):
     notes.write_text("keep")
     for taken in (tmp_path, notes, made[0]):
         with pytest.raises(FileExistsError):
-            make_poses(walk, taken, Options(), quiet())
+            make_poses(walk, taken, Options(), QUIET)
     assert notes.read_text() == "keep"
 
 
 @pytest.mark.slow
 def test_one_thread_and_a_seed_give_the_same_file(walk, tmp_path):
     for name in "ab":
-        make_poses(walk, tmp_path / name, Options(threads=1), quiet())
+        make_poses(walk, tmp_path / name, Options(threads=1), QUIET)
     one, other = ((tmp_path / name / "sparse/0/images.bin").read_bytes() for name in "ab")
     assert one == other
 
@@ -99,7 +99,7 @@ def test_turning_on_the_spot_gives_no_poses(monkeypatch, shots, tmp_path):
         folder,
         tmp_path / "poses",
         Options(threads=1),
-        quiet(),
+        QUIET,
         kind=PosesError,
     )
 

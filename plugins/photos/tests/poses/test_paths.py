@@ -7,19 +7,14 @@ import av
 import numpy as np
 import pytest
 import torch
-from commands import done, run_qgs
+from commands import done, run_qgs, typed
 from photo_formats import noisy_photos, row_of_frames
 from PIL import Image, ImageSequence
-from qgs_photos.poses.filming import (
-    FilmScene,
-    cameras_of,
-    open_film_scene,
-    seen_depth,
-    write_film,
-)
+from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, seen_depth, write_film
 from qgs_photos.poses.paths import path_of, read_path, walk
 from tables import must_refuse
 from training_runs import tiny
+from walk import pinhole
 from walked import frames
 
 import qgs
@@ -37,7 +32,7 @@ def cameras():
     """A row of cameras that looks along z."""
     c2w = torch.eye(4).repeat(7, 1, 1)
     c2w[:, 0, 3] = torch.linspace(-0.5, 0.5, 7)
-    return Cameras(c2w[None], torch.tensor([44.0, 44, 27, 18]).expand(1, 7, 4), SIZE)
+    return pinhole(c2w, (44.0, 44.0, 27.0, 18.0), SIZE)[None]
 
 
 def wall(depth):
@@ -145,15 +140,14 @@ def test_the_command_films(made, tmp_path):
     save_ply(wall(3.0), tmp_path / "scene.ply")
     out = tmp_path / "a.mp4"
     film = f"{tmp_path} {made[0]} --out {out} --path walk --seconds 0.4 --rate 5 --size 32x48"
-    result = run_qgs("video", *film.split())
-    assert result.exit_code == 0, result.output
+    done("video", *film.split())
     assert len(frames(out)) == 2
     for refused, error in (
         (f"{tmp_path}", ValueError),
         ("nothing", FileNotFoundError),
         (film.replace("a.mp4", "b.mp4").replace("walk", "walks"), ValueError),
     ):
-        assert isinstance(run_qgs("video", *refused.split()).exception, error)
+        assert isinstance(typed(f"video {refused}").exception, error)
 
 
 def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path):

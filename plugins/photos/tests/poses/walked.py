@@ -7,13 +7,10 @@ import numpy as np
 from PIL import Image
 from rich.console import Console
 
+QUIET = Console(quiet=True)
 SCALE = 2
 PHOTOS = 6
 """Size of the photos over that of `textured_room`, and how many there are."""
-
-
-def quiet():
-    return Console(quiet=True)
 
 
 def write_photos(folder, images, name="{}.png"):

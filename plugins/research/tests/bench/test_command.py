@@ -4,7 +4,7 @@ import json
 import re
 
 import yaml
-from commands import run_qgs
+from commands import typed
 from qgs_research.bench import run
 from qgs_research.bench.work import Peak
 
@@ -16,7 +16,7 @@ SMALL = f"--size 16x24 --device cpu --rounds 3 --warmup 0 --set {' --set '.join(
 
 
 def bench(words):
-    return run_qgs("bench", *f"{words} {SMALL}".split())
+    return typed(f"bench {words} {SMALL}")
 
 
 def test_recipes_are_compared_with_the_first(tmp_path, monkeypatch):
@@ -66,6 +66,6 @@ MISTAKES = """
 
 def test_mistakes():
     for words, named in yaml.safe_load(MISTAKES).items():
-        error = run_qgs("bench", TOKENGS, *words.split(), "--device", "cpu").exception
+        error = typed(f"bench {TOKENGS} {words} --device cpu").exception
         assert isinstance(error, ValueError), words
         assert named in str(error), words

@@ -1,21 +1,19 @@
 """Published weights become checkpoints: every tensor accounted for, or nothing is written."""
 
 import os
-from functools import partial
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 import torch
 from commands import run_qgs
+from fuzzing.kill import RECIPES
 from published.files import read_golden
 from qgs_research.published.importing import import_weights
 from qgs_research.published.layouts import PublishedError, fitting_recipe, names_of
 from qgs_research.published.tokengs import TOKENGS
 from qgs_research.published.tokengs2026 import TOKENGS_2026_6
 from safetensors.torch import load_file, save_file
-from tables import must_refuse
-from torch.testing import assert_close
+from tables import assert_equal, must_refuse
 
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
@@ -23,16 +21,12 @@ from qgs.checkpoint.tensors import shapes_of
 from qgs.recipe import resolve
 from qgs.recipe.recipe import differing_predictions
 
-ROOT = Path(__file__).parents[4]
-RECIPES = ROOT / "recipes"
-
 
 def published(name):
     """The state dict in a golden file."""
-    return read_golden(ROOT / f"tests/golden/{name}.safetensors").weights()
+    return read_golden(RECIPES.parent / f"tests/golden/{name}.safetensors").weights()
 
 
-equal = partial(assert_close, rtol=0, atol=0)
 TOKENGS_A = published("tokengs_a")
 LOCUS = published("locus_full_a")
 
@@ -57,7 +51,7 @@ def test_every_tensor_arrives_bit_equal_or_is_known_as_unused(tmp_path):
         known = names_of(imported(folder, given).recipe)
         ours = load_file(folder / "made.safetensors")
         assert given.keys() == {*known.published.values(), *known.unused}
-        equal(ours, {key: given[theirs] for key, theirs in known.published.items()})
+        assert_equal(ours, {key: given[theirs] for key, theirs in known.published.items()})
 
 
 def test_an_imported_checkpoint_is_like_any_other(tmp_path):
@@ -134,10 +128,8 @@ def test_other_precisions_are_converted_and_told(tmp_path):
         save_file(weights, tmp_path / f"{kind}.safetensors")
         out = tmp_path / f"made_{kind}/x.safetensors"
         words = ("import", tmp_path / f"{kind}.safetensors", "--recipe", "auto", "--out", out)
-        told = run_qgs(*words).output
-        assert f"converted to float32: 109 of 109 are {kind}" in told
-        centers = load_file(out)["queries.center"]
-        assert torch.equal(centers, weights["gs_anchor_xyz_raw"].float())
+        assert f"converted to float32: 109 of 109 are {kind}" in run_qgs(*words).output
+        assert torch.equal(load_file(out)["queries.center"], weights["gs_anchor_xyz_raw"].float())
 
 
 def test_parameters_that_share_memory_or_lie_in_strides(tmp_path):
@@ -150,7 +142,7 @@ def test_parameters_that_share_memory_or_lie_in_strides(tmp_path):
     done = import_weights(tmp_path / "w.pt", None, tmp_path / "c.safetensors")
     ours = load_file(tmp_path / "c.safetensors")
     known = names_of(done.recipe).published
-    equal(ours, {key: weights[theirs] for key, theirs in known.items()})
+    assert_equal(ours, {key: weights[theirs] for key, theirs in known.items()})
 
 
 def test_weights_that_are_no_numbers_are_refused(tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 import yaml
 from qgs_research.published.locus import LOCUSGS
-from qgs_research.published.weight_layout import LayoutError, renamed
+from qgs_research.published.weight_layout import LayoutError
 
 import qgs
 
@@ -25,7 +25,6 @@ model:
   centers: {type: locus/radius_scaled}
   supervision: {layers: [2, 3]}
 """)
-CONTENT = "model.decoder.cross_attention={type: qgs/content}"
 FIXED_CENTERS = ("model.queries.radius=false", "model.decoder.refinement.radius=false",
                  "model.decoder.cross_attention.bandwidth=fixed",
                  "model.centers={type: locus/anchor_offset}")  # fmt: skip
@@ -47,7 +46,7 @@ def test_the_recipe_that_is_read_makes_the_same_model():
         (),
         FIXED_CENTERS,
         ("model.decoder.refinement.radius=false",),
-        (CONTENT,),
+        ("model.decoder.cross_attention={type: qgs/content}",),
         ("model.decoder.self_attention={type: qgs/content}",),
         ("model.encoder.depth=0", "model.encoder.mlp_ratio=4"),
     ):
@@ -56,20 +55,6 @@ def test_the_recipe_that_is_read_makes_the_same_model():
         read = qgs.compose(LOCUSGS.read(shapes), device="meta")
         assert published_shapes(read) == shapes
         assert read.recipe["model"] == own.recipe["model"]
-
-
-def test_what_is_never_read_stands_beside_what_is():
-    for overrides, each_layer in (((), 9), ((CONTENT,), 8)):
-        names = published_shapes(composed(*overrides))
-        unused = {renamed(name, *rule) for name in names for rule in LOCUSGS.unused} - {None}
-        assert len(unused) == 3 * each_layer
-        assert not unused & names.keys()
-
-
-def test_only_its_own_files_have_its_marks():
-    marks = set(LOCUSGS.marks)
-    assert marks <= published_shapes(composed()).keys()
-    assert not marks <= {"gs_tokens", "patch_embed.proj.weight"}
 
 
 def test_shapes_without_a_recipe_are_refused():

@@ -23,15 +23,13 @@ def results(name, recipe="", seed=None, step=None, **psnr):
     """Of one training, with an LPIPS of PSNR / 100."""
     scenes = {scene: {"model_psnr": v, "model_lpips": v / 100} for scene, v in psnr.items()}
     protocol = Protocol("rooms", {"format": 1, "views": "rooms"})
-    frames = dict.fromkeys(scenes, ("0 3", "1 2"))
-    stored = StoredResults(name, protocol, COLUMNS, scenes, frames)
+    stored = StoredResults(name, protocol, COLUMNS, scenes, dict.fromkeys(scenes, ("0 3", "1 2")))
     return replace(stored, recipe=recipe, seed=seed, step=step)
 
 
 def test_scenes_pair_by_name():
     first = results("first", c=11.0, b=10.0, a=9.0, other=1.0, another=2.0)
-    second = results("second", a=10.0, b=12.0, c=11.0, only=50.0)
-    scores = compare([first, second])
+    scores = compare([first, results("second", a=10.0, b=12.0, c=11.0, only=50.0)])
     psnr, lpips = (scores.difference("second", metric) for metric in COLUMNS)
     assert (psnr.mean, psnr.scenes) == (pytest.approx(1.0), 3)
     assert lpips.mean == pytest.approx(0.01)
@@ -90,8 +88,7 @@ def test_two_runs_compare_scene_by_scene(tmp_path):
         folder = run / "evaluation"
         done("eval", f"rooms/{run.name}", "--set", "evaluation.scenes=2", "--out", folder)
         means.append(json.loads((folder / "summary.json").read_text())["model"]["psnr"])
-    shown = done("compare", *runs, "--out", tmp_path).output
-    assert "95 % interval" in shown
+    assert "95 % interval" in done("compare", *runs, "--out", tmp_path).output
     table = json.loads((tmp_path / "comparison.json").read_text())["table"]
     apart = next(row["difference"] for row in table if row["variant"] == str(runs[1]))
     assert apart["mean"] == pytest.approx(means[1] - means[0])

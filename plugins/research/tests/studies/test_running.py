@@ -7,7 +7,6 @@ import re
 import signal
 import sys
 import time
-from pathlib import Path
 
 import pytest
 from commands import done
@@ -20,12 +19,10 @@ from qgs_research.studies.study import read_study
 from rich.console import Console
 from tables import must_refuse
 
-RECIPES = Path(__file__).parents[4] / "recipes"
-
 
 @pytest.fixture
 def study(tmp_path):
-    text = kill.STUDY.format(recipes=RECIPES, steps=12)
+    text = kill.STUDY.format(recipes=kill.RECIPES, steps=12)
     text = text.replace("seeds: [0, 1, 2]", "seeds: [0, 1]")
     text = re.sub(r"  (free|tokengs):.*\n|differs:.*\n", "", text)
     text = re.sub(r"hypotheses:.*", "hypotheses: [flat < locus]", text)
@@ -64,11 +61,10 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
     must_refuse("`flat`", done, "study", study, "--out", out, "--workers", 0)
 
 
-def trained(plan, runs=None, workers=1):
+def trained(plan, workers):
     console = Console(file=io.StringIO())
-    runs = runs or plan.runs
     ended = running.train_missing(
-        plan, runs, workers=workers, threads=1, device="cpu", console=console
+        plan, plan.runs, workers=workers, threads=1, device="cpu", console=console
     )
     return *ended, console.file.getvalue()
 
@@ -87,7 +83,7 @@ def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted
     first.failure.write_text("CollapseError: training collapsed at step 7: it\nLikely causes")
     say = "print('threads', os.environ['OMP_NUM_THREADS'], words, flush=True)"
     stub(monkeypatch, f"{say}; os.kill(os.getpid(), 9)")
-    failed, stopped, told = trained(plan, workers=2)
+    failed, stopped, told = trained(plan, 2)
     assert {*failed} == {*plan.runs}
     assert stopped is None
     assert str(first.failure) in told
@@ -101,7 +97,7 @@ def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted
 
 def test_a_signal_ends_the_processes_and_the_call(plan, monkeypatch):
     stub(monkeypatch, f"os.kill({os.getpid()}, 15); time.sleep(600)")
-    failed, stopped, _ = trained(plan, workers=1)
+    failed, stopped, _ = trained(plan, 1)
     assert (failed, stopped) == ([], signal.SIGTERM)
 
 

@@ -3,13 +3,12 @@
 import os
 import subprocess
 import time
-from pathlib import Path
 
 import pytest
 from commands import done, run_qgs, sets
 from tables import must_refuse
 
-RECIPE = Path(__file__).parents[4] / "recipes/tiny/locus.yaml"
+RECIPE = "tiny/locus.yaml"
 
 
 def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(tmp_path, monkeypatch):

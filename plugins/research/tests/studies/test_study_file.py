@@ -5,10 +5,10 @@ import re
 import shutil
 import textwrap
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 from commands import done
+from fuzzing.kill import RECIPES
 from qgs_research.studies.hypotheses import parsed
 from qgs_research.studies.plan import composed, planned
 from qgs_research.studies.runs import recipe_file, run_of, write_plan
@@ -18,7 +18,6 @@ from tables import must_refuse
 from qgs.contracts import OptionError
 from qgs.recipe import RecipeError, resolve
 
-RECIPES = Path(__file__).parents[4] / "recipes"
 SOUND = f"""study: 1
 base: {RECIPES}/tiny/locus.yaml
 variants:

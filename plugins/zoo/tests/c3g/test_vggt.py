@@ -8,12 +8,11 @@ import qgs_zoo.c3g.vggt
 import torch
 import torch.nn.functional as F
 from odd_views import odd_views
-from qgs_dev import Case, checks_for, run_check
+from qgs_dev import Case, CaseRun
 from qgs_zoo.c3g.vggt import MODULE, VggtFeatures
 from safetensors.torch import load_file, save_file
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from torch import nn
-from torch.testing import assert_close
 
 import qgs
 from qgs.contracts import MissingExtraError, ModelDims
@@ -86,14 +85,17 @@ def test_weights_are_the_users(weights):
     del given["camera_head.weight"]
     for suffix in (".safetensors", ".pt"):
         made = encoder(weights.with_suffix(suffix)).aggregator
-        assert_close(made.state_dict(prefix="aggregator."), given, rtol=0, atol=0)
+        assert_equal(made.state_dict(prefix="aggregator."), given)
 
 
 def overrides(weights):
     """Of the tiny recipe, to C3G's with VGGT."""
     return [
         f"model.encoder={{type: c3g/vggt_features, weights: {weights}}}",
-        *("model.width=8", "model.heads=2", "model.queries.count=6", "data.image_size=[28, 42]"),
+        "model.width=8",
+        "model.heads=2",
+        "model.queries.count=6",
+        "data.image_size=[28, 42]",
         "optimizer.parts={encoder: 0.01, queries: 0.01}",
     ]
 
@@ -122,7 +124,7 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
 
 
 def test_it_keeps_the_contract_of_encoders(weights):
-    case = Case(VggtFeatures.Config(weights=str(weights)))
-    results = [run_check(check, case) for check in checks_for(case, ("core",))]
-    assert [(r.check.name, r.message) for r in results if not r.ok] == []
+    run = CaseRun(Case(VggtFeatures.Config(weights=str(weights))))
+    results = [*run.results(["core"])]
+    assert not [result.message for result in results if not result.ok]
     assert sum(r.verdict == "passed" for r in results) > 20

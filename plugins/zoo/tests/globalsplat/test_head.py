@@ -7,14 +7,13 @@ import torch
 from qgs_zoo.globalsplat.head import MergingHead, rotation_6d
 from qgs_zoo.globalsplat.streams import TEXTURE
 from small_parts import made
+from tables import assert_equal
 from torch.nn.functional import layer_norm
 from torch.testing import assert_close
 
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import QueryState
 
-LOW = math.log(1e-4) - 1
-HIGH = math.log(0.05) + 2
 DRAW = torch.Generator().manual_seed(0)
 GEOMETRY = 2 * torch.randn(1, 3, 16, 14, generator=DRAW).double()
 GEOMETRY[..., 0, 3:5] = torch.tensor([-9, 9])  # scales beyond both bounds
@@ -32,7 +31,7 @@ def orthonormal(six):
 def one_gaussian(block, colours):
     """Of raw candidates (S, 14) and coefficients (S, 48), by the formulas of the paper."""
     gates = block[:, 13].softmax(0)
-    log_scale = (block[:, 3:6] - 2).clip(LOW, HIGH)
+    log_scale = (block[:, 3:6] - 2).clip(math.log(1e-4) - 1, math.log(0.05) + 2)
     opacity = (block[:, 12] - 5).sigmoid()
     sh = (gates @ colours).view(16, 3)
     return (
@@ -91,7 +90,7 @@ def test_the_head_reads_both_streams_after_their_norms():
     texture = head.texture(layer_norm(STATE[TEXTURE], (16,))).unflatten(-1, (4, 48))
     out = head(STATE)
     wanted = head.activate(geometry, texture)
-    assert_close((out.sh, out.scales), (wanted.sh, wanted.scales), rtol=0, atol=0)
+    assert_equal((out.sh, out.scales), (wanted.sh, wanted.scales))
 
 
 def test_weights_start_as_told():

@@ -15,27 +15,22 @@ from qgs.contracts import LayerParts
 from qgs.geometry.rays import plucker_rays
 from qgs.types import ImageMemory, QueryState
 
-SMALL = {"rgb_width": 6, "ray_width": 5, "lens_width": 3, "bands": 2}
-
 
 def test_a_token_is_its_colours_beside_its_rays_and_its_camera():
-    encoder = made(PosedPatches, patch_size=4, **SMALL)
+    encoder = made(PosedPatches, patch_size=4, rgb_width=6, ray_width=5, lens_width=3, bands=2)
     given = odd_views(2, 16, 24)
     memory = encoder(given)
     assert memory.features.shape == (2, 2 * 4 * 6 + 4, 11)
     assert memory.grid is memory.keys is memory.patch_rays is None
     assert torch.equal(memory.features[0, -4:], encoder.registers)
-    scene = 1
-    view = 1
-    row = 2
-    column = 3
-    token = memory.features[scene, view * 24 + row * 6 + column]
-    patch = (scene, view, slice(None), slice(8, 12), slice(12, 16))
+    # scene 1, view 1, row 2, column 3
+    token = memory.features[1, 24 + 2 * 6 + 3]
+    patch = (1, 1, slice(None), slice(8, 12), slice(12, 16))
     assert_close(token[:6], encoder.rgb_embedding(2 * given.images[patch] - 1).flatten())
     rays = encoder.ray_embedding(plucker_rays(given.cameras)[patch]).flatten()
-    fx, fy, cx, cy = given.cameras.intrinsics[scene, view].tolist()
+    fx, fy, cx, cy = given.cameras.intrinsics[1, 1].tolist()
     told = torch.tensor([math.log(fx / 24), math.log(fy / 16), cx / 24, cy / 16])
-    x = given.cameras.c2w[scene, view, :3, 3]
+    x = given.cameras.c2w[1, 1, :3, 3]
     waves = [f(k * math.pi * x) for f in (torch.sin, torch.cos) for k in (1, 2)]
     camera = torch.cat([encoder.lens_mlp(told), x, *waves])
     assert_close(token[6:], rays + encoder.camera_proj(camera))

@@ -74,11 +74,6 @@ def test_the_end_is_beyond_the_beginning():
     assert refused("tiny/gslrm.yaml", [override]).option == "model.centers.far"
 
 
-def by_formula(block, x):
-    x = x + block.proj(attended(*block.qkv(F.layer_norm(x, (16,))).split(16, -1)))
-    return x + block.fc2(F.gelu(block.fc1(F.layer_norm(x, (16,)))))
-
-
 def test_the_transformer_sees_nine_channels_of_every_pixel():
     encoder = made(Transformer, patch_size=P, depth=2, mlp_ratio=2.0, init_std=0.3)
     given = odd_views(3, 8, 12)
@@ -88,7 +83,8 @@ def test_the_transformer_sees_nine_channels_of_every_pixel():
     x = F.layer_norm(encoder.embedding(in_patches(pixels).flatten(2)), (16,))
     for block in encoder.blocks:
         assert block.fc1.out_features == 32
-        x = by_formula(block, x)
+        x = x + block.proj(attended(*block.qkv(F.layer_norm(x, (16,))).split(16, -1)))
+        x = x + block.fc2(F.gelu(block.fc1(F.layer_norm(x, (16,)))))
     memory = encoder(given)
     assert_close(memory.features, x)
     assert memory.grid == GRID

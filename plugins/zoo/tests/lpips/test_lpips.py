@@ -125,9 +125,7 @@ def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg):
     rgb, truth = torch.rand(2, 2, 2, 3, 24, 32)
 
     def value(rgb):
-        rendering = SimpleNamespace(rgb=rgb)
-        target = SimpleNamespace(images=truth)
-        return loss(None, rendering, target, None)["vgg16"]
+        return loss(None, SimpleNamespace(rgb=rgb), SimpleNamespace(images=truth), None)["vgg16"]
 
     found = value(rgb.requires_grad_())
     assert_close(found, lpips_of(vgg).distance(rgb, truth).mean() / 2)
@@ -138,5 +136,4 @@ def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg):
 
 def test_images_that_are_too_small_are_refused_with_the_recipe():
     data = "data={type: qgs/photos, path: x, image_size: [8, 16]}"
-    problem = refused(RECIPE, [data, "losses={mine: {type: lpips/vgg16}}"])
-    assert "LPIPS" in problem.reason
+    assert "LPIPS" in refused(RECIPE, [data, "losses={mine: {type: lpips/vgg16}}"]).reason

@@ -39,15 +39,11 @@ def undrawn(monkeypatch):
         monkeypatch.setattr(nn.init, draw, lambda x, *_, **__: x)
 
 
-def directions(count):
-    return F.normalize(torch.randn(count, 3).double(), dim=-1)
-
-
 def test_every_tensor():
     """But of the release's data loader: it crops to whole pixels, sources of photos here do not."""
     for golden in map(read, FILES.split()):
         rows = parity.compared(golden)
-        assert [row for row in rows if row.problem] == []
+        assert not [row for row in rows if row.problem]
         assert {row.name for row in rows} == {*golden.promised()}
 
 
@@ -72,7 +68,7 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     factors = quat_to_matrix(ours.quats) * ours.scales[..., None, :]
     # Colours in 50 directions in place of harmonics: the family's rasteriser reads directions as
     # z, x, y, and never degree 4.
-    seen = directions(50).float()
+    seen = F.normalize(torch.randn(50, 3), dim=-1)
     sh = theirs["harmonics"][..., :16]
     turned = harmonics(seen[:, [2, 0, 1]], sh.shape[-1] - 1) @ sh[..., 1:].mT
     colours = ours.colors[..., None, :] + harmonics(seen, ours.sh.shape[-2]) @ ours.sh

@@ -1,7 +1,5 @@
 """Scenes that move: the embedding of times, which queries carry them, who reads whom."""
 
-from functools import partial
-
 import pytest
 import torch
 from odd_views import odd_views
@@ -45,13 +43,6 @@ INPUTS = views(torch.zeros(2, 2), torch.zeros(2, 1))
 TARGETS = INPUTS.select([0]).replace(target_time=None)
 
 
-def dynamic_queries(**options):
-    """Whose embedding of times is no longer zero."""
-    queries = made(DynamicQueries, count=7, **options)
-    torch.nn.init.normal_(queries.time_embedding.proj.weight)
-    return queries
-
-
 def test_times_are_cosines_and_sines_and_embedded_as_zeros_at_first():
     times = torch.tensor([[0.0, 2.5]])
     angles = times[..., None] * torch.tensor([1, 0.01])
@@ -64,9 +55,10 @@ def test_the_target_time_is_added_to_the_dynamic_queries_or_to_all():
     assert not DynamicQueries.reads_cameras
     photos = [Photos(INPUTS.images, target_time=torch.tensor([[x], [0.5]])) for x in (0.0, 1.0)]
     for dynamic, moving in ((3, [False] * 4 + [True] * 3), (0, [True] * 7)):
-        early, late = map(partial(dynamic_queries(dynamic=dynamic), MEMORY), photos)
-        changed = (early.features != late.features).any(-1)
-        assert changed.tolist() == [moving, [False] * 7]
+        queries = made(DynamicQueries, count=7, dynamic=dynamic)
+        torch.nn.init.normal_(queries.time_embedding.proj.weight)
+        early, late = (queries(MEMORY, each) for each in photos)
+        assert (early.features != late.features).any(-1).tolist() == [moving, [False] * 7]
         fields = {name: x.tolist() for name, x in early.fields.items()}
         assert fields == ({MOVES: [moving] * 2} if dynamic else {})
 
