@@ -20,8 +20,8 @@ supervision: {type: qgs/layers, layers: [1]}
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
 
 
-def run_qgs(*words):
-    return CliRunner().invoke(app, [*map(str, words)])
+def run_qgs(*words, **options):
+    return CliRunner().invoke(app, [*map(str, words)], **options)
 
 
 def typed(line):
@@ -31,7 +31,7 @@ def typed(line):
 
 def done(*words):
     """The result of a command that must end well."""
-    result = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+    result = run_qgs(*words, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result
 

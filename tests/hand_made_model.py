@@ -43,6 +43,5 @@ def gaussians():
     z = z + 1
     quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 48, 4)
     means = torch.cat([(xy - 0.5) * z, z], -1)
-    scales = torch.full((1, 48, 3), 0.05)
     opacities = torch.full((1, 48), 0.8)
-    return Gaussians(means, scales, quats, opacities, colours)
+    return Gaussians(means, torch.full((1, 48, 3), 0.05), quats, opacities, colours)

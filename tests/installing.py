@@ -1,6 +1,5 @@
 """A fixture that installs distributions in a folder of their own, for as long as a test runs."""
 
-import json
 import sys
 from textwrap import dedent
 
@@ -11,10 +10,10 @@ import pytest
 def install(tmp_path_factory, monkeypatch):
     """Make a distribution importable: install(distribution, plugin name, module source).
 
-    editable: as `pip install -e` leaves it. group: of its entry point.
+    group: of its entry point.
     """
 
-    def install(distribution, plugin, source, version="1.2", editable=False, group="qgs.plugins"):
+    def install(distribution, plugin, source, version="1.2", group="qgs.plugins"):
         folder = tmp_path_factory.mktemp("site")
         safe = distribution.replace("-", "_")
         (folder / f"_test_{safe}.py").write_text(dedent(source))
@@ -23,9 +22,6 @@ def install(tmp_path_factory, monkeypatch):
         metadata = f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
         (info / "METADATA").write_text(metadata)
         (info / "entry_points.txt").write_text(f"[{group}]\n{plugin} = _test_{safe}:plugin\n")
-        if editable:
-            record = {"url": folder.as_uri(), "dir_info": {"editable": True}}
-            (info / "direct_url.json").write_text(json.dumps(record))
         monkeypatch.syspath_prepend(folder)
         monkeypatch.delitem(sys.modules, f"_test_{safe}", raising=False)
 

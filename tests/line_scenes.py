@@ -1,5 +1,6 @@
 """Scenes made of numbers, and a source of them, for tests of data."""
 
+import numpy as np
 import torch
 
 from qgs.contracts import Scene, SceneSource, SceneSourceConfig
@@ -8,11 +9,24 @@ from qgs.evaluate.plan import EvaluationPlan
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras
 
+DOWN = torch.tensor([0.0, 1, 0])
+SPAN = Span(Span.Config())
+
+
+def drawn(scene, views, seed, step=0, sampler=SPAN):
+    """Inputs and targets as they are drawn for a training."""
+    return sampler.draw(scene, views, np.random.default_rng(seed), step)
+
 
 def circle(angles, radius):
     """Poses (V, 4, 4) on a circle about the origin that look at it, at 0 along z."""
     eyes = radius * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
-    return look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).to(eyes).expand_as(eyes))
+    return look_at(eyes, -eyes, DOWN)
+
+
+def values(frames):
+    """What images (F, 3, H, W) of a `Line` are about."""
+    return torch.tensor(list(frames)).view(-1, 1, 1, 1) / 100
 
 
 class Line(Scene):
@@ -31,8 +45,7 @@ class Line(Scene):
         return Cameras(c2w, torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
 
     def images(self, frames):
-        value = torch.tensor(list(frames)).float() / 100
-        return value[:, None, None, None] + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
+        return values(frames) + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
 
 
 class Lines(SceneSource):
@@ -46,9 +59,9 @@ class Lines(SceneSource):
         return self._scenes
 
 
-def plan_of(source, views, evaluation, sampler=None, **options):
+def plan_of(source, views, evaluation, sampler=SPAN, **options):
     """A plan, by default with the default sampler."""
-    return EvaluationPlan(source, views, evaluation, sampler or Span(Span.Config()), **options)
+    return EvaluationPlan(source, views, evaluation, sampler, **options)
 
 
 def samples_of(*given, **options):

@@ -1,6 +1,7 @@
-"""What tests demand in one line: a refusal, the same bits."""
+"""What tests demand in one line: a refusal, the same bits, files as they were; tables as rows."""
 
 from functools import partial
+from pathlib import Path
 
 import pytest
 from torch.testing import assert_close
@@ -9,6 +10,18 @@ assert_equal = partial(assert_close, rtol=0, atol=0)
 
 
 def must_refuse(match, function, *given, kind=ValueError, **options):
-    """`function` raises `kind` with `match`."""
-    with pytest.raises(kind, match=match):
+    """`function` raises `kind` with `match`, which is returned."""
+    with pytest.raises(kind, match=match) as caught:
         function(*given, **options)
+    return caught.value
+
+
+def rows(table, mark=" | "):
+    """The cells of each line."""
+    return [line.split(mark) for line in table.strip().splitlines()]
+
+
+def contents(folder):
+    """Path to bytes and time of change of every file."""
+    files = filter(Path.is_file, folder.rglob("*"))
+    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}

@@ -51,6 +51,8 @@ class TapeSource(SceneSource):
 
 
 plugin = Plugin("tapes", 1, (TapeSource,))
+INSTALLED = ("qgs-tapes", "tapes", "from tape_source import plugin")
+"""For the fixture `install`."""
 
 
 def install(folder, monkeypatch):
@@ -62,11 +64,11 @@ def install(folder, monkeypatch):
     monkeypatch.syspath_prepend(folder)
 
 
-def write_tape(file, frames=6, size=(16, 16)):
+def write_tape(file):
     """Noise, seen by cameras a step apart."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    images = np.random.default_rng(0).integers(0, 256, (frames, *size, 3), np.uint8)
-    c2w = np.tile(np.eye(4), (frames, 1, 1))
-    c2w[:, 0, 3] = 0.1 * np.arange(frames)
+    images = np.random.default_rng(0).integers(0, 256, (6, 16, 16, 3), np.uint8)
+    c2w = np.tile(np.eye(4), (6, 1, 1))
+    c2w[:, 0, 3] = 0.1 * np.arange(6)
     with file.open("wb") as opened:
         np.savez(opened, images=images, c2w=c2w)

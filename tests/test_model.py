@@ -48,11 +48,8 @@ def test_layers_that_are_decoded_and_refined(views):
     assert [len(x.refinements) for x in (model, small("locus", override))] == [1, 2]
 
 
-LAYER = "model.decoder.layers={0: {cross_attention: {type: qgs/content}}}"
-
-
 def test_a_model_says_its_slots_in_a_few_lines():
-    model = small("locus", LAYER)
+    model = small("locus", "model.decoder.layers.0.cross_attention.type=qgs/content")
     heading, *lines = repr(model).splitlines()
     total = sum(parameter.numel() for parameter in model.parameters())
     assert f"{total:,} parameters" in heading

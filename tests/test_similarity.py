@@ -42,8 +42,12 @@ def test_values_and_gradients():
             continue
         images, truth = pair(2, 3, *size)
         one = truth[:1, :1].mT.expand(2, 3, -1, -1)
-        alone = images[0, 0], truth[0, 0]
-        for x, y in ((images, truth), (truth, images), (images.mT, one), alone):
+        for x, y in (
+            (images, truth),
+            (truth, images),
+            (images.mT, one),
+            (images[0, 0], truth[0, 0]),
+        ):
             found = mean_ssim(x.to(dtype), y.to(dtype), padding)
             expected = slow(x, y, padding)
             slope, reference = (torch.autograd.grad(3 * v, images)[0] for v in (found, expected))

@@ -36,8 +36,7 @@ def test_what_does_not_fit_together_is_refused():
     must_refuse(r"Attributes\.quats", GaussianAttributes, THREE, THREE, THREE, ONE, THREE)
     must_refuse(r"Gaussians\.sh .*\(1, 5, C, 3\), got", Gaussians, *BALLS, zeros(1, 5, 3))
     must_refuse(r"sh has 4 coefficients.* 3, 8 or 15", Gaussians, *BALLS, zeros(1, 5, 4, 3))
-    both = [Gaussians(*BALLS), Gaussians(*BALLS, zeros(1, 5, 3, 3))]
-    must_refuse("sh", concatenated, both, 1)
+    must_refuse("sh", concatenated, [Gaussians(*BALLS), Gaussians(*BALLS, zeros(1, 5, 3, 3))], 1)
     must_refuse(r"Rendering\.depth", Rendering, RGB, ALPHA, ALPHA[..., :4])
     must_refuse(r"SpatialSupport\.axes", SpatialSupport, zeros(1, 2, 3), zeros(1, 2, 3))
 

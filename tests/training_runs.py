@@ -2,7 +2,8 @@
 
 import json
 from contextlib import closing
-from pathlib import Path
+from functools import partial
+from itertools import islice
 
 import pytest
 import torch
@@ -13,8 +14,6 @@ from qgs.recipe import resolve
 from qgs.train.folder import RunFolder, read_state
 from qgs.train.tracking import TrainingProgress
 from qgs.train.training import Trainer, train
-
-RECIPES = Path(__file__).parents[1] / "recipes/tiny"
 
 SMALL = """
 model.width=32 model.heads=2 model.queries.count=24
@@ -34,11 +33,14 @@ TWO = (
 
 def tiny(name, *overrides):
     """A recipe of recipes/tiny, smaller yet, with overrides."""
-    return resolve(RECIPES / f"{name}.yaml", [*SMALL.split(), *overrides])
+    return resolve(f"tiny/{name}.yaml", [*SMALL.split(), *overrides])
 
 
 def run(recipe, folder, resume=False, device="cpu"):
     return train(recipe, folder, console=QUIET, device=device, resume=resume)
+
+
+resume = partial(run, resume=True)
 
 
 @pytest.fixture(scope="session")
@@ -95,8 +97,14 @@ def assert_equal_runs(first, second):
     assert one == other
 
 
+def batches(recipe, count, size, **options):
+    """The first training batches."""
+    with closing(training_batches(recipe.build_data(), recipe.views, size, 0, **options)) as stream:
+        return list(islice(stream, count))
+
+
 def first_batch(recipe):
-    return next(training_batches(recipe.build_data(), recipe.views, 2, seed=0))
+    return batches(recipe, 1, 2)[0]
 
 
 def losses(run):

@@ -14,7 +14,7 @@ def arc(degrees, radius, rise=0.0):
     """Poses (V, 4, 4) of cameras around the origin, which they look at, y down."""
     angles = torch.as_tensor(degrees).double().deg2rad()
     axes = torch.stack([angles.sin(), rise * angles, angles.cos()], -1)
-    return look_at(-radius * axes, axes, torch.tensor([0.0, 1.0, 0.0]).expand_as(axes).double())
+    return look_at(-radius * axes, axes, torch.tensor([0.0, 1.0, 0.0]))
 
 
 def pinhole(c2w, lens=(64.0, 64.0, 32.0, 32.0), size=(SIDE, SIDE)):

@@ -1,11 +1,9 @@
 """A run of `qgs train` made once."""
 
-from pathlib import Path
-
 import pytest
 from commands import done, run_qgs, sets
 
-RECIPE = Path(__file__).parents[2] / "recipes/tiny/locus.yaml"
+RECIPE = "tiny/locus.yaml"
 QUICK = sets(
     "data.image_size=[32, 32]",
     "views.targets=2",

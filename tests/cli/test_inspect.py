@@ -7,6 +7,7 @@ import pytest
 import typer
 import yaml
 from commands import done
+from tables import rows
 
 from qgs.cli import app, main
 from qgs.recipe import RecipeError, files, resolve
@@ -53,8 +54,7 @@ eval absent; absent
 def test_mistakes_are_printed_without_a_traceback(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("QGS_DEBUG", raising=False)
     (tmp_path / "slow.yaml").write_text(SMALL + "optimizer:\n  parts:\n    encodr: 0.1\n")
-    for line in MISTAKES.strip().splitlines():
-        words, reason = line.split("; ")
+    for words, reason in rows(MISTAKES, "; "):
         monkeypatch.setattr(sys, "argv", ["qgs", *words.split()])
         with pytest.raises(SystemExit) as caught:
             main()
@@ -66,11 +66,6 @@ def test_mistakes_are_printed_without_a_traceback(tmp_path, monkeypatch, capsys)
 
 
 RECIPES = Path(__file__).parents[2] / "recipes"
-
-
-@pytest.fixture(autouse=True)
-def _elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 def test_all_are_listed_with_what_they_are():
@@ -117,7 +112,7 @@ def test_a_copy_brings_what_it_extends_and_overwrites_nothing():
 
 
 def test_the_recipes_of_a_wheel_come_first(tmp_path, monkeypatch):
-    inside = tmp_path / "qgs" / "recipes" / "tiny"
+    inside = tmp_path / "qgs/recipes/tiny"
     inside.mkdir(parents=True)
     (inside / "locus.yaml").write_text("recipe: 1\nseed: 9\n")
     monkeypatch.setattr(files, "__file__", str(tmp_path / "qgs/recipe/files.py"))

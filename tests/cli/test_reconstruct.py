@@ -8,7 +8,7 @@ from commands import done, record_of, saved
 from photo_formats import noisy_photos, scene
 from PIL import Image
 from plyfile import PlyData
-from tables import must_refuse
+from tables import must_refuse, rows
 
 import qgs
 from qgs.reconstruction.scenes import frame_list
@@ -109,8 +109,8 @@ def test_photos_of_the_training_are_not_called_novel(photos, tmp_path, small_pic
     assert kinds(record) == {0: "input", 6: "input", 1: "novel", 3: "seen in training"}
 
 
-def test_the_data_of_a_plugin(checkpoint, tmp_path, monkeypatch, small_pictures):
-    tape_source.install(tmp_path / "site", monkeypatch)
+def test_the_data_of_a_plugin(checkpoint, tmp_path, install, small_pictures):
+    install(*tape_source.INSTALLED)
     tapes = tmp_path / "tapes"
     for name in "ab":
         tape_source.write_tape(tapes / f"{name}.tape")
@@ -138,9 +138,8 @@ def test_photos_that_are_not_there_are_refused(photos):
     must_refuse(r"--frames: '0-8' is no photo", frame_list, "0-8", "--frames", found)
     found.frame_name = ["a/1.png", "b/1.png", "11.png", *"defg"].__getitem__
     assert frame_list("b/1.png", "--frames", found) == [1]
-    must_refuse(
-        r"'1\.png' fits 0 \(a/1\.png\), 1 \(b/1\.png\)\.", frame_list, "1.png", "--frames", found
-    )
+    reason = r"'1\.png' fits 0 \(a/1\.png\), 1 \(b/1\.png\)\."
+    must_refuse(reason, frame_list, "1.png", "--frames", found)
 
 
 SENSELESS = """
@@ -152,7 +151,6 @@ SENSELESS = """
 
 
 def test_options_that_make_no_sense_are_refused(checkpoint, photos, tmp_path):
-    for line in SENSELESS.strip().splitlines():
-        words, reason = line.split(" | ")
+    for words, reason in rows(SENSELESS):
         must_refuse(reason, written, checkpoint, photos, *words.split(), out=tmp_path / "out")
         assert not (tmp_path / "out").exists()

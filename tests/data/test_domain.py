@@ -7,18 +7,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from line_scenes import samples_of
-from training_runs import run, tiny
+from line_scenes import DOWN, SPAN, samples_of
+from training_runs import resume, run, tiny
+from walk import pinhole
 
 from qgs.checkpoint.model_file import CheckpointFile, save
 from qgs.checkpoint.tensors import CheckpointError
 from qgs.data import stream
 from qgs.data.stream import trained_domain
-from qgs.data.view_samplers import Span
 from qgs.domain import KEY, Domain, verdict
 from qgs.geometry.poses import look_at
 from qgs.recipe import resolve
-from qgs.types import Cameras
 
 
 def recipe(*words):
@@ -28,15 +27,13 @@ def recipe(*words):
 def around(target, eyes, focal=16.0):
     """Cameras (1, V) of 32 x 32 pixels at `eyes` along x that look at (0, 0, target)."""
     places = torch.tensor([[x, 0.0, 0.0] for x in eyes])
-    goal = torch.tensor([0.0, 0.0, target])
-    down = torch.tensor([0.0, 1.0, 0.0]).expand_as(places)
-    intrinsics = torch.tensor([focal, focal, 16.0, 16.0]).expand(1, len(eyes), 4)
-    return Cameras(look_at(places, goal - places, down)[None], intrinsics, (32, 32))
+    c2w = look_at(places, torch.tensor([0.0, 0.0, target]) - places, DOWN)
+    return pinhole(c2w, (focal, focal, 16.0, 16.0), (32, 32))[None]
 
 
 PAIR = around(2, (-0.5, 0.5))
 PARALLEL = replace(PAIR, c2w=torch.eye(4).repeat(1, 2, 1, 1))
-PARALLEL.c2w[0, 1, 0, 3] = 1
+PARALLEL.c2w[..., 1, 0, 3] = 1
 
 
 def domain(*cameras):
@@ -122,7 +119,7 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
 def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch):
     source = recipe().build_data()
     monkeypatch.setattr(type(source.scenes("train")[0]), "cameras", None)
-    assert trained_domain(source, recipe().views, 0, Span(Span.Config()), 0).samples == 0
+    assert trained_domain(source, recipe().views, 0, SPAN, 0).samples == 0
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(tmp_path):
@@ -132,6 +129,6 @@ def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(tmp_p
     file = run(recipe("training.steps=1"), tmp_path).folder.checkpoint
     assert CheckpointFile(file).domain.ranges == expected
     file.write_bytes(file.read_bytes()[:1000])
-    run(two, tmp_path, resume=True)
+    resume(two, tmp_path)
     found = CheckpointFile(file).domain
     assert (found.ranges, found.samples) == (expected, stream.MEASURED)

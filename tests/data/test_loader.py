@@ -2,22 +2,22 @@
 
 import multiprocessing
 import threading
-from itertools import islice
-from pathlib import Path
 
 import pytest
 import torch
 from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
 from tables import must_refuse
+from training_runs import batches, same
 
 from qgs.containers import named_tensors
 from qgs.contracts import ViewsConfig
 from qgs.data.stream import SampleError, scenes_fingerprint, training_batches
 from qgs.recipe import resolve
 
-TINY = Path(__file__).parents[2] / "recipes/tiny/tokengs.yaml"
-ROOMS = resolve(TINY, ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"])
+ROOMS = resolve(
+    "tiny/tokengs.yaml", ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"]
+)
 
 
 def photos(folder):
@@ -29,19 +29,10 @@ def photos(folder):
     return resolve(ROOMS.tree, [data, "views.gap=[4, 4]"])
 
 
-def batches(recipe, count, size, **options):
-    stream = training_batches(recipe.build_data(), recipe.views, size, 3, **options)
-    try:
-        return list(islice(stream, count))
-    finally:
-        stream.close()
-
-
 def assert_same(first, second):
     for a, b in zip(first, second, strict=True):
         assert a.scenes == b.scenes
-        ours, theirs = (dict(named_tensors([batch.inputs, batch.targets])) for batch in (a, b))
-        torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+        assert same(*(dict(named_tensors([batch.inputs, batch.targets])) for batch in (a, b)))
 
 
 def test_running_out_of_memory_is_no_bad_sample(tmp_path, monkeypatch):
@@ -136,5 +127,5 @@ def test_groups_are_visited_one_after_another_in_changing_orders():
 def test_fingerprints_tell_stores_apart():
     stores = ([range(6)], [range(3), range(3, 6)], [range(4), range(4, 6)])
     assert len({scenes_fingerprint(Grouped(6, groups)) for groups in stores}) == 3
-    same = ([[0, 1]], [range(2)], [range(2), []])
-    assert len({scenes_fingerprint(Grouped(2, groups)) for groups in same}) == 1
+    alike = ([[0, 1]], [range(2)], [range(2), []])
+    assert len({scenes_fingerprint(Grouped(2, groups)) for groups in alike}) == 1

@@ -1,6 +1,6 @@
 """What does not fit into memory is refused with numbers."""
 
-import pytest
+from tables import must_refuse
 
 from qgs.machine import TooLargeError, refuse_more_than_memory
 
@@ -8,5 +8,5 @@ from qgs.machine import TooLargeError, refuse_more_than_memory
 def test_only_what_does_not_fit_is_refused(monkeypatch):
     monkeypatch.setattr("qgs.machine.available_bytes", lambda: 10)
     refuse_more_than_memory("this", 10, "Less.")
-    with pytest.raises(TooLargeError, match=r"11 bytes.*10 bytes.*Less"):
-        refuse_more_than_memory("this", 11, "Less.")
+    reason = r"11 bytes.*10 bytes.*Less"
+    must_refuse(reason, refuse_more_than_memory, "this", 11, "Less.", kind=TooLargeError)

@@ -28,9 +28,8 @@ def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
     uploaded(folder, UPath(url))
     expected = scene(folder).images([0, 2, 1])
     photos = scene(url)
-    source = opened(url, holdout=0)
     views = ViewsConfig(inputs=2, targets=1, gap=(1, 3))
-    assert SampleStream(source, views, 0).batch([0]).scenes
+    assert SampleStream(opened(url, holdout=0), views, 0).batch([0]).scenes
     store = type(UPath(url).fs)
     together = threading.Barrier(3)
     whole = store._open

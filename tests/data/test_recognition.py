@@ -1,8 +1,8 @@
 """Which source opens a path: those of qgs and of plugins alike."""
 
-import pytest
 import yaml
 from qgs_photos.datasets import plugin as datasets
+from tables import must_refuse
 from tape_source import TapeSource, plugin, write_tape
 from upath import UPath
 
@@ -52,8 +52,8 @@ def test_by_content(tmp_path):
 def test_files_and_nothing(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"")
     assert recognised(UPath(tmp_path / "a.zip"), SOURCES) == "datasets/dl3dv"
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        recognised(UPath(tmp_path / "b"), SOURCES)
+    absent = UPath(tmp_path / "b")
+    must_refuse("does not exist", recognised, absent, SOURCES, kind=FileNotFoundError)
 
 
 def test_a_plugin_is_asked_before_qgs_and_both_are_named(tmp_path, caplog):
@@ -78,7 +78,5 @@ def test_options_for_other_data_and_for_that_of_the_training(tmp_path):
         assert source.config == TapeSource.Config(path=str(tmp_path), image_size=opened_at)
         assert known == (of is trained)
     other = PhotosSource.config_for("there", (8, 8), black)
-    assert other == PhotosSource.Config(
-        path="there", image_size=(8, 8), background=BLACK, holdout=0
-    )
+    assert other == black.model_copy(update={"path": "there", "image_size": (8, 8), "holdout": 0})
     assert PhotosSource.config_for("there", (8, 8), SceneSourceConfig()).holdout == 0

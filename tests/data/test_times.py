@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from line_scenes import Line, Lines, samples_of
+from line_scenes import Line, Lines, drawn, samples_of
 from photo_formats import scene, synthetic, write_blender
 from tables import must_refuse
 from torch.testing import assert_close
@@ -10,7 +10,6 @@ from training_runs import run
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.samples import collate, make_sample
-from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import held_out_windows
 from qgs.recipe import RecipeError, resolve
 
@@ -46,23 +45,16 @@ def test_times_that_cannot_be(tmp_path):
         must_refuse("'time'", scene, dnerf(tmp_path, 0, time, 0.5))
 
 
-def drawn(scene, seed):
-    return Span(Span.Config()).draw(scene, VIEWS, np.random.default_rng(seed), 0)
-
-
 def test_one_camera_a_time_gives_that_frame_as_all_targets():
-    scene = Moving(12, 1)
     for seed in range(40):
-        inputs, (target, same) = Span(Span.Config()).draw(
-            scene, VIEWS, np.random.default_rng(seed), 0
-        )
+        inputs, (target, same) = drawn(Moving(12, 1), VIEWS, seed)
         assert inputs[0] < target == same < inputs[-1]
 
 
 def test_several_cameras_a_time_give_targets_of_one_time_and_inputs_of_several_cameras():
     asked = set()
     for seed in range(60):
-        inputs, targets = drawn(Moving(9, 4), seed)
+        inputs, targets = drawn(Moving(9, 4), VIEWS, seed)
         assert len({*targets, *inputs}) == 4, "targets are no inputs while there are others"
         first, last = (frame // 4 for frame in inputs)
         assert last - first in (2, 3, 4)

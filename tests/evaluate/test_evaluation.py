@@ -8,9 +8,9 @@ import math
 from collections import Counter
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 import torch
-import yaml
 from line_scenes import samples_of
 from rich.console import Console
 from training_runs import same, tiny
@@ -36,8 +36,7 @@ class MeanAbsoluteError(Metric):
         log: str | None = None
 
     def forward(self, given):
-        error = (given.images - given.targets.images).abs() ** self.config.power
-        return error.mean((-3, -2, -1))
+        return ((given.images - given.targets.images).abs() ** self.config.power).mean((-3, -2, -1))
 
 
 class DepthError(Metric):
@@ -69,19 +68,12 @@ def mine(*options):
     return resolve(tiny("tokengs").tree, options, plugins=[plugin])
 
 
-def write_index(folder, scenes):
-    """An index of scenes whose frames are told in YAML."""
-    file = folder / "some_index.json"
-    file.write_text(json.dumps(yaml.safe_load(scenes)))
-    return f"evaluation.index={file}"
-
-
-PARTLY = """
-test/000000: {context: [0, 3], target: [1, 2]}
-test/000001: {context: [0, 99], target: [1]}
-gone: {context: [0, 3], target: [1]}
-nil: null
-"""
+PARTLY = """{
+"test/000000": {"context": [0, 3], "target": [1, 2]},
+"test/000001": {"context": [0, 99], "target": [-1]},
+"gone": {"context": [0, 3], "target": [1]},
+"nil": null
+}"""
 """Of the last three none can be judged."""
 
 
@@ -114,15 +106,17 @@ def judged():
 def test_scores_are_the_metrics_of_model_and_baselines(judged):
     recipe, evaluation, _ = judged
     model = recipe.build_model().eval()
-    data = recipe.build_data()
-    sample = samples_of(data, recipe.views, recipe.evaluation, depths=True)[0]
+    sample = samples_of(recipe.build_data(), recipe.views, recipe.evaluation, depths=True)[0]
     inputs = sample.inputs
     targets = sample.targets
     with torch.no_grad():
         gaussians = model(inputs).gaussians
         rendering = model.render(gaussians, targets.cameras)
-    images = {"model": rendering.rgb, "nearest_input": nearest_input(inputs, targets.cameras)}
-    images["mean_colour"] = mean_colour(inputs, targets.cameras)
+    images = {
+        "model": rendering.rgb,
+        "nearest_input": nearest_input(inputs, targets.cameras),
+        "mean_colour": mean_colour(inputs, targets.cameras),
+    }
     expected = {
         f"{method}_{metric.__name__}": metric(image, targets.images).mean()
         for method, image in images.items()
@@ -154,10 +148,9 @@ def test_evaluations_write_the_same_files(judged, tmp_path):
     rows = list(csv.DictReader(files["scenes.csv"].decode().splitlines()))
     assert [row["scene"] for row in rows] == ["test/000000", "test/000001"]
     assert summary["scenes"] == summary["samples"] == 2
-    first, second = (float(row["model_mae"]) for row in rows)
-    spread = {"mean": (first + second) / 2, "variance": (first - second) ** 2 / 4}
-    spread |= {"median": spread["mean"], "scenes": 2}
-    assert summary["over_scenes"]["mae"] == pytest.approx(spread)
+    errors = np.array([float(row["model_mae"]) for row in rows])
+    spread = {"mean": errors.mean(), "variance": errors.var(), "median": np.median(errors)}
+    assert summary["over_scenes"]["mae"] == pytest.approx({**spread, "scenes": 2})
     for method in METHODS:
         mean = sum(float(row[f"{method}_mae"]) for row in rows) / 2
         assert summary[method]["mae"] == pytest.approx(mean)
@@ -172,17 +165,18 @@ def test_evaluations_write_the_same_files(judged, tmp_path):
 
 
 def test_what_is_missing_is_told_in_the_same_line_as_the_score(tmp_path):
-    recipe = tiny("tokengs", write_index(tmp_path, PARTLY))
+    index = tmp_path / "some_index.json"
+    index.write_text(PARTLY)
+    recipe = tiny("tokengs", f"evaluation.index={index}")
     evaluation = evaluate(recipe.build_model(), recipe)
     summary = evaluation.summary()
     assert summary["missing"] == {
-        "test/000001": "the index names frames 99, the scene has 0 to 7",
+        "test/000001": "the index names frames 99, -1, the scene has 0 to 7",
         "gone": "not among the test scenes of the data",
     }
     evaluation.write(tmp_path)
-    text = shown(evaluation)
     table = (tmp_path / "table.md").read_text()
-    for place in (text, table):
+    for place in (shown(evaluation), table):
         assert "missing test/000001: the index names frames 99" in place
         assert "input views of 16 x 16 pixels, poses" in place
     assert all("1 of 3" in row for row in table.splitlines() if row.startswith("| model"))

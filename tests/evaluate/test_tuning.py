@@ -6,7 +6,7 @@ import pytest
 import torch
 from line_scenes import samples_of
 from tables import must_refuse
-from training_runs import tiny
+from training_runs import same, tiny
 
 from qgs.containers import map_tensors
 from qgs.evaluate.tuning import tune
@@ -27,10 +27,6 @@ def opened(*words):
     return recipe, recipe.build_model().eval(), samples[0].inputs
 
 
-def tuned(recipe, model, inputs):
-    return tune(model, inputs, recipe)
-
-
 @pytest.mark.parametrize(
     ("rate", "words"), [(1e-2, ["tokengs"]), (1e-2, ["locus"]), (0.1, ["tokengs", *LATENTS])]
 )
@@ -42,9 +38,9 @@ def test_the_input_views_are_met_better_and_weights_are_bit_equal(rate, words):
     calls = []
     part = model.encoder.latent_blocks[0] if rate == 0.1 else model.encoder
     part.register_forward_hook(lambda *_: calls.append(1))
-    gaussians, told = tuned(recipe, model, inputs)
+    gaussians, told = tune(model, inputs, recipe)
     assert len(calls) == 1
-    torch.testing.assert_close(model.state_dict(), before, rtol=0, atol=0)
+    assert same(model.state_dict(), before)
     assert all(weights.grad is None and weights.requires_grad for weights in model.parameters())
     assert not gaussians.means.requires_grad
 
@@ -76,7 +72,7 @@ def test_every_floating_field_is_tuned_and_no_other(monkeypatch):
         return predict(views, memory, state, *rest)
 
     monkeypatch.setattr(model, "predict", recorded)
-    tuned(recipe, model, inputs)
+    tune(model, inputs, recipe)
     assert torch.equal(seen[0].features, start.features)
     assert not torch.equal(seen[-1].features, start.features)
     for name in ("anchor.center", "anchor.raw_radius"):
@@ -89,14 +85,10 @@ def test_a_forward_pass_starts_from_the_given_state():
     start = model.queries.start(1)
     shifted = start.replace(fields={"anchor.center": start["anchor.center"] + 1})
     with torch.no_grad():
-        plain, same, moved = (
+        plain, given, moved = (
             model(inputs, state=s).gaussians.means for s in (None, start, shifted)
         )
-    assert torch.equal(plain, same)
+    assert torch.equal(plain, given)
     assert not torch.allclose(plain, moved)
-    must_refuse(
-        "the memory has 1 scenes, but the initial state has 2",
-        model,
-        inputs,
-        state=model.queries.start(2),
-    )
+    reason = "the memory has 1 scenes, but the initial state has 2"
+    must_refuse(reason, model, inputs, state=model.queries.start(2))

@@ -7,6 +7,7 @@ from pkgutil import resolve_name
 import guide
 import yaml
 from guide_pages import DOCS, all_pages
+from tables import rows
 
 from qgs.contracts import Component
 from qgs.recipe.errors import Problems
@@ -60,9 +61,9 @@ two passes | depth_weight | {:g} \|D
 def rows_of(text):
     """The cells of the rows of all tables, but for heads, whose first cell is empty."""
     lines = [line for line in text.splitlines() if line.startswith("|") and "---" not in line]
-    rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
-    assert {len(row) for row in rows} == {4}
-    return [row for row in rows if row[0]]
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    assert {len(row) for row in cells} == {4}
+    return [row for row in cells if row[0]]
 
 
 ROWS = rows_of(EQUATIONS)
@@ -70,8 +71,7 @@ ROWS = rows_of(EQUATIONS)
 
 @cache
 def configs(slot):
-    components = guide.REGISTRY.components(slot)
-    return {name: component.Config for name, component in components.items()}
+    return {name: component.Config for name, component in guide.REGISTRY.components(slot).items()}
 
 
 def owners(option, where):
@@ -107,10 +107,9 @@ def test_a_row_leads_to_code_that_has_its_options():
 
 
 def test_constants_are_the_defaults():
-    for line in CONSTANTS.strip().splitlines():
-        name, option, wording = line.split(" | ")
+    for name, option, wording in rows(CONSTANTS):
         found = [row for row in ROWS if row[0] == name and f"`{option}`" in row[3]]
-        assert found, line
+        assert found, (name, option)
         for _, formula, where, _ in found:
             for config in owners(option, where):
                 default = config.model_fields[option].get_default()

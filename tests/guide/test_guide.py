@@ -57,9 +57,8 @@ def test_recipes_of_the_five_ideas():
 
 
 def test_the_reference_explains_every_option():
-    registry = guide.REGISTRY
     configs = [*guide.SECTIONS.values()]
-    configs += [c.Config for slot in SLOTS for c in registry.components(slot).values()]
+    configs += [c.Config for slot in SLOTS for c in guide.REGISTRY.components(slot).values()]
     for config in configs:
         rows = guide.option_table(config).splitlines()[2:]
         cells = [[x.strip().strip("`") for x in re.split(r"(?<!\\)\|", row)] for row in rows]

@@ -22,7 +22,7 @@ POINTS = GOLDEN["points"]
 
 
 def photometric(rgb=PREDICTED, truth=TRUTH, **options):
-    cameras = Cameras(CAMERAS.c2w, CAMERAS.intrinsics, truth.shape[-2:])
+    cameras = CAMERAS.replace(size=truth.shape[-2:])
     return judged(Photometric(Photometric.Config(**options)), Views(truth, cameras), rgb=rgb)
 
 
@@ -30,13 +30,8 @@ def test_valid_ssim_is_the_metric_of_large_enough_images():
     rgb = PREDICTED.clamp(0, 1)
     found = photometric(rgb, ssim_weight=0.3, padding="valid")["ssim"]
     assert_close(found, 0.3 * (1 - ssim(rgb, TRUTH).mean()) / 2)
-    must_refuse(
-        "at least 11 pixels a side, got 10 x 24",
-        photometric,
-        rgb[..., :10, :],
-        TRUTH[..., :10, :],
-        padding="valid",
-    )
+    low = (image[..., :10, :] for image in (rgb, TRUTH))
+    must_refuse("at least 11 pixels a side, got 10 x 24", photometric, *low, padding="valid")
 
 
 def test_terms_have_weights_and_those_of_weight_zero_are_left_out():
@@ -54,9 +49,9 @@ def test_gradients_of_visibility_are_finite_everywhere():
     nearly_zero = torch.tensor([[0.3, 0.1, 1e-30], [1e-30, 0.0, 1e-30], [0.0, 0.2, -1e-12]])
     points = torch.cat([POINTS, nearly_zero.expand(2, 3, 3)], 1).requires_grad_()
     for options in ({}, {"behind": 0.025}, {"clamp": None}, {"z_guard": 1e-3}):
-        values = view_visibility(points, CAMERAS[:, :1], **options)
-        (gradient,) = torch.autograd.grad(values.sum(), points)
-        assert values.isfinite().all(), options
+        value = view_visibility(points, CAMERAS[:, :1], **options).sum()
+        (gradient,) = torch.autograd.grad(value, points)
+        assert value.isfinite(), options
         assert gradient.isfinite().all(), options
         assert gradient.any(), options
 
@@ -92,9 +87,8 @@ POSE = torch.tensor([[0, 0, 1.0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 LENS = torch.tensor([2.0, 2.0, 3.0, 2.0])
 DEPTHS = torch.zeros(1, 1, 1, 4, 6)
 DEPTHS[..., 1, 2] = 2
-WALL = Views(
-    torch.zeros(1, 1, 3, 4, 6), Cameras(POSE[None, None], LENS[None, None], (4, 6)), depths=DEPTHS
-)
+FROM = Cameras(POSE[None, None], LENS[None, None], (4, 6))
+WALL = Views(torch.zeros(1, 1, 3, 4, 6), FROM, depths=DEPTHS)
 """A turned camera of 4 x 6 pixels, one of which sees something."""
 SEEN_FROM_IT = torch.tensor([
     [-0.5, -0.5, 2.5],  # half a unit behind the wall: 0.5 - beta / 2
@@ -112,14 +106,19 @@ def term(means, views, **options):
     return judged(DepthSurface(config), views, means)["depth_surface"]
 
 
+def differentiated(means, views, **options):
+    """The term, and its gradient."""
+    means = means.clone().requires_grad_()
+    value = term(means, views, **options)
+    return value, *torch.autograd.grad(value, means)
+
+
 def test_depth_by_hand():
     """A view that is target and input (`training.judge_inputs`) counts once."""
     for inputs in (False, True):
-        means = OF_DEPTH.clone().requires_grad_()
-        loss = term(means, WALL, inputs=inputs)
-        loss.backward()
+        loss, slope = differentiated(OF_DEPTH, WALL, inputs=inputs)
         assert loss.item() == pytest.approx((0.4 + 0.025) / 2)
-        gradient = means.grad[0] @ POSE[:3, :3]
+        gradient = slope[0] @ POSE[:3, :3]
         # z alone moves: 1 / 2 beyond beta, (1.9 - 2) / beta / 2 within it
         assert gradient[:, 2].tolist() == pytest.approx([0.5, -0.25, 0, 0, 0, 0])
         assert not gradient[:, :2].any()
@@ -127,12 +126,10 @@ def test_depth_by_hand():
 
 def test_a_batch_without_depth_maps_adds_nothing_and_is_logged_once(caplog):
     warn_once.cache_clear()
-    means = OF_DEPTH.clone().requires_grad_()
     for _ in range(2):
-        value = term(means, WALL.replace(depths=None))
-        value.backward()
+        value, slope = differentiated(OF_DEPTH, WALL.replace(depths=None))
         assert value == 0
-        assert not means.grad.any()
+        assert not slope.any()
     assert caplog.text.count("no depth maps") == 1
 
 
@@ -149,12 +146,10 @@ def test_a_hidden_surface_is_not_drawn_to_what_hides_it():
     depths = torch.ones(1, 2, 1, 4, 4)
     views = Views(depths.expand(-1, -1, 3, -1, -1), cameras, depths=depths)
     means = torch.tensor([[[0.2, 0.1, 1.0], [0.2, 0.1, 2.0], [-0.3, -0.2, 2.0]]])
-    means.requires_grad_()
-    value = term(means, views)
-    value.backward()
+    value, slope = differentiated(means, views)
     assert value == 0
-    assert not means.grad.any()
-    assert term(means.detach() + torch.tensor([0, 0, 0.1]), views) > 0
+    assert not slope.any()
+    assert term(means + torch.tensor([0, 0, 0.1]), views) > 0
 
 
 def test_depths_are_scaled_and_mirrored_and_unknown_in_noisy_views_and_without_maps():
@@ -175,6 +170,6 @@ def test_depths_are_scaled_and_mirrored_and_unknown_in_noisy_views_and_without_m
 
 
 def test_a_training_has_the_loss_on_depth(tmp_path):
-    history = run(ROOMS, tmp_path / "run").folder.history()
+    history = run(ROOMS, tmp_path).folder.history()
     assert history
     assert all(0 < record["depth_surface"] < 10 for record in history), history

@@ -72,13 +72,12 @@ def test_the_nearest_view_is_copied_whatever_the_scale_of_the_scene():
         (views([0, 0.01], [0.3, 0]), cameras([0.004]), [1]),
         (views([0, 100.0], [0.3, 0]), cameras([40.0]), [1]),
     ):
-        found = nearest_input(inputs, targets)
-        assert torch.equal(found, inputs.images[:, nearest]), targets
+        assert torch.equal(nearest_input(inputs, targets), inputs.images[:, nearest]), targets
 
 
 def test_each_scene_has_its_own_views_and_mean_colour():
     both = stack_views([views([0, 1.0]), views([1.0, 0])])
-    targets = Cameras(both.cameras.c2w[:1, :1].repeat(2, 1, 1, 1), torch.ones(2, 1, 4), (8, 8))
+    targets = both.cameras[[0, 0], :1]
     expected = torch.stack([both.images[0, :1], both.images[1, 1:]])
     assert torch.equal(nearest_input(both, targets), expected)
     mean = both.images.mean((1, 3, 4))[:, None, :, None, None]

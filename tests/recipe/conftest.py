@@ -1,7 +1,6 @@
 """A plugin whose components depend on each other, and recipes in the working directory."""
 
 from pathlib import Path
-from textwrap import dedent
 
 import pytest
 
@@ -122,11 +121,13 @@ def installed(install):
 
 @pytest.fixture
 def write(tmp_path, monkeypatch):
-    """Write recipes into the working directory: write(text) or write(text, name)."""
+    """Write a recipe into the working directory: write(text)."""
     monkeypatch.chdir(tmp_path)
 
-    def write(text, name="recipe.yaml"):
-        Path(name).write_text(dedent(text).lstrip("\n"))
-        return Path(name)
+    file = Path("recipe.yaml")
+
+    def write(text):
+        file.write_text(text)
+        return file
 
     return write

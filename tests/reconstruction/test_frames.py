@@ -25,8 +25,7 @@ def chosen(photos, inputs, times=range(9), held_out=(), gap=(3, 20)):
 
 
 def test_inputs_spread_over_times_and_novel_frames_are_of_one_time_between(photos):
-    times = (0, 1, 2, 3, 4, 4, 5, 6, 7)
-    assert chosen(photos, 2, times, held_out=(3, 4, 5)) == ((0, 8), (4, 5))
+    assert chosen(photos, 2, (0, 1, 2, 3, 4, 4, 5, 6, 7), held_out=(3, 4, 5)) == ((0, 8), (4, 5))
     assert chosen(photos, 3, gap=(3, 5))[0] == (1, 4, 7)
 
 

@@ -7,6 +7,7 @@ import torch
 import yaml
 from commands import MODEL
 from photo_formats import noisy_photos, scene
+from tables import must_refuse
 from torch.testing import assert_close
 from varying_head import VaryingHead
 
@@ -37,10 +38,6 @@ def photos(tmp_path_factory):
     return noisy_photos(tmp_path_factory.mktemp("photos") / "row", step=5.0)
 
 
-def posed(views, c2w):
-    return replace(views, cameras=replace(views.cameras, c2w=c2w))
-
-
 @pytest.fixture
 def far(views):
     """The views by cameras far from the origin, in units of which 100 lie between them."""
@@ -48,7 +45,7 @@ def far(views):
     c2w[0, 1, 0, 3] = 1
     c2w = POSE @ c2w
     c2w[..., :3, 3] *= 100
-    return posed(views, c2w)
+    return replace(views, cameras=replace(views.cameras, c2w=c2w))
 
 
 def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):
@@ -94,8 +91,7 @@ def test_what_cannot_be_reconstructed_is_refused(model, views, photos):
         (model, photos, {"frames": ["9.png"]}, r"9\.png"),
         (by_hand, views, {}, "recipe"),
     ):
-        with pytest.raises(ValueError, match=word):
-            qgs.reconstruct(chosen, given, **options)
+        must_refuse(word, qgs.reconstruct, chosen, given, **options)
 
 
 def test_photos_are_read_in_their_own_world_and_size(photos):
@@ -106,5 +102,4 @@ def test_photos_are_read_in_their_own_world_and_size(photos):
     few = qgs.read_photos(photos, size=(10, 12), frames=["2.png", 0])
     assert few.images.shape == (1, 2, 3, 10, 12)
     assert few.cameras.c2w[0, :, 0, 3].tolist() == [10, 0]
-    with pytest.raises(FileNotFoundError):
-        qgs.read_photos(photos / "nothing")
+    must_refuse("nothing", qgs.read_photos, photos / "nothing", kind=FileNotFoundError)

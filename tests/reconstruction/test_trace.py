@@ -18,8 +18,7 @@ def test_chosen_layers_and_queries_are_recorded_of_a_pass_that_predicts_the_same
     assert trace.grid == (2, 4, 4)
     first, last = trace.layers.values()
     for state, number in ((first.after, 1), (last.before, 2)):
-        expected = prediction.layers[number].state.features[:, [7, 2]]
-        assert_close(state.features, expected)
+        assert_close(state.features, prediction.layers[number].state.features[:, [7, 2]])
     read = last.cross_attention.weights
     assert read.shape == (1, 2, 2, 32)
     assert_close(read.sum(-1), torch.ones(1, 2, 2))

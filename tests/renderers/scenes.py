@@ -45,20 +45,18 @@ def make_scene(
     c2w[..., :3, 3] = 0.1 * randn(batch, views, 3)
     focal = max(size) * (0.9 + 0.2 * rand(batch, views, 2))
     centre = torch.tensor([size[1] / 2, size[0] / 2]) + 0.5 * randn(batch, views, 2)
-    cameras = Cameras(c2w, torch.cat([focal, centre], -1), size)
-    return gaussians.to(dtype), cameras.to(dtype)
+    return gaussians.to(dtype), Cameras(c2w, torch.cat([focal, centre], -1), size).to(dtype)
 
 
 def differentiate(renderer, gaussians, cameras):
     """The rendering, and gradients by name of a fixed random projection of all its images."""
     names = dict(named_tensors(gaussians))
     leaves = {**names, "c2w": cameras.c2w, "intrinsics": cameras.intrinsics}
-    leaves = {name: value.detach().clone().requires_grad_() for name, value in leaves.items()}
     if renderer.name == "gsplat":
-        leaves["intrinsics"].requires_grad_(False)
-    lenses = Cameras(leaves["c2w"], leaves["intrinsics"], cameras.size)
+        del leaves["intrinsics"]
+    leaves = {name: value.detach().clone().requires_grad_() for name, value in leaves.items()}
+    lenses = Cameras(leaves["c2w"], leaves.get("intrinsics", cameras.intrinsics), cameras.size)
     rendering = renderer(Gaussians(**{name: leaves[name] for name in names}), lenses)
-    leaves = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
     images = [image for _, image in named_tensors(rendering)]
     torch.manual_seed(1)
     slopes = [torch.rand(image.shape, dtype=torch.float64).to(image) for image in images]

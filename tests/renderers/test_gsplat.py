@@ -8,6 +8,7 @@ import pytest
 import torch
 from renderers.scenes import make_scene
 from tables import must_refuse
+from torch.testing import assert_close
 
 import qgs.renderers as auto_module
 import qgs.renderers.gsplat as gsplat_module
@@ -40,8 +41,7 @@ def test_arguments_are_what_gsplat_expects(calls):
     bare = render(gaussians.replace(sh=None, features=None), cameras)
     found, of_bare = (call.kwargs for call in calls)
     fx, fy, cx, cy = cameras.intrinsics[1, 2]
-    lens = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    assert torch.equal(found.pop("Ks")[1, 2], lens)
+    assert torch.equal(found.pop("Ks")[1, 2], torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     assert found.pop("render_mode") == "RGB+ED"
     features = gaussians.features[:, None].expand(2, 3, 7, 2)
     backdrop = torch.tensor([0.1, 0.2, 0.3, 0, 0]).expand(2, 3, 5)
@@ -57,7 +57,7 @@ def test_arguments_are_what_gsplat_expects(calls):
         "packed": False,
         "backgrounds": backdrop,
     }
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     assert torch.equal(of_bare["colors"], gaussians.colors[:, None].expand(2, 3, 7, 3))
     assert torch.equal(of_bare["backgrounds"], backdrop[..., :3])
     channels = torch.tensor([0, 1, 2, 3, 4, 5, 0.25, 3])[:, None, None].expand(2, 3, 8, 12, 20)
@@ -75,7 +75,7 @@ def test_options_that_the_kernels_fix_are_refused():
             (problem,) = cls.problems(config, context)
             assert problem.option == option
             assert "qgs/cpu" in problem.fix
-            assert [*cls.problems(RendererConfig(near=1.0, dilation=1.0), context)] == []
+            assert not [*cls.problems(RendererConfig(near=1.0, dilation=1.0), context)]
         must_refuse(option, GsplatRenderer, config)
 
 
@@ -85,9 +85,8 @@ ON_CUDA = SimpleNamespace(means=SimpleNamespace(is_cuda=True, dtype=torch.float3
 
 def test_tensors_elsewhere_and_intrinsics_that_want_a_gradient_are_refused():
     gaussians, cameras = make_scene()
-    must_refuse(
-        "CUDA tensors, got Gaussians on cpu", GsplatRenderer(RendererConfig()), gaussians, cameras
-    )
+    render = GsplatRenderer(RendererConfig())
+    must_refuse("CUDA tensors, got Gaussians on cpu", render, gaussians, cameras)
     cameras.intrinsics.requires_grad_()
     must_refuse("no gradient for intrinsics", gsplat_module._check_supported, ON_CUDA, cameras)
 
