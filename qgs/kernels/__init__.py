@@ -8,8 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 
-def kernel(function: Callable[..., Any]) -> Any:
-    """Compile `function` with numba on first use; cache it on disk if a folder is writable."""
+def kernel(function: Callable[..., Any], **more: Any) -> Any:
+    """Compile `function` with numba on first use; cache it on disk if a folder is writable.
+
+    more: further options of numba.
+    """
     from numba import njit
 
     options = {
@@ -17,8 +20,10 @@ def kernel(function: Callable[..., Any]) -> Any:
         # No branch on a division by zero.
         "error_model": "numpy",
         "fastmath": {"contract", "reassoc", "arcp", "nsz"},
-        # cached kernels share the functions they call, and might use another kernel's build
+        # Cached kernels share the functions that they call by name, so one loaded from the cache
+        # may run another kernel's build of them, with other roundings; what is inlined is its own.
         "forceinline": True,
+        **more,
     }
     try:
         return njit(cache=True, **options)(function)

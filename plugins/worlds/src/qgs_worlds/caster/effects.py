@@ -5,10 +5,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from PIL import Image
 
-from qgs_worlds.caster.vectors import INNER, OPTIONS
+from qgs.kernels import kernel
+from qgs_worlds.caster.vectors import inner
 
 # Share of full brightness above which highlights are compressed.
 _SHOULDER = 0.6
@@ -17,7 +17,7 @@ _STEP = 1 / 512
 _ENTRIES = 2048
 
 
-@njit(**INNER)
+@inner
 def _scrambled(i, j, seed):
     """Return 32 random bits for each pixel i of frame j."""
     h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
@@ -26,7 +26,7 @@ def _scrambled(i, j, seed):
     return h ^ (h >> 16)
 
 
-@njit(**OPTIONS)
+@kernel
 def _curve(gamma):
     """Return the tone curve for the square root of light, from 0 in steps of `_STEP`."""
     table = np.empty(_ENTRIES)
@@ -39,7 +39,7 @@ def _curve(gamma):
     return table
 
 
-@njit(**OPTIONS)
+@kernel
 def _develop(image, light, gains, gamma, vignette, grain, seed, frame):
     height, width, _ = light.shape
     reach = 1.0 / (height * height + width * width)

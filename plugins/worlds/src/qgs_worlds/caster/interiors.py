@@ -3,13 +3,13 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import hit, upright
 from qgs_worlds.caster.patterns import mixture, smooth
 from qgs_worlds.caster.shading import TAKEN, on_axis, to_world
-from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus, mix, narrow, times, triple
+from qgs_worlds.caster.vectors import along, dot, inner, minus, mix, narrow, times, triple
 
 # Share of the light that the lamp's shadow removes.
 _SHADOW = 0.36
@@ -22,7 +22,7 @@ _FLOOR = 4
 _FLAT = 0.03
 
 
-@njit(**INNER)
+@inner
 def _range(low, high, lamp, reach, extent, cells):
     """Return the range of the floor map's cells, on one axis, that a shape or its shadow covers."""
     start = min(low, lamp + (low - lamp) * reach)
@@ -32,7 +32,7 @@ def _range(low, high, lamp, reach, extent, cells):
     return max(first, 0), min(last, cells)
 
 
-@njit(**INNER)
+@inner
 def _darken(darkness, body, size, lamp):
     """Add a shape's shadow from the lamp and the dimness directly below it."""
     cells = darkness.shape[0]
@@ -63,7 +63,7 @@ def _darken(darkness, body, size, lamp):
             darkness[i, j] = max(darkness[i, j], dark)
 
 
-@njit(**OPTIONS)
+@kernel
 def _blurred(values):
     """Return the mean over 3 x 3 cells."""
     last = values.shape[0] - 1
@@ -78,7 +78,7 @@ def _blurred(values):
     return result
 
 
-@njit(**OPTIONS)
+@kernel
 def floor_shadows(shapes, size, lamp):
     """Return the factor (C, C) of the light on the floor, indexed by x, then y."""
     darkness = np.zeros((_SHADOW_CELLS, _SHADOW_CELLS))
@@ -89,7 +89,7 @@ def floor_shadows(shapes, size, lamp):
     return 1 - _blurred(_blurred(darkness))
 
 
-@njit(**INNER)
+@inner
 def _on_round(body, part, p):
     """Return `_surface` of a ball or a cylinder, in its own frame; part 1 is a cap."""
     x, y, z = p
@@ -101,7 +101,7 @@ def _on_round(body, part, p):
     return normal, angle * radius, z, angle / math.pi, z / body.extent[2]
 
 
-@njit(**INNER)
+@inner
 def _surface(shape, part, place):
     """Return the texture index, world normal and texture coordinates of a point.
 
@@ -126,12 +126,12 @@ def _surface(shape, part, place):
     return shape.texture, to_world(body, normal), u, v, across, up
 
 
-@njit(**INNER)
+@inner
 def _edge(distance):
     return 1 - 0.30 / (1 + 6 * distance) ** 2
 
 
-@njit(**INNER)
+@inner
 def _wall_shadow(place, size, face):
     """Return how much darker walls are towards the edges of the room."""
     x, y, z = place
@@ -141,7 +141,7 @@ def _wall_shadow(place, size, face):
     return a * b * c
 
 
-@njit(**INNER)
+@inner
 def _floor_shadow(floor, place, size):
     """Interpolate the floor's map of shadows."""
     last = floor.shape[0] - 1
@@ -156,7 +156,7 @@ def _floor_shadow(floor, place, size):
     return low * (1 - a) + high * a
 
 
-@njit(**INNER)
+@inner
 def _shadow(room, code, place, normal):
     if code < 8:
         shadow = _wall_shadow(place, room.size, code)
@@ -166,7 +166,7 @@ def _shadow(room, code, place, normal):
     return 1 - 0.4 / (1 + 3 * place[2]) ** 2
 
 
-@njit(**INNER)
+@inner
 def _light(room, code, place, normal):
     """Return the RGB light at a point: a bright ceiling above, and Lambert light of the lamps."""
     # more light on surfaces that face down; otherwise ceilings would be dark
@@ -182,7 +182,7 @@ def _light(room, code, place, normal):
     return times(_shadow(room, code, place, normal), total)
 
 
-@njit(**INNER)
+@inner
 def _gather(t, code, i, j, own, samples, top, o, rays, points):
     """Write where rays of pixel (i, j) hit surface `own`, the mean in row 0; return the count."""
     n = 0
@@ -203,7 +203,7 @@ def _gather(t, code, i, j, own, samples, top, o, rays, points):
     return n
 
 
-@njit(**INNER)
+@inner
 def _albedo(texture, shape, part, points, n, footprint):
     """Return the mean RGB of a texture at rows 1 to n of `points`, or at row 0 if it is smooth."""
     first = 0 if smooth(texture.pattern) else 1
@@ -220,7 +220,7 @@ def _albedo(texture, shape, part, points, n, footprint):
     return along(rgb, third / (last - first), minus(texture.colors[2], base))
 
 
-@njit(**INNER)
+@inner
 def _shade(room, code, points, n, footprint):
     """Return the RGB in [0, 1] of a surface seen at rows 1 to n of `points`."""
     shape = room.shapes[code >> 3]
@@ -233,7 +233,7 @@ def _shade(room, code, points, n, footprint):
     return min(albedo[0] * red, 1.0), min(albedo[1] * green, 1.0), min(albedo[2] * blue, 1.0)
 
 
-@njit(**OPTIONS)
+@kernel
 def paint_room(image, t, code, top, samples, room, c2w, rays):
     """Write a band of the image (rows, W, 3) uint8 from row `top`; this overwrites `code`.
 

@@ -8,10 +8,10 @@ vectorises. They are in the primitive's own frame. A ray that misses enters at i
 import math
 
 import numpy as np
-from numba import njit
 
+from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus
+from qgs_worlds.caster.vectors import along, dot, inner, minus
 
 # Least distance of a hit in metres; cameras are never that near to a surface.
 NEAR = np.float32(0.01)
@@ -32,13 +32,13 @@ _ADVANCE = np.float32(1e-6)
 _NUDGE = np.float32(1e-3)
 
 
-@njit(**INNER)
+@inner
 def reciprocal(x):
     """Return 1 / x, or a large number where x is 0."""
     return ONE / (x if abs(x) > TINY else TINY)
 
 
-@njit(**INNER)
+@inner
 def slab(o, inverse, h):
     """Return the interval of a ray between -h and h on one axis; inverse is 1 / d."""
     a = (-h - o) * inverse
@@ -46,35 +46,35 @@ def slab(o, inverse, h):
     return min(a, b), max(a, b)
 
 
-@njit(**INNER)
+@inner
 def nearest(o, d):
     """Return the point of a ray nearest to the origin, and its t."""
-    t = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    t = -dot(o, d) / dot(d, d)
     return along(o, t, d), t
 
 
-@njit(**INNER)
+@inner
 def ellipsoid(o, d):
     """Return the interval in the unit sphere. o: see `nearest`."""
-    inside = ONE - (o[0] * o[0] + o[1] * o[1] + o[2] * o[2])
-    root = math.sqrt(max(inside, ZERO) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
+    inside = ONE - dot(o, o)
+    root = math.sqrt(max(inside, ZERO) / dot(d, d))
     met = inside > ZERO
     return (-root if met else NONE), (root if met else -NONE), ZERO, ZERO
 
 
-@njit(**INNER)
+@inner
 def ball(o, d, radius):
     """Return the entry into a sphere around the origin; balls have no cuts and need no exit."""
-    inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
-    x, y, z = along(o, middle, d)
-    inside = radius * radius - (x * x + y * y + z * z)
+    inverse = ONE / dot(d, d)
+    middle = -dot(o, d) * inverse
+    place = along(o, middle, d)
+    inside = radius * radius - dot(place, place)
     root = math.sqrt(max(inside, ZERO) * inverse)
     met = inside > ZERO
     return (middle - root if met else NONE), NONE, ZERO, ZERO
 
 
-@njit(**INNER)
+@inner
 def _last_and_first(x, y, z):
     """Return the overlap of three intervals, and which of them it starts and ends with."""
     near = max(x[0], y[0], z[0])
@@ -84,7 +84,7 @@ def _last_and_first(x, y, z):
     return near, far, entry, leave
 
 
-@njit(**INNER)
+@inner
 def box(o, d):
     """Return the interval in the cube; faces are numbered by axis."""
     x = slab(o[0], reciprocal(d[0]), ONE)
@@ -93,7 +93,7 @@ def box(o, d):
     return _last_and_first(x, y, z)
 
 
-@njit(**INNER)
+@inner
 def block(o, d, h):
     """Return the interval in a box of half sizes h, like `box`."""
     x = slab(o[0], reciprocal(d[0]), h[0])
@@ -102,7 +102,7 @@ def block(o, d, h):
     return _last_and_first(x, y, z)
 
 
-@njit(**INNER)
+@inner
 def interior(o, d, h):
     """Return where a ray from inside leaves a room that stands on z = 0.
 
@@ -120,7 +120,7 @@ def interior(o, d, h):
     return t, NONE, face + (ONE if toward > ZERO else ZERO), ZERO
 
 
-@njit(**INNER)
+@inner
 def _shaft(o, d, radius, half):
     """Return the interval in an upright cylinder, and the interval between its caps."""
     low, high = slab(o[2], reciprocal(d[2]), half)
@@ -136,14 +136,14 @@ def _shaft(o, d, radius, half):
     return (near if met else NONE), (far if met else -NONE), low, high
 
 
-@njit(**INNER)
+@inner
 def cylinder(o, d, h):
     """Return the interval in a cylinder of radius h[0] and half height h[2]. Face 1 is a cap."""
     near, far, low, high = _shaft(o, d, h[0], h[2])
     return near, far, (ONE if near == low else ZERO), (ONE if far == high else ZERO)
 
 
-@njit(**INNER)
+@inner
 def capsule(o, d, half):
     """Return the interval within 1 of the segment from z = -half to half."""
     near, far, _, _ = _shaft(o, d, ONE, half)
@@ -156,7 +156,7 @@ def capsule(o, d, half):
     return near, far, ZERO, ZERO
 
 
-@njit(**INNER)
+@inner
 def frustum(o, d, top):
     """Return the interval in a cone of radius 1 at z = -1, `top` <= 1 at z = 1. Face 1 is a cap."""
     # caps come first, because they cut off the side
@@ -188,7 +188,7 @@ def frustum(o, d, top):
     return (near if met else NONE), (far if met else -NONE), entry, leave
 
 
-@njit(**INNER)
+@inner
 def torus(o, d, thickness, start):
     """Return the entry into a ring of outer radius 1 about z, from t `start` on, as exit too.
 
@@ -212,7 +212,7 @@ def torus(o, d, thickness, start):
     return NONE, -NONE, ZERO, ZERO
 
 
-@njit(**INNER)
+@inner
 def height_at(heights, x, y):
     """Return the bilinear height at x, y in [-1, 1]."""
     last = heights.shape[0] - 1
@@ -227,13 +227,13 @@ def height_at(heights, x, y):
     return low + a * (high - low)
 
 
-@njit(**INNER)
+@inner
 def _above(heights, o, d, t):
     x, y, z = along(o, t, d)
     return z - height_at(heights, x, y)
 
 
-@njit(**INNER)
+@inner
 def _next_line(o, d, t, cells):
     """Return the t at which a ray crosses the next cell border on one axis."""
     if abs(d) < TINY:
@@ -243,7 +243,7 @@ def _next_line(o, d, t, cells):
     return (np.float32(line) / cells * _TWO - ONE - o) / d
 
 
-@njit(**INNER)
+@inner
 def _surface_between(heights, o, d, t, above, line, below):
     """Return the t of a hit on the map: the ray is `above` it at t and `below` it at `line`."""
     # regula falsi, because heights along a ray in one cell are a parabola
@@ -259,7 +259,7 @@ def _surface_between(heights, o, d, t, above, line, below):
     return t + (line - t) * above / (above - below)
 
 
-@njit(**INNER)
+@inner
 def relief(o, d, heights, start):
     """Return the entry into the cube below a height map, like `torus`. Face 0 is top, 1 a side."""
     t, end, _, _ = box(o, d)
@@ -282,7 +282,7 @@ def relief(o, d, heights, start):
     return NONE, -NONE, ZERO, ZERO
 
 
-@njit(**INNER)
+@inner
 def less(near, far, entry, cut_near, cut_far, cut_leave):
     """Return the entry into an interval minus a cut, and its face, plus 3 on the cut's wall."""
     outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
@@ -292,26 +292,26 @@ def less(near, far, entry, cut_near, cut_far, cut_leave):
     return t, (entry if outer else cut_leave + np.float32(3))
 
 
-@njit(**INNER)
+@inner
 def local(primitive, v):
     """Return a direction in the frame of a primitive."""
     axes = primitive.axes
     return dot(axes[0], v), dot(axes[1], v), dot(axes[2], v)
 
 
-@njit(**INNER)
+@inner
 def local_point(primitive, p):
     """Return a point in the frame of a primitive."""
     return local(primitive, minus(p, primitive.center))
 
 
-@njit(**INNER)
+@inner
 def hollow(shape):
     """Return True for a bent or cut shape, which may shade itself and fills little of its box."""
     return shape.body.kind >= s.TORUS or shape.cut.kind != s.NOTHING
 
 
-@njit(**INNER)
+@inner
 def upright(body, v):
     """Return `local` faster, for a shape in metres that is turned about z."""
     cos = body.axes[0, 0]
@@ -319,7 +319,7 @@ def upright(body, v):
     return cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]
 
 
-@njit(**OPTIONS)
+@kernel
 def hit(body, o, d):
     """Return the t at which a ray enters a BLOCK, a BALL or a CYLINDER, or inf."""
     p = upright(body, minus(o, body.center))
@@ -333,13 +333,13 @@ def hit(body, o, d):
     return near if (near > NEAR) & (near <= far) else NONE
 
 
-@njit(**OPTIONS)
+@kernel
 def height_of(heights, x, y):
     """Return `height_at` for calls from Python."""
     return height_at(heights, x, y)
 
 
-@njit(**OPTIONS)
+@kernel
 def clearances(shapes, points):
     """Return distances (F, S) in metres from points (F, 3) to the boxes of shapes, 0 inside."""
     distances = np.empty((points.shape[0], shapes.shape[0]))

@@ -2,16 +2,14 @@
 
 import math
 
-from numba import njit
-
 from qgs_worlds.caster.textures import eased
-from qgs_worlds.caster.vectors import INNER
+from qgs_worlds.caster.vectors import inner
 
 (PLAIN, CHECKER, STRIPES, PLANKS, TILES, BRICKS, CLOUDS, GRADIENT, PICTURE, RUG, WINDOW, DOTS,
  BOOKS) = range(13)  # fmt: skip
 
 
-@njit(**INNER)
+@inner
 def _hash(i, j, seed):
     """Return a number in [0, 1) for each lattice point."""
     # primes of xxHash, which spread neighbours over all bits
@@ -20,7 +18,7 @@ def _hash(i, j, seed):
     return (h ^ (h >> 16)) / 4294967296.0
 
 
-@njit(**INNER)
+@inner
 def _noise(x, y, seed):
     """Return value noise in [0, 1] with unit period."""
     i = math.floor(x)
@@ -32,20 +30,20 @@ def _noise(x, y, seed):
     return low * (1 - b) + high * b
 
 
-@njit(**INNER)
+@inner
 def _part(x):
     """Return the fractional part of x."""
     return x - math.floor(x)
 
 
-@njit(**INNER)
+@inner
 def _seam(x, width):
     """Return 1 within `width` of an integer, 0 elsewhere."""
     f = _part(x)
     return 1.0 if f < width or f > 1 - width else 0.0
 
 
-@njit(**INNER)
+@inner
 def _grid(x, y, shift, seed, softness):
     """Draw tiles of unit size with a tone for each, and the joints between them."""
     row = math.floor(y)
@@ -55,7 +53,7 @@ def _grid(x, y, shift, seed, softness):
     return tone, softness * max(_seam(x, 0.03), _seam(y, 0.03 * (1 + 2 * shift)))
 
 
-@njit(**INNER)
+@inner
 def _planks(x, y, seed, fade):
     board = math.floor(x)
     # boards start at different heights
@@ -65,7 +63,7 @@ def _planks(x, y, seed, fade):
     return tone, fade * max(_seam(x, 0.03), _seam(along, 0.005))
 
 
-@njit(**INNER)
+@inner
 def _picture(p, q, seed):
     """Draw a landscape: hills under a sky with a sun."""
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
@@ -82,7 +80,7 @@ def _picture(p, q, seed):
     return 0.25 - 0.25 * q, 0.0
 
 
-@njit(**INNER)
+@inner
 def _rug(p, q, x, y, seed):
     """Draw two borders, a ring in the middle, and diamonds."""
     edge = min(1 - abs(p), 1 - abs(q))
@@ -99,7 +97,7 @@ def _rug(p, q, x, y, seed):
     return (0.7 if diamond < 0.28 else 0.0) + 0.15 * _noise(6 * x, 6 * y, seed), 0.0
 
 
-@njit(**INNER)
+@inner
 def _window(p, q, seed):
     """Draw a frame with a cross, trees and a sky."""
     if abs(p) < 0.03 or abs(q - 0.25) < 0.025 or abs(p) > 0.94 or abs(q) > 0.95:
@@ -110,20 +108,20 @@ def _window(p, q, seed):
     return 0.3 * _noise(2 * p, 3 * q, seed), 0.0
 
 
-@njit(**INNER)
+@inner
 def _spines(x, seed):
     """Draw books of several widths, some with a band."""
     i = math.floor(x + 0.3 * _noise(x, 0.5, seed))
     return _hash(i, 1, seed), (0.9 * _hash(i, 2, seed) if _hash(i, 3, seed) > 0.5 else 0.0)
 
 
-@njit(**INNER)
+@inner
 def smooth(kind):
     """Return True if a texture has no edges inside."""
     return kind in (PLAIN, CLOUDS, GRADIENT)
 
 
-@njit(**INNER)
+@inner
 def mixture(texture, u, v, p, q, footprint):
     """Return weights (m, n) for the colour lerp(lerp(a, b, m), c, n).
 

@@ -5,8 +5,8 @@ the depth.
 """
 
 import numpy as np
-from numba import njit
 
+from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import (
     NEAR,
@@ -28,7 +28,7 @@ from qgs_worlds.caster.intervals import (
     torus,
     upright,
 )
-from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus, narrow, over, triple
+from qgs_worlds.caster.vectors import along, dot, inner, minus, narrow, over, triple
 
 # Part p of shape i has code 8 i + p; codes are float32, so that loops vectorise them with t.
 SKY = -1
@@ -36,7 +36,7 @@ SKY = -1
 _PLANE = 0.02
 
 
-@njit(**INNER)
+@inner
 def _corners(body, c2w, corners):
     """Write the camera-frame positions (8, 3) of the corners of the box around a primitive."""
     middle = minus(body.center, c2w[:, 3])
@@ -52,7 +52,7 @@ def _corners(body, c2w, corners):
             corners[k, a] = center + across + (z if k & 4 else -z)
 
 
-@njit(**INNER)
+@inner
 def _clipped(corners, points):
     """Write the corners before the camera and where edges cross its plane; return the number."""
     n = 0
@@ -72,7 +72,7 @@ def _clipped(corners, points):
     return n
 
 
-@njit(**INNER)
+@inner
 def _covered(corners, points, intrinsics):
     """Return the pixel range u0, u1, v0, v1 of a box from its corners; u0 > u1 behind the camera.
 
@@ -91,7 +91,7 @@ def _covered(corners, points, intrinsics):
     return u0, u1, v0, v1
 
 
-@njit(**INNER)
+@inner
 def _span(low, high, samples, first, count):
     """Return the range of samples between two coordinates, among `count` from pixel `first` on."""
     # half a sample more on both sides, because bounds and rays round differently
@@ -100,7 +100,7 @@ def _span(low, high, samples, first, count):
     return int(min(max(low, 0.0), count)), int(min(max(high + 1, 0.0), count))
 
 
-@njit(**INNER)
+@inner
 def ray_basis(c2w, intrinsics):
     """Return the columns of B (3, 3), with d = B (1, u, v) in the world frame."""
     right = over(c2w[:, 0], intrinsics[0])
@@ -109,13 +109,13 @@ def ray_basis(c2w, intrinsics):
     return corner, right, down
 
 
-@njit(**INNER)
+@inner
 def _row_base(rays, v):
     """Return the direction of the ray at u = 0 of row v."""
     return narrow(along(rays[0], v, rays[2]))
 
 
-@njit(**INNER)
+@inner
 def _ray(o, base, step, u):
     """Return a ray of a row: its point nearest to the origin, its direction, and t at that point.
 
@@ -126,7 +126,7 @@ def _ray(o, base, step, u):
     return p, d, t
 
 
-@njit(**INNER)
+@inner
 def _store(spans, k, found, t):
     near, far, entry, leave = found
     spans[0, k] = near + t
@@ -135,7 +135,7 @@ def _store(spans, k, found, t):
     spans[3, k] = leave
 
 
-@njit(**INNER)
+@inner
 def _inside_row(kind, extra, heights, steps, o, base, step, spans):
     """Write `spans` (4, R): entries, exits and their faces, for the rays of a row.
 
@@ -167,7 +167,7 @@ def _inside_row(kind, extra, heights, steps, o, base, step, spans):
                 _store(spans, k, relief(p, d, heights, -t), t)
 
 
-@njit(**INNER)
+@inner
 def _closest(t, code, own, first, second):
     """Keep the nearer hit: that of a shape with intervals (4, R), or the earlier one."""
     for k in range(t.shape[0]):
@@ -179,7 +179,7 @@ def _closest(t, code, own, first, second):
         code[k] = own + face if closer else code[k]
 
 
-@njit(**INNER)
+@inner
 def _keep(t, code, k, own, found):
     near, far, face, _ = found
     closer = (near > NEAR) & (near <= far) & (near < t[k])
@@ -187,7 +187,7 @@ def _keep(t, code, k, own, found):
     code[k] = own + face if closer else code[k]
 
 
-@njit(**INNER)
+@inner
 def _cover_row(t, code, own, kind, extent, steps, o, base, step):
     """Keep the nearer hits along a row, like `_closest`, for a shape in metres without a cut.
 
@@ -207,7 +207,7 @@ def _cover_row(t, code, own, kind, extent, steps, o, base, step):
             _keep(t, code, k, own, interior(o, along(base, steps[k], step), extent))
 
 
-@njit(**INNER)
+@inner
 def _trace_primitive(primitive, heights, o, base, step, steps, spans):
     field = heights[int(primitive.extra) if primitive.kind == s.HEIGHT else 0]
     lo = local_point(primitive, o)
@@ -216,7 +216,7 @@ def _trace_primitive(primitive, heights, o, base, step, steps, spans):
     _inside_row(primitive.kind, primitive.extra, field, steps, lo, lb, ls, spans)
 
 
-@njit(**INNER)
+@inner
 def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
     """Do the same as `_trace_shape` for a shape in metres."""
     above, below, first, last = area
@@ -232,7 +232,7 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
         _cover_row(depths, codes, own, kind, extent, along_row, lo, lb, ls)
 
 
-@njit(**INNER)
+@inner
 def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch):
     """Let a shape cover everything behind it in an area of the samples."""
     above, below, first, last = area
@@ -251,7 +251,7 @@ def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, are
         _closest(t[row, first:last], code[row, first:last], own, spans[0], spans[1])
 
 
-@njit(**OPTIONS)
+@kernel
 def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
     """Return t and code (R, C) float32 of rays from pixel row `top` on, and the basis of the rays.
 

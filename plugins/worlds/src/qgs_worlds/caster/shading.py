@@ -3,18 +3,17 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import ONE, ZERO, height_at, hollow, local_point
 from qgs_worlds.caster.raycast import SKY
 from qgs_worlds.caster.shadows import lit, surroundings, visible
 from qgs_worlds.caster.textures import color, noise
 from qgs_worlds.caster.vectors import (
-    INNER,
-    OPTIONS,
     along,
     dot,
+    inner,
     longest,
     minus,
     mix,
@@ -31,7 +30,7 @@ TAKEN = np.float32(-2)
 _LIFT = 2e-3
 
 
-@njit(**INNER)
+@inner
 def on_axis(axis, p, unit):
     """Return the normal of a box face across an axis, the position on it and its number."""
     x, y, z = p
@@ -42,7 +41,7 @@ def on_axis(axis, p, unit):
     return (0.0, 0.0, math.copysign(1.0, z)), x * unit[0], y * unit[1], (5 if z > 0 else 4)
 
 
-@njit(**INNER)
+@inner
 def _on_relief(field, p, unit):
     x, y, _ = p
     step = np.float32(2.0 / (field.shape[0] - 1))
@@ -52,7 +51,7 @@ def _on_relief(field, p, unit):
     return normal, x * unit[0], y * unit[1], 0
 
 
-@njit(**INNER)
+@inner
 def _on_primitive(primitive, heights, face, p):
     """Return the result of `on_axis` for any primitive, at a point of one of its faces."""
     kind = primitive.kind
@@ -84,14 +83,14 @@ def _on_primitive(primitive, heights, face, p):
     return (x, y, 0.5 * (1 - extra) * across), angle * unit[0], z * unit[2], 0
 
 
-@njit(**INNER)
+@inner
 def to_world(primitive, n):
     """Return a normal of a primitive's frame in the world frame, with any length."""
     axes = primitive.axes
     return dot(axes[:, 0], n), dot(axes[:, 1], n), dot(axes[:, 2], n)
 
 
-@njit(**INNER)
+@inner
 def surface(shape, heights, part, place):
     """Return the texture index, world normal and texture coordinates of a point."""
     cut = part >= 3
@@ -105,7 +104,7 @@ def surface(shape, heights, part, place):
     return row, normal, u * scale, v * scale
 
 
-@njit(**INNER)
+@inner
 def _clouds(air, x, y, z):
     """Return how white the sky is in a direction, from noise on a plane above."""
     if air.clouds <= 0 or z <= 0.02:
@@ -123,7 +122,7 @@ def _clouds(air, x, y, z):
     return min(max(2.0 * cloud + air.clouds - 0.5, 0.0), 1.0) * min(8 * z, 1.0)
 
 
-@njit(**INNER)
+@inner
 def _glow(lights, view):
     """Return the glow around the sun: a cosine to the eighth, by squares because `**` is slow."""
     if lights.shape[0] == 0 or lights[0].lamp > 0:
@@ -134,7 +133,7 @@ def _glow(lights, view):
     return 0.5 * near * near
 
 
-@njit(**INNER)
+@inner
 def _sky(air, lights, view):
     """Return RGB of the sky in a direction: a gradient, clouds and a glow around the sun."""
     x, y, z = view
@@ -147,7 +146,7 @@ def _sky(air, lights, view):
     return along(glow, 1.0, mix(clear, (white, white, white), cloud))
 
 
-@njit(**INNER)
+@inner
 def _light(light, shadows, own, place, normal, view, open_, shine):
     """Return how much of a light a point reflects: diffusely, and as a highlight."""
     toward = minus(light.place, times(light.lamp, place))
@@ -169,7 +168,7 @@ def _light(light, shadows, own, place, normal, view, open_, shine):
     return strength * cosine, strength * half**shine
 
 
-@njit(**INNER)
+@inner
 def _shade(world, around, code, place, view, footprint, distance):
     """Return RGB of a surface seen at a point from direction `view`."""
     i = code >> 3
@@ -198,7 +197,7 @@ def _shade(world, around, code, place, view, footprint, distance):
     return mix(seen, air.horizon, mist)
 
 
-@njit(**INNER)
+@inner
 def _gather(t, code, i, j, own, samples):
     """Return number and means of the rays of pixel (i, j) that hit `own`, and mark them as used.
 
@@ -219,7 +218,7 @@ def _gather(t, code, i, j, own, samples):
     return n, t_sum / n, u_sum / t_sum, v_sum / t_sum
 
 
-@njit(**OPTIONS)
+@kernel
 def paint(image, t, code, top, samples, world, c2w, rays):
     """Write a band of the image (rows, W, 3) float32 from row `top`; this overwrites `code`.
 

@@ -6,12 +6,12 @@ Ambient occlusion estimates how much of the sky or walls a point sees, from boxe
 import math
 
 import numpy as np
-from numba import njit
 
+from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import ZERO, hollow, local
 from qgs_worlds.caster.raycast import trace
-from qgs_worlds.caster.vectors import INNER, OPTIONS, REDUCING, dot, longest, minus, narrow
+from qgs_worlds.caster.vectors import dot, inner, longest, minus, narrow, reducing
 
 # Fields of a box: matrix, centre in its frame, extents, units and the number of its shape.
 _FIELDS = 19
@@ -71,7 +71,7 @@ def _views(
     return [(c2w[0], _SUN_SIDE, _SUN_SIDE / 2 * _SUN / radius)]
 
 
-@njit(**INNER)
+@inner
 def _seen(shadows, k, own, p):
     """Return the share of a light that reaches a point, from map k; 1 outside the map."""
     view = shadows.maps[k]
@@ -102,7 +102,7 @@ def _seen(shadows, k, own, p):
     return light
 
 
-@njit(**INNER)
+@inner
 def lit(shadows, light, own, p):
     """Return the share of a light that reaches a point. own: its shape if that cannot shade it."""
     k = light.shadows - 1
@@ -113,7 +113,7 @@ def lit(shadows, light, own, p):
     return _seen(shadows, k, own, p)
 
 
-@njit(**OPTIONS)
+@kernel
 def surroundings(shapes):
     """Return the memory that `visible` keeps for successive points: all boxes, and the near ones.
 
@@ -134,7 +134,7 @@ def surroundings(shapes):
     return boxes, np.empty_like(boxes), np.full(5, np.inf)
 
 
-@njit(**INNER)
+@inner
 def _find(shapes, around, p, reach, slack):
     """Keep the boxes near a place, except those of hollow shapes, which do not fill their boxes."""
     boxes, near, place = around
@@ -153,7 +153,7 @@ def _find(shapes, around, p, reach, slack):
     place[3] = count
 
 
-@njit(**REDUCING)
+@reducing
 def visible(shapes, around, own, point, normal, strength, reach, footprint):
     """Return the ambient light at a point, from a distance field at two heights above it.
 

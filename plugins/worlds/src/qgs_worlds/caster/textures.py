@@ -3,10 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.vectors import INNER, mix, times
+from qgs_worlds.caster.vectors import inner, mix, times
 
 # Side of the table of random numbers, which noise repeats; a power of two, for `chance`.
 _SIDE = 64
@@ -15,13 +14,13 @@ _INK = 0.24
 _TABLE = np.random.default_rng(7).random((_SIDE, _SIDE)).astype(np.float32)
 
 
-@njit(**INNER)
+@inner
 def chance(i, j, seed):
     """Return a number in [0, 1) for each lattice point."""
     return float(_TABLE[(i + seed) & (_SIDE - 1), (j + (seed >> 6)) & (_SIDE - 1)])
 
 
-@njit(**INNER)
+@inner
 def _corner(basis, i, j, seed, x, y):
     """Return the height at (x, y) of a plane through the lattice point, level or sloped."""
     if basis == s.VALUE:
@@ -29,7 +28,7 @@ def _corner(basis, i, j, seed, x, y):
     return (2 * chance(i, j, seed) - 1.0) * x + (2 * chance(j, i, seed + 1371) - 1.0) * y
 
 
-@njit(**INNER)
+@inner
 def _cells(x, y, i, j, seed):
     """Return the distance to the nearest of random points, one per cell, minus its mean."""
     least = 4.0
@@ -41,13 +40,13 @@ def _cells(x, y, i, j, seed):
     return 1.4 * (math.sqrt(least) - 0.45)
 
 
-@njit(**INNER)
+@inner
 def eased(x):
     """Return x in [0, 1], eased to zero slope at both ends."""
     return x * x * (3 - 2 * x)
 
 
-@njit(**INNER)
+@inner
 def noise(basis, x, y, seed):
     """Return noise of unit period and a mean of about 0, mostly within -0.5 and 0.5."""
     i = math.floor(x)
@@ -66,13 +65,13 @@ def noise(basis, x, y, seed):
     return low + eased(b) * (high - low)
 
 
-@njit(**INNER)
+@inner
 def _seen(footprint, period):
     """Return the visibility of details with a period, 0 if it is below two footprints."""
     return min(max(2.0 - 4.0 * footprint / period, 0.0), 1.0)
 
 
-@njit(**INNER)
+@inner
 def _octaves(texture, x, y, footprint):
     """Return noise in octaves around 0.5; x, y and footprint are in periods."""
     total = 0.0
@@ -90,19 +89,19 @@ def _octaves(texture, x, y, footprint):
     return 0.5 + total
 
 
-@njit(**INNER)
+@inner
 def _step(x, blur):
     """Return a blurred step at 0."""
     return min(max(0.5 + x / blur, 0.0), 1.0)
 
 
-@njit(**INNER)
+@inner
 def _bar(x, width, blur):
     """Return 1 within `width` around an integer, 0 elsewhere."""
     return _step(0.5 * width - abs(x - math.floor(x + 0.5)), blur)
 
 
-@njit(**INNER)
+@inner
 def _glyphs(x, y, seed):
     """Draw lines of letters from 4 x 6 random dots, with spaces and lines of random length."""
     line = math.floor(y)
@@ -116,7 +115,7 @@ def _glyphs(x, y, seed):
     return 1.0
 
 
-@njit(**INNER)
+@inner
 def _mean(kind, width):
     """Return the mean share of the fourth colour in a pattern."""
     if kind == s.CHECKER:
@@ -128,7 +127,7 @@ def _mean(kind, width):
     return _INK if kind == s.GLYPHS else width
 
 
-@njit(**INNER)
+@inner
 def _pattern(kind, x, y, width, seed, blur):
     """Return the share of the fourth colour, and the tone of the cell in [0, 1]."""
     if kind == s.STRIPES or kind == s.RINGS:
@@ -152,7 +151,7 @@ def _pattern(kind, x, y, width, seed, blur):
     return _INK + _seen(blur, 0.4) * (_glyphs(x, y, seed) - _INK), 0.5
 
 
-@njit(**INNER)
+@inner
 def _marked(texture, rgb, u, v, warped, footprint):
     """Put the pattern of a texture over a colour. warped: u after the warp of the noise."""
     period = texture.pattern_period
@@ -168,7 +167,7 @@ def _marked(texture, rgb, u, v, warped, footprint):
     return mix(times(shade, rgb), texture.colors[3], w)
 
 
-@njit(**INNER)
+@inner
 def color(texture, u, v, footprint):
     """Return RGB at u, v. footprint: distance between neighbouring pixels, in the same unit."""
     x = u / texture.period

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from random import Random
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
+from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.textures import chance, noise
-from qgs_worlds.caster.vectors import OPTIONS
 from qgs_worlds.worlds.things import spread
 
 # textures of a world
@@ -127,7 +126,7 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
     return {**fields, "seed": rng.randrange(1 << 16), "colors": [*ramp, mark]}
 
 
-@njit(**OPTIONS)
+@kernel
 def height_maps(seed, count):
     """Return (count, 33, 33) float32 in [-1, 1] of smooth octaves, each map with its own grain."""
     maps = np.empty((count, _SIDE, _SIDE), np.float32)
