@@ -219,7 +219,7 @@ def component_fault(component: type[Component]) -> str:
         return "has an option `type`; rename it, because `type` names the component in a recipe"
     fields: Mapping[str, Any] = config.model_fields
     scheduled: object = component.scheduled
-    known = {n for n, option in fields.items() if _number_kinds(option.annotation)}
+    known = {n for n, option in fields.items() if _may_be_number(option.annotation)}
     if not (isinstance(scheduled, frozenset) and scheduled <= known):
         return f"has `scheduled` {scheduled!r}; give a frozenset of names of number options"
     # Other components are built once and do not follow the training steps.
@@ -228,10 +228,8 @@ def component_fault(component: type[Component]) -> str:
     return ""
 
 
-def _number_kinds(annotation: Any) -> set[type]:
-    """Return which of int and float an option of this type can hold, possibly neither."""
-    if annotation in (int, float):
-        return {annotation}
+def _may_be_number(annotation: Any) -> bool:
+    """Return True if an option of this type can hold an int or a float."""
     # `float | None` and numbers with limits count; a list of numbers does not.
     parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
-    return {kind for part in parts for kind in _number_kinds(part)}
+    return annotation in (int, float) or any(map(_may_be_number, parts))

@@ -52,7 +52,7 @@ def read_record(folder: Path) -> Record:
     """Read the record in `folder`. Raises ValueError where it is damaged."""
     file = folder / CAMERAS
     try:
-        return _parsed(folder, json.loads(file.read_text(encoding="utf-8")))
+        return _parsed(folder, json.loads(file.read_bytes()))
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(
             f"{file} is no record of a reconstruction ({type(error).__name__}: {error}): make it "

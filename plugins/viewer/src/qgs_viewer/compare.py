@@ -36,8 +36,8 @@ def compare_models(
     photos: str | None,
     target: Path,
     device: str,
-    size: str | None = None,
-    scale: float | None = None,
+    size: str | None,
+    scale: float | None,
 ) -> None:
     """Judge `models`, by default those that come with qgs, and write their report."""
     pixels = parse_size(size)

@@ -38,9 +38,9 @@ FIGURES: Mapping[FigureName, Callable[[Sequence[ModelScenes], Detail], Section]]
 def write_figures(
     models: Sequence[ModelScenes],
     folder: Path,
-    names: Sequence[FigureName] = (),
-    query: int | None = None,
-    notes: Sequence[str] = (),
+    names: Sequence[FigureName],
+    query: int | None,
+    notes: Sequence[str],
 ) -> Iterator[str]:
     """Write the figures `names`, all by default, and figures.md; yield a line on each.
 

@@ -216,7 +216,7 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
     path = folder / CAMERAS
     gaussians = load_ply(folder / PLY)
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = json.loads(path.read_bytes())
         views = record["views"]
         scene = FinishedScene(str(record["scene"]), folder, views)
         inputs = tuple(place for place, view in enumerate(views) if view["kind"] == "input")

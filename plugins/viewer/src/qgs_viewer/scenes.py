@@ -31,7 +31,7 @@ class ModelScenes:
     samples: Sequence[Sample]
     gaussians: Sequence[Gaussians]
     scene: QueryScene
-    curves: Curves = ()
+    curves: Curves
 
     @property
     def target_camera(self) -> Cameras:

@@ -271,7 +271,7 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
         module.requires_grad_(False)
     for mode in each_mode(module):
         where = f"in {mode} under autocast"
-        with seeded(0), _autocast(case), LearnedLayers() as layers:
+        with seeded(0), torch.autocast(case.device, torch.bfloat16), LearnedLayers() as layers:
             outputs = _with_explanation(trial, inputs)
         expect_finite({n: x for n, x in outputs.items() if n != EXPLAINED}, where)
         # Replayed layers give the same outputs in both precisions, so only geometry can differ.
@@ -292,10 +292,6 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
         expect(not found, f"{where}, compared with float32, {found}")
         if case.slot in ATTENTION:
             expect_none(layers.halved, f"converts float32 geometry to bfloat16 {where}")
-
-
-def _autocast(case: Case) -> torch.autocast:
-    return torch.autocast(case.device, dtype=torch.bfloat16)
 
 
 def _halved(inputs: Inputs) -> Inputs:
@@ -323,7 +319,7 @@ def check_autocast_is_close(case: Case) -> None:
     trial = Trial(case)
     inputs = _halved(trial.inputs)
     exact = floating(trial(cast(inputs, torch.float32)))
-    with _autocast(case):
+    with torch.autocast(case.device, torch.bfloat16):
         rounded = floating(trial(inputs))
     for name, tensor in exact.items():
         off = (rounded[name].float() - tensor).abs().mean()

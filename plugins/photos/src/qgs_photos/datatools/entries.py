@@ -35,16 +35,14 @@ class Encoding:
     def image(self, pixels: np.ndarray) -> bytes:
         """Return (H, W, 3) uint8 as the bytes of a file."""
         if self.jpeg is None:
-            return png(pixels)
-        file = io.BytesIO()
-        Image.fromarray(pixels).save(file, format="JPEG", quality=self.jpeg, subsampling=0)
-        return file.getvalue()
+            return encoded(pixels)
+        return encoded(pixels, "JPEG", quality=self.jpeg, subsampling=0)
 
 
-def png(pixels: np.ndarray) -> bytes:
-    """Return pixels (H, W, 3) or (H, W), uint8, as the bytes of a PNG file."""
+def encoded(pixels: np.ndarray, format: str = "PNG", **options: int) -> bytes:
+    """Return pixels (H, W, 3) or (H, W), uint8, as the bytes of a file. options: Pillow's."""
     file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format="PNG")
+    Image.fromarray(pixels).save(file, format, **options)
     return file.getvalue()
 
 
@@ -121,7 +119,7 @@ def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
 
 
 def chunk_entry(
-    key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int], times: Tensor | None = None
+    key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int], times: Tensor | None
 ) -> ChunkEntry:
     """Return the entry of a scene; see `qgs_photos.datasets.chunk_files` for its keys."""
     names = [frame.name for frame in frames]
@@ -135,7 +133,7 @@ def chunk_entry(
         "sizes": torch.tensor([frame.size for frame in frames], dtype=torch.int32),
     }
     if any(frame.mask is not None for frame in frames):
-        masks = [b"" if frame.mask is None else png(frame.mask) for frame in frames]
+        masks = [b"" if frame.mask is None else encoded(frame.mask) for frame in frames]
         entry["masks"] = [*map(_bytes, masks)]
     if held_out:
         entry["held_out"] = torch.tensor(list(held_out), dtype=torch.int64)

@@ -95,7 +95,7 @@ class SceneReport:
 
     name: str
     kind: str
-    split: str = ""
+    split: str
     listed: int = 0
     decodable: int = 0
     missing: int = 0

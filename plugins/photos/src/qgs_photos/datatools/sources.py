@@ -11,7 +11,7 @@ from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
 from qgs.recipe.registry import Registry, load_registry, load_usable_plugins
-from qgs_photos.datatools.entries import bytes_of, png
+from qgs_photos.datatools.entries import bytes_of, encoded
 from qgs_photos.datatools.photos import Candidate, Photo
 
 OF_FILES = ("qgs", "datasets")
@@ -104,7 +104,7 @@ def _frame(scene: Scene, frame: int) -> PhotoFrame:
 
 
 def _image_file(scene: Scene, frame: int) -> bytes:
-    return png(bytes_of(scene.images([frame])[0]))
+    return encoded(bytes_of(scene.images([frame])[0]))
 
 
 def _read_mask(scene: Scene, frame: int) -> np.ndarray | None:

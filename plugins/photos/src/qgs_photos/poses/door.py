@@ -63,7 +63,7 @@ def is_made(source: Path, out: Path) -> bool:
     """Return whether `out` has the poses of `source`. Raises PosesError for those of others."""
     held = fingerprint(source)
     with suppress(OSError, json.JSONDecodeError):
-        record = json.loads((out / RECORD).read_text(encoding="utf-8"))
+        record = json.loads((out / RECORD).read_bytes())
         if record["source"] == held:
             return True
         raise PosesError(

@@ -197,7 +197,7 @@ def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
 def _scene_options(folder: Path) -> AutoRenderer.Config:
     """Return the renderer's options of what `qgs scene` wrote, else the default ones."""
     try:
-        given = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["background"]
+        given = json.loads((folder / "metrics.json").read_bytes())["background"]
         return AutoRenderer.Config.model_validate({"background": tuple(given)})
     except (OSError, ValueError, KeyError, TypeError):
         return AutoRenderer.Config()

@@ -71,7 +71,7 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
     degrees instead of the file's. Raises ValueError where it is neither.
     """
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = json.loads(file.read_bytes())
         if entries := data.get("camera_path"):
             read = [_keyframe(entry, size) for entry in entries]
         else:

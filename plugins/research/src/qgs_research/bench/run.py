@@ -30,13 +30,13 @@ def measure_recipes(
     names: Sequence[str],
     work: Mapping[str, Any],
     *,
-    step: bool = False,
-    memory: bool = False,
-    renderer: bool = False,
-    rounds: int = 10,
-    warmup: int = 2,
-    overrides: Sequence[str] = (),
-    say: Callable[[str], None] = lambda _: None,
+    step: bool,
+    memory: bool,
+    renderer: bool,
+    rounds: int,
+    warmup: int,
+    overrides: Sequence[str],
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Measure size and forward latency of all recipes, with initial weights.
 

@@ -144,7 +144,7 @@ def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list
     return tensors, [f"converted to float32: {report}"] if others else []
 
 
-def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool = False) -> None:
+def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool) -> None:
     """Write a checkpoint again. half: store real numbers as float16, and the rest unchanged.
 
     Raises the errors of `CheckpointFile`, and CheckpointError if float16 cannot hold a weight.

@@ -15,7 +15,7 @@ from scipy.stats import t as student
 
 from qgs.contracts import Column
 from qgs.wording import counted
-from qgs_research.studies.stored import StoredResults, scenes_with
+from qgs_research.studies.stored import StoredResults
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
@@ -79,21 +79,6 @@ class Estimate:
             "scenes": self.scenes,
             "interval": self.interval,
         }
-
-
-def estimate(
-    parts: Sequence[tuple[Runs, int]], metric: str, confidence: float = CONFIDENCE
-) -> Estimate | None:
-    """Return the sum of means with weights `parts`; None without a common seed and scene."""
-    seeds = [seed for seed in parts[0][0] if all(seed in runs for runs, _ in parts)]
-    scenes = scenes_with(metric, [runs[seed] for runs, _ in parts for seed in seeds])
-    if not scenes:
-        return None
-    values = np.zeros((len(seeds), len(scenes)))
-    for runs, weight in parts:
-        # Pairing precedes the means, so that common effects of a seed or scene cancel.
-        values += weight * np.array([runs[seed].scores(metric, scenes) for seed in seeds])
-    return Estimate(seeds=seeds, values=values, interval=interval(values, confidence))
 
 
 def sign_of(column: Column) -> int:

@@ -201,7 +201,7 @@ def refuse_changed(plan: Plan) -> None:
         changed.pop(INDEX, None)
         index = read_index(recipe.evaluation.index)
         protocols = [run.evaluation(name) / "protocol.json" for run in evaluated]
-        stored = [json.loads(file.read_text(encoding="utf-8"))["views"] for file in protocols]
+        stored = [json.loads(file.read_bytes())["views"] for file in protocols]
         if any(views.get("index") != to_jsonable_python(index) for views in stored):
             changed[INDEX] = ("other scenes or frames", recipe.evaluation.index)
         if changed:

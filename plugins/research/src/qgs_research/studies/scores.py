@@ -11,9 +11,9 @@ import numpy as np
 
 from qgs.contracts import Column
 from qgs.metrics.baselines import BASELINES
-from qgs_research.studies.estimates import CONFIDENCE, Estimate, Runs, estimate
+from qgs_research.studies.estimates import CONFIDENCE, Estimate, Runs, interval
 from qgs_research.studies.hypotheses import MAIN
-from qgs_research.studies.stored import StoredResults
+from qgs_research.studies.stored import StoredResults, scenes_with
 
 Terms: TypeAlias = Mapping[tuple[str, str], int]
 """Weights of means, by model and evaluation."""
@@ -85,9 +85,17 @@ class Scores:
     ) -> Estimate | None:
         """Return the sum of means with weights `terms`; None without a common seed and scene."""
         parts = [(self.stored.get(term, {}), weight) for term, weight in terms.items()]
-        return estimate(parts, metric, confidence)
+        seeds = [seed for seed in parts[0][0] if all(seed in runs for runs, _ in parts)]
+        scenes = scenes_with(metric, [runs[seed] for runs, _ in parts for seed in seeds])
+        if not scenes:
+            return None
+        values = np.zeros((len(seeds), len(scenes)))
+        for runs, weight in parts:
+            # Pairing precedes the means, so that common effects of a seed or scene cancel.
+            values += weight * np.array([runs[seed].scores(metric, scenes) for seed in seeds])
+        return Estimate(seeds=seeds, values=values, interval=interval(values, confidence))
 
-    def baselines(self, evaluation: str = MAIN) -> dict[str, dict[str, float]]:
+    def baselines(self, evaluation: str) -> dict[str, dict[str, float]]:
         """Return means over scenes of the baselines, by name and metric.
 
         The result is empty if an evaluation has several protocols, each with its own baselines.

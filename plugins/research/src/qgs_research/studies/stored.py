@@ -84,8 +84,8 @@ def read_results(path: str | Path) -> StoredResults:
 
 
 def _read(folder: Path, name: str) -> StoredResults:
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    protocol = json.loads((folder / "protocol.json").read_text(encoding="utf-8"))
+    summary = json.loads((folder / "summary.json").read_bytes())
+    protocol = json.loads((folder / "protocol.json").read_bytes())
     scenes: dict[str, dict[str, float]] = {}
     frames: dict[str, tuple[str, str]] = {}
     with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:

@@ -65,10 +65,10 @@ def ellipsoid(o, d):
 @inner
 def ball(o, d, radius):
     """Return the entry into a sphere around the origin; balls have no cuts and need no exit."""
-    inverse = ONE / dot(d, d)
-    middle = -dot(o, d) * inverse
-    place = along(o, middle, d)
-    inside = radius * radius - dot(place, place)
+    inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
+    x, y, z = along(o, middle, d)
+    inside = radius * radius - (x * x + y * y + z * z)
     root = math.sqrt(max(inside, ZERO) * inverse)
     met = inside > ZERO
     return (middle - root if met else NONE), NONE, ZERO, ZERO

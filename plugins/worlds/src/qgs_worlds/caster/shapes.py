@@ -132,5 +132,18 @@ def packed(shapes: Sequence[Shape]) -> np.ndarray:
 
 
 def _primitives(primitives: Sequence[Primitive]) -> np.ndarray:
+    """Return a table of PRIMITIVE."""
     kind, center, half, turn, extra = map(np.array, zip(*primitives, strict=True))
-    return s.primitives(kind, extra, center, half, turn.reshape(-1, 3, 3))
+    metric = (kind >= s.BLOCK)[:, None]
+    unit = np.where(metric, 1.0, half)
+    extent = np.where(metric, half, 1.0)
+    extent[kind == s.CAPSULE, 2] += extra[kind == s.CAPSULE]
+    extent[kind == s.TORUS, 2] = extra[kind == s.TORUS]
+    table = np.zeros(len(kind), s.PRIMITIVE)
+    table["kind"] = kind
+    table["extra"] = extra
+    table["axes"] = turn.reshape(-1, 3, 3).transpose(0, 2, 1) / unit[:, :, None]
+    table["center"] = center
+    table["unit"] = unit
+    table["extent"] = extent
+    return table

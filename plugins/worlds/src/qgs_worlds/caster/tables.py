@@ -72,25 +72,6 @@ AIR = np.dtype(
 MAP = np.dtype([("begin", "i8"), ("side", "i8"), ("focal", "f8"), ("c2w", "f8", (3, 4))])
 
 
-def primitives(
-    kind: np.ndarray, extra: np.ndarray, center: np.ndarray, half: np.ndarray, turn: np.ndarray
-) -> np.ndarray:
-    """Return a table of PRIMITIVE. half: metres (P, 3). turn: rotations to the world (P, 3, 3)."""
-    metric = (kind >= BLOCK)[:, None]
-    unit = np.where(metric, 1.0, half)
-    extent = np.where(metric, half, 1.0)
-    extent[kind == CAPSULE, 2] += extra[kind == CAPSULE]
-    extent[kind == TORUS, 2] = extra[kind == TORUS]
-    table = np.zeros(len(kind), PRIMITIVE)
-    table["kind"] = kind
-    table["extra"] = extra
-    table["axes"] = turn.transpose(0, 2, 1) / unit[:, :, None]
-    table["center"] = center
-    table["unit"] = unit
-    table["extent"] = extent
-    return table
-
-
 class Shadows(NamedTuple):
     """Shadow maps: a table of MAP, and concatenated depths and codes of all their pixels."""
 
