@@ -5,8 +5,8 @@ from typing import Any
 from qgs.checkpoint.tensors import Shapes
 from qgs_research.published.weight_layout import (
     LayoutError,
-    WeightLayout,
     layer_count,
+    layout,
     size_at,
     whole_ratio,
 )
@@ -24,7 +24,6 @@ _CNN_WIDTHS = [64, 96, 128]
 _HARMONICS = (4, 9, 16, 25)
 """Number of harmonics per colour channel for degrees 1 to 4."""
 _EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement"))
-_ENDS = {"queries": ("mvsplat/pixels",), "centers": ("mvsplat/on_rays",)}
 
 
 def _recipe(model: dict[str, Any]) -> dict[str, Any]:
@@ -140,46 +139,5 @@ def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
     )
 
 
-MVSPLAT = WeightLayout(
-    name="MVSplat",
-    plugin="mvsplat",
-    source="donydchen/mvsplat",
-    components={
-        "encoder": ("mvsplat/mvsplat",),
-        "head": ("mvsplat/gaussians",),
-        **_ENDS,
-    },
-    renames={"encoder.": "encoder."},
-    marks=(_PREDICTOR + "corr_refine_net.0.weight", _PREDICTOR + "to_disparity.2.weight"),
-    read=_read_mvsplat,
-    undecided=(
-        "near and far: 1 and 100, of RealEstate10K and ACID (DTU: 2.125 and 4.525)",
-        "bounds of the scales, opacity map: as in the release",
-        "losses: mean squared error; the release adds 0.05 LPIPS (plugin `lpips`)",
-        "frame and scale of the world: as given; renderer, training: the framework's defaults",
-    ),
-)
-"""Layout of the released MVSplat, in Lightning files or as a bare state dict."""
-
-DEPTHSPLAT = WeightLayout(
-    name="DepthSplat",
-    plugin="mvsplat",
-    source="cvg/depthsplat",
-    components={
-        "encoder": ("mvsplat/depthsplat",),
-        "head": ("mvsplat/depthsplat_gaussians",),
-        **_ENDS,
-    },
-    renames={"encoder.network.": "encoder."},
-    marks=(_PREDICTOR + "pretrained.norm.weight", _UPSAMPLER + "projects.0.weight", _HEAD),
-    read=_read_depthsplat,
-    undecided=(
-        "near and far: 0.5 and 100, of RealEstate10K (DL3DV: 0.5 and 200)",
-        "views matched with each view: the nearest 2",
-        "bounds of the scales: as in the release",
-        "losses: mean squared error, of both depths if there are two; the release adds 0.05 LPIPS "
-        "(plugin `lpips`)",
-        "frame and scale of the world: as given; renderer, training: the framework's defaults",
-    ),
-)
-"""Layout of the released DepthSplat, in Lightning files or as a bare state dict."""
+MVSPLAT = layout("mvsplat", _read_mvsplat)
+DEPTHSPLAT = layout("depthsplat", _read_depthsplat)

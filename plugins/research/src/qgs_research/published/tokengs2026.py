@@ -3,8 +3,8 @@
 from typing import Any
 
 from qgs.checkpoint.tensors import Shapes
-from qgs_research.published.tokengs import BACKBONE_RENAMES, CROSS_QUERY, DECODER, read_tokengs
-from qgs_research.published.weight_layout import LayoutError, WeightLayout, layer_count, size_at
+from qgs_research.published.tokengs import TOKENGS, read_tokengs
+from qgs_research.published.weight_layout import LayoutError, layer_count, layout, size_at
 
 READOUT = "enc_dec_backbone.multiscale_norms."
 DYNAMIC = "gs_tokens_dynamic"
@@ -12,31 +12,6 @@ TIME = "patch_time_embed"
 TARGET_TIME = "patch_time_embed_tgt"
 LATENTS = "enc_dec_backbone.latents"
 LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
-
-_RENAMES = {
-    "encoder.time_embedding.": "patch_time_embed.",
-    "queries.time_embedding.": "patch_time_embed_tgt.",
-    "queries.dynamic": DYNAMIC,
-    "encoder.norms.{}.": READOUT + "{}.",
-    "encoder.latents": LATENTS,
-    "encoder.feature_kv_proj.": "enc_dec_backbone.latent_feature_kv_proj.",
-    "encoder.feature_k_norm.": "enc_dec_backbone.latent_feature_k_norm.",
-    "encoder.latent_kv_proj.": "enc_dec_backbone.latent_kv_proj.",
-    **{
-        f"encoder.latent_blocks.{{}}.{ours}": LATENT_BLOCK + f"{{}}.{theirs}"
-        for ours, theirs in (
-            ("cross_attention.norm.", "gs_cross_attn.gs_token_norm."),
-            ("cross_attention.", "gs_cross_attn."),
-            ("cross_scale.", "gs_cross_attn_scale."),
-            ("self_norm.", "gs_self_attn.norm."),
-            ("self_attention.", "gs_self_attn.gs_self_attn."),
-            ("self_scale.", "gs_self_attn_scale."),
-            ("mlp_norm.", "mlp.norm."),
-            ("mlp.", "mlp.mlp."),
-            ("mlp_scale.", "mlp_scale."),
-        )
-    },
-}
 
 
 def _read(shapes: Shapes) -> dict[str, Any]:
@@ -84,33 +59,4 @@ def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
     return {"type": "tokengs2026/latent_bottleneck", **found}
 
 
-TOKENGS_2026_6 = WeightLayout(
-    name="TokenGS 2026.6",
-    plugin="tokengs2026",
-    source="nv-tlabs/TokenGS",
-    components={
-        "encoder": ("tokengs2026/multiscale_vit", "tokengs2026/latent_bottleneck"),
-        "queries": ("qgs/latent", "tokengs2026/dynamic"),
-        "cross_attention": ("qgs/content",),
-        "self_attention": ("qgs/content", "tokengs2026/block_causal"),
-        "feed_forward": ("qgs/mlp",),
-        "refinement": ("qgs/none",),
-        "head": ("qgs/gaussian_head",),
-        "centers": ("qgs/free",),
-    },
-    renames=BACKBONE_RENAMES | _RENAMES | CROSS_QUERY,
-    marks=(DECODER + "0.gs_cross_attn.q_proj.weight", READOUT + "0.weight"),
-    read=_read,
-    undecided=(
-        "activations of the head and of the positions, their clamps and epsilons: as in TokenGS",
-        "blocks that the encoder reads: every second one up to the last",
-        "supervised layers: the last",
-        "frame of the world: the mean camera",
-        "scale of the world, losses, renderer, training: the framework's defaults",
-    ),
-)
-"""Layout of the release of June 2026.
-
-Runs with `use_multiscale_encoder: False` are not recognised, because their norm of the block that
-they read has the same name as in TokenGS.
-"""
+TOKENGS_2026_6 = layout("tokengs2026", _read, TOKENGS)

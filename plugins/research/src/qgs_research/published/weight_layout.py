@@ -2,8 +2,10 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from qgs.checkpoint.tensors import Shapes
@@ -29,7 +31,7 @@ def renamed(name: str, ours: str, theirs: str) -> str | None:
 
 @dataclass(frozen=True)
 class WeightLayout:
-    """Names and shapes in the state dicts of one published codebase.
+    """Names and shapes in the state dicts of one published codebase; see `layout`.
 
     name: name of the published model. plugin: plugin with its components.
     source: where it is published.
@@ -48,17 +50,30 @@ class WeightLayout:
     name: str
     plugin: str
     source: str
-    components: Mapping[str, tuple[str, ...]]
+    components: Mapping[str, Sequence[str]]
     renames: Mapping[str, str]
-    marks: tuple[str, ...]
+    marks: Sequence[str]
     read: Callable[[Shapes], dict[str, Any]]
-    unused: tuple[tuple[str, str], ...] = ()
-    undecided: tuple[str, ...] = ()
+    undecided: Sequence[str]
+    unused: Sequence[tuple[str, str]] = ()
 
     def published_name(self, ours: str) -> str | None:
         """Return the published name of our parameter `ours`, or None."""
         names = (renamed(ours, *rule) for rule in self.renames.items())
         return next((name for name in names if name is not None), None)
+
+
+def layout(
+    name: str,
+    read: Callable[[Shapes], dict[str, Any]],
+    base: WeightLayout | None = None,
+) -> WeightLayout:
+    """Return the layout in NAME.toml. base: codebase whose renames hold unless NAME.toml has others."""
+    text = Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8")
+    fields = tomllib.loads(text)
+    if base:
+        fields["renames"] = {**base.renames, **fields["renames"]}
+    return WeightLayout(read=read, **fields)
 
 
 def layer_count(shapes: Shapes, prefix: str) -> int:
