@@ -68,7 +68,7 @@ def layout(
     read: Callable[[Shapes], dict[str, Any]],
     base: WeightLayout | None = None,
 ) -> WeightLayout:
-    """Return the layout in NAME.toml. base: codebase whose renames hold unless NAME.toml has others."""
+    """Return the layout in NAME.toml. base: a layout whose renames hold where it has no others."""
     text = Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8")
     fields = tomllib.loads(text)
     if base:
