@@ -5,15 +5,12 @@ import re
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any, TypeAlias
+from typing import Any
 
 from qgs_photos.poses.job import Job
-from qgs_photos.poses.photos import PosesError
-
-Show: TypeAlias = Callable[[str, int, int], None]
-"""Called with a stage, what is done of it, and what there is."""
+from qgs_photos.poses.photos import PosesError, Show
 
 # Of COLMAP's log, kept for a crash.
 _LINES = 30
@@ -27,7 +24,9 @@ def run(job: Job, show: Show) -> Sequence[str]:
     Raises PosesError where COLMAP finds none, or ends early.
     """
     # a failed check of COLMAP ends its process: it must not be that of the command
-    process = subprocess.Popen(
+    told: dict[str, Any] = {}
+    last = deque[str](maxlen=_LINES)
+    with subprocess.Popen(
         [sys.executable, "-m", "qgs_photos.poses.worker"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -36,31 +35,26 @@ def run(job: Job, show: Show) -> Sequence[str]:
         errors="replace",
         # Ctrl-C reaches this process alone, which ends the other
         start_new_session=True,
-    )
-    assert process.stdin is not None
-    assert process.stdout is not None
-    told: dict[str, Any] = {}
-    last = deque[str](maxlen=_LINES)
-    try:
-        process.stdin.write(json.dumps(asdict(job)) + "\n")
-        process.stdin.flush()
-        for line in process.stdout:
-            if line.startswith("{"):
-                told = json.loads(line)
-            elif found := _STEP.search(line):
-                done, total = map(int, found.groups())
-                told |= {"done": done - 1, "total": total}
-            else:
-                last.append(line.rstrip())
-            if "stage" in told:
-                show(told["stage"], told["done"], told["total"])
-        process.wait()
-    # whatever ends the loop, Ctrl-C too, must not leave a process behind
-    finally:
-        process.kill()
-        process.wait()
-        process.stdin.close()
-        process.stdout.close()
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            process.stdin.write(json.dumps(asdict(job)) + "\n")
+            process.stdin.flush()
+            for line in process.stdout:
+                if line.startswith("{"):
+                    told = json.loads(line)
+                elif found := _STEP.search(line):
+                    done, total = map(int, found.groups())
+                    told |= {"done": done - 1, "total": total}
+                else:
+                    last.append(line.rstrip())
+                if "stage" in told:
+                    show(told["stage"], told["done"], told["total"])
+            process.wait()
+        # whatever ends the loop, Ctrl-C too, must not leave a process behind
+        finally:
+            process.kill()
     if "refused" in told:
         raise PosesError(f"no poses: {told['refused']}")
     if code := process.returncode:

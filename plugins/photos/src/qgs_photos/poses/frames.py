@@ -1,6 +1,6 @@
 """Frames of a video: of each interval of time and of motion the sharpest."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
@@ -12,7 +12,7 @@ from av.error import FFmpegError
 from PIL import Image
 
 from qgs.wording import counted
-from qgs_photos.poses.photos import LEAST, PosesError
+from qgs_photos.poses.photos import LEAST, PosesError, Show
 
 # 120 at even steps of time are too few where the camera turns fast: of a walk through an office as
 # a video, 42 of 120 frames got poses, and 143 of the 143 that follow the motion.
@@ -33,7 +33,7 @@ def extract(
     video: Path,
     folder: Path,
     count: int | None = None,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    progress: Show = lambda stage, done, total: None,
 ) -> list[str]:
     """Write the sharpest frame of each interval as JPEG, upright, numbered from 0 on.
 

@@ -22,12 +22,13 @@ from rich.progress import (
 from qgs.files import naming_full_disk, replacing_entries, write_text
 from qgs.wording import counted, listed
 from qgs_photos.commands import refuse_filled
-from qgs_photos.poses.colmap import Show, run
+from qgs_photos.poses.colmap import run
 from qgs_photos.poses.frames import extract
 from qgs_photos.poses.job import Job
 from qgs_photos.poses.photos import (
     LEAST,
     PosesError,
+    Show,
     camera_groups,
     left_out_formats,
     photo_files,

@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from PIL import Image, ImageOps
 from upath import UPath
@@ -25,6 +26,10 @@ _PLAIN = ("JPEG", "MPO", "PNG")
 _ORIENTATION, _SUB, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
 # Focal length, its equivalent of 35 mm film, lens.
 _LENS = (0x920A, 0xA405, 0xA434)
+
+
+Show: TypeAlias = Callable[[str, int, int], None]
+"""Called with a stage, what is done of it, and what there is."""
 
 
 class PosesError(ValueError):
@@ -75,7 +80,7 @@ def prepare(
     kept: Path,
     working: Path,
     side: int,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    progress: Show = lambda stage, done, total: None,
 ) -> tuple[list[Photo], dict[str, str]]:
     """Put `files` upright into `kept`, and no longer than `side` into `working`.
 

@@ -1,6 +1,5 @@
 """Inputs of a given size, and operations to call repeatedly."""
 
-import math
 import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -13,6 +12,7 @@ from typing import Any, Literal, TypeAlias
 import torch
 from torch import nn
 
+from qgs.geometry.poses import look_at
 from qgs.model import QueryGaussianModel
 from qgs.precision import Precision, autocast
 from qgs.recipe import Recipe, resolve
@@ -63,14 +63,12 @@ def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Vi
     # All recipes and processes get equal photos.
     generator = torch.Generator().manual_seed(seed)
     images = torch.rand(batch, count, 3, *size, generator=generator)
-    c2w = torch.eye(4).repeat(batch, count, 1, 1)
-    for index in range(count):
-        # Cameras are ten degrees apart, like neighbouring photos of a walk.
-        angle = math.radians(10 * index)
-        sine = math.sin(angle)
-        cosine = math.cos(angle)
-        turn = [[cosine, 0, sine, -sine], [0, 1, 0, 0], [-sine, 0, cosine, 1 - cosine]]
-        c2w[:, index, :3] = torch.tensor(turn)
+    # Cameras are ten degrees apart, like neighbouring photos of a walk.
+    angle = torch.deg2rad(10.0 * torch.arange(count))
+    forward = torch.stack([angle.sin(), torch.zeros(count), angle.cos()], -1)
+    down = torch.tensor([0.0, 1.0, 0.0]).expand_as(forward)
+    centre = torch.tensor([0.0, 0.0, 1.0])
+    c2w = look_at(centre - forward, forward, down).expand(batch, count, 4, 4)
     height, width = size
     focal = float(max(size))
     intrinsics = torch.tensor([focal, focal, width / 2, height / 2]).expand(batch, count, 4)

@@ -90,7 +90,7 @@ def draw_cameras(
         fault = _outside(rig.c2w[:, :3, 3], place, world[0])
         if fault == 0:
             fault = _view_fault(rig, world)
-        if fault < least or best is None:
+        if fault < least:
             best = rig
             least = fault
         # good enough: each try casts all views
