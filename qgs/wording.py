@@ -1,7 +1,9 @@
 """Wording of messages and tables."""
 
 import logging
-from collections.abc import Collection, Iterable
+import os
+import re
+from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
 from functools import lru_cache
 
@@ -58,3 +60,11 @@ def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
     """Return a fix for a message: the nearest choice, or the list of choices."""
     near = nearest(word, choices)
     return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices), 30) or 'none'}"
+
+
+def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Return names of models or recipes without the folders that they share and suffixes."""
+    files = [os.path.abspath(path) for path in paths]
+    shared = os.path.commonpath([os.path.dirname(file) for file in files])
+    suffix = r"\.(ya?ml|safetensors)$"
+    return [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]

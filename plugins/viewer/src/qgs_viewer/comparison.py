@@ -2,7 +2,6 @@
 
 import math
 import os
-import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,6 +31,7 @@ from qgs.reconstruction.scenes import (
     size_multiple,
     whole_size,
 )
+from qgs.wording import short_names
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
 WINDOWS = 6
@@ -160,16 +160,12 @@ class Model:
         return yaml.safe_dump(dict(self.recipe.tree), sort_keys=False, allow_unicode=True)
 
 
-def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Names of models or recipes, each another: what their folders share and suffixes left out.
+def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Return `short_names` of models or recipes, each another.
 
     One that comes again is numbered: `a/x.yaml`, `b/x.yaml` and that again are a/x, b/x, b/x (2).
     """
-    files = [os.path.abspath(path) for path in paths]
-    # Runs of one study share most of their path.
-    shared = os.path.commonpath([os.path.dirname(file) for file in files])
-    suffix = r"\.(ya?ml|safetensors)$"
-    names = [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]
+    names = short_names(paths)
     before = [names[:index].count(name) for index, name in enumerate(names)]
     return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 
@@ -182,7 +178,7 @@ def open_models(
     overrides: Sequence[str] = (),
 ) -> list[Model]:
     """Load models for unseen scenes, or for held-out photos. Raises as `recipes_alike`."""
-    files = dict(zip(short_names(names), map(checkpoint_path, names), strict=True))
+    files = dict(zip(numbered_names(names), map(checkpoint_path, names), strict=True))
     recipes = recipes_alike(files, photos, size, overrides)
     windows: PhotoWindows | None = None
     models = []
@@ -205,7 +201,7 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
     """
     # a number of steps that no time budget reaches
     overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
-    names = short_names(files)
+    names = numbered_names(files)
     recipes = {name: resolve(f, overrides) for name, f in zip(names, files, strict=True)}
     refuse_unequal(recipes, (*JUDGED, *TRAINED))
     return recipes
