@@ -2,9 +2,9 @@
 
 import math
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -38,8 +38,7 @@ WITH_MEMORY = ("layer", "feedback")
 QUERY_INPUTS = ("state", "features", "offsets")
 
 
-@dataclass(frozen=True)
-class Sizes:
+class Sizes(NamedTuple):
     """Sizes B, N, V, K and (H, W) of inputs; `image` None stands for the size of the case."""
 
     batch: int = 2

@@ -69,7 +69,7 @@ def masked(tree: Any, mask_BN: Tensor, other: Any) -> Any:
 
 def scalar(tree: Any) -> Tensor:
     """Return a float64 sum of all floating-point numbers in `tree` with random weights."""
-    total = torch.zeros((), dtype=torch.float64)
+    total = torch.zeros(()).double()
     for index, tensor in enumerate(floating(tree).values()):
         # Equal weights would let errors of opposite signs cancel.
         generator = torch.Generator().manual_seed(index)

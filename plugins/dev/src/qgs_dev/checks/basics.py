@@ -58,11 +58,7 @@ VARIED = (
 
 WARM_UP = (Sizes(batch=2, queries=6), Sizes(batch=3, queries=8, views=3, gaussians=3))
 # Later sizes for a compiled component; none of their numbers occurs in WARM_UP.
-LATER = (
-    Sizes(batch=4, queries=9, views=4, gaussians=4),
-    Sizes(batch=5, queries=11, views=5, gaussians=5),
-    Sizes(batch=7, queries=13, views=7, gaussians=7),
-)
+LATER = [Sizes(count, queries, count, count) for count, queries in ((4, 9), (5, 11), (7, 13))]
 # Number of further graphs that the later sizes may need, because one of them may be special.
 SLACK = 2
 

@@ -291,7 +291,7 @@ def run_training_step(recipe: Recipe, case: Case) -> None:
     losses = recipe.build_losses().values()
     views = Maker(case).target()
     target = views.select([0])
-    total = torch.zeros((), dtype=torch.float64)
+    total = torch.zeros(()).double()
     for prediction in model(views).layers.values():
         expect_finite(prediction, "in a prediction of a model with this component")
         rendering = model.render(prediction.gaussians, target.cameras)

@@ -209,7 +209,7 @@ def _expect_changes(trial: Trial, name: str, gradient: Tensor) -> None:
 
 def _brightness(rendering: Any) -> Tensor:
     """Return a smooth scalar function of the colours, alpha, depth and features."""
-    total = torch.zeros((), dtype=torch.float64)
+    total = torch.zeros(()).double()
     for number, (_, image) in enumerate(named_tensors(rendering), 1):
         y, x = (torch.linspace(-1, 1, size, dtype=torch.float64) for size in image.shape[-2:])
         y = y[:, None]

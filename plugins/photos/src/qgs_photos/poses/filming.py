@@ -3,9 +3,9 @@
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -34,8 +34,7 @@ _QUALITY = "18"
 _HEIGHT = 480
 
 
-@dataclass(frozen=True)
-class FilmScene:
+class FilmScene(NamedTuple):
     """Gaussians (1, G) and the cameras (1, V) of photos of them, in one world.
 
     world: from the photos' world to that one, the pose (4, 4) of its reference camera and scale.

@@ -1,7 +1,5 @@
 """The command `qgs bench`: size, latency and memory of models as tables and a JSON report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, TypeAlias, get_args
 

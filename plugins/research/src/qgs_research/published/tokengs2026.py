@@ -8,8 +8,6 @@ from qgs_research.published.weight_layout import LayoutError, layer_count, layou
 
 READOUT = "enc_dec_backbone.multiscale_norms."
 DYNAMIC = "gs_tokens_dynamic"
-TIME = "patch_time_embed"
-TARGET_TIME = "patch_time_embed_tgt"
 LATENTS = "enc_dec_backbone.latents"
 LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
 
@@ -18,9 +16,9 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     tree = read_tokengs(shapes)
     model = tree["model"]
     model["encoder"] |= _encoder(shapes, model["encoder"]["depth"])
-    model["encoder"]["time_channels"] = _channels(shapes, TIME)
+    model["encoder"]["time_channels"] = _channels(shapes, "patch_time_embed")
     dynamic = DYNAMIC in shapes
-    timed = _channels(shapes, TARGET_TIME)
+    timed = _channels(shapes, "patch_time_embed_tgt")
     if dynamic:
         model["decoder"]["self_attention"] = {"type": "tokengs2026/block_causal"}
     if dynamic or timed:

@@ -1,7 +1,5 @@
 """The commands `qgs study`, `qgs compare` and `qgs diff`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from qgs.contracts import OptionError
 from qgs.wording import did_you_mean
@@ -17,8 +17,7 @@ _FORM = "write `A < B` or `A > B`, each side a variant or a sum such as `A@noisy
 _TERM = re.compile(rf"\s*([+-]?)\s*({NAME})(?:@({NAME}))?\s*")
 
 
-@dataclass(frozen=True)
-class Contrast:
+class Contrast(NamedTuple):
     """Left side minus right side of a hypothesis. terms: (variant, evaluation) -> coefficient.
 
     sign: claimed sign, -1 for `<`.

@@ -1,10 +1,9 @@
 """The results of a study: verdicts, a one-line answer, and files with all numbers."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from scipy.stats import spearmanr
 
@@ -37,8 +36,7 @@ A random order of three variants is the published one in 1 of 6 cases, of five i
 """
 
 
-@dataclass(frozen=True)
-class Judgement:
+class Judgement(NamedTuple):
     """Verdict on a hypothesis. estimate: left minus right; None without runs."""
 
     hypothesis: Hypothesis

@@ -2,7 +2,7 @@
 
 import io
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -59,8 +59,7 @@ def _develop(image, light, gains, gamma, vignette, grain, seed, frame):
                 image[i, j, c] = int(min(max(value, 0.0), 255.0) + 0.5)
 
 
-@dataclass(frozen=True)
-class Effects:
+class Effects(NamedTuple):
     """Effects of a camera that turn light into a photo.
 
     gains: (3,) for R, G and B. gamma: exponent of the tone curve. vignette: darkening towards the

@@ -198,8 +198,8 @@ def _gather(t, code, i, j, own, samples, top, o, rays, points):
                 d = along(along(rays[0], u, rays[1]), v, rays[2])
                 place = along(o, t[i + a, j + b], d)
                 total = along(total, 1.0, place)
-                points[n, 0], points[n, 1], points[n, 2] = place
-    points[0, 0], points[0, 1], points[0, 2] = times(1 / n, total)
+                points[n] = place
+    points[0] = times(1 / n, total)
     return n
 
 

@@ -252,6 +252,4 @@ def paint(image, t, code, top, samples, world, c2w, rays):
                         size = spread * depth
                         seen = _shade(world, around, int(own), place, view, size, depth * long)
                     total = along(total, n, seen)
-            rgb = times(step * step, total)
-            for c in range(3):
-                image[row, column, c] = rgb[c]
+            image[row, column] = times(step * step, total)

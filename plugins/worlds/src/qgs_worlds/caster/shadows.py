@@ -138,8 +138,7 @@ def surroundings(shapes):
 def _find(shapes, around, p, reach, slack):
     """Keep the boxes near a place, except those of hollow shapes, which do not fill their boxes."""
     boxes, near, place = around
-    for k in range(3):
-        place[k] = p[k]
+    place[:3] = p
     place[4] = slack * slack
     count = 0
     reach = np.float32(1.6 * reach + slack)

@@ -1,7 +1,6 @@
 """Cameras of a scene: walks, orbits, looks around, and sets that look at one point."""
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -26,8 +25,7 @@ _TRIES = 12
 _PROBE = (6, 6)
 
 
-@dataclass(frozen=True)
-class Rig:
+class Rig(NamedTuple):
     """Cameras of a scene.
 
     c2w: OpenCV (F, 4, 4). fov: across the longer side of an image, in degrees. distance: from the

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from random import Random
+from typing import NamedTuple
 
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.shapes import (
@@ -31,8 +31,7 @@ def any_angle(rng: Random) -> float:
     return rng.uniform(0, math.tau)
 
 
-@dataclass(frozen=True)
-class Style:
+class Style(NamedTuple):
     """Distribution of the shapes of things.
 
     kinds: kinds of primitives. tilted: share of freely turned primitives. cut, wired, repeated:
