@@ -68,7 +68,7 @@ def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Vi
     forward = torch.stack([angle.sin(), torch.zeros(count), angle.cos()], -1)
     down = torch.tensor([0.0, 1.0, 0.0]).expand_as(forward)
     centre = torch.tensor([0.0, 0.0, 1.0])
-    c2w = look_at(centre - forward, forward, down).expand(batch, count, 4, 4)
+    c2w = look_at(centre - forward, forward, down).repeat(batch, 1, 1, 1)
     height, width = size
     focal = float(max(size))
     intrinsics = torch.tensor([focal, focal, width / 2, height / 2]).expand(batch, count, 4)
