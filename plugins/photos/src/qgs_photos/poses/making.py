@@ -145,7 +145,7 @@ def _made(source: Path, out: Path, working: Path, options: Options, show: Show) 
         files = sorted(frames.glob("*.jpg"))
     else:
         files = photo_files(source)
-        names = left_out_formats(files)
+        names = left_out_formats(files[0].parent)
         remarks = [f"not read, convert them to JPEG: {listed(names, 3)}"] if names else []
     photos, faulty = prepare(files, out / "images", small, options.side, show)
     if len(photos) < LEAST:

@@ -55,7 +55,7 @@ def photo_files(folder: Path) -> list[Path]:
     if len(files) >= LEAST:
         return sorted(files, key=lambda file: _by_number(file.name))
     text = f"{found} holds {counted(len(files), 'photo')}, and poses need {LEAST} at least"
-    if foreign := _foreign(found):
+    if foreign := left_out_formats(found):
         raise PosesError(f"{text}; {listed(foreign, 3)} cannot be read: convert them to JPEG")
     raise PosesError(f"{text}: take more, from places of your own choice")
 
@@ -65,14 +65,10 @@ def _by_number(name: str) -> tuple[str, str]:
     return re.sub(r"\d+", lambda found: found[0].zfill(20), name), name
 
 
-def _foreign(folder: Path) -> list[str]:
+def left_out_formats(folder: Path) -> list[str]:
+    """Return names of photos in `folder` in formats that are not read."""
     names = (file.name for file in folder.iterdir())
     return sorted(name for name in names if name.lower().endswith(_FOREIGN))
-
-
-def left_out_formats(files: Sequence[Path]) -> list[str]:
-    """Return names of photos beside `files` in formats that are not read."""
-    return _foreign(files[0].parent)
 
 
 def prepare(
