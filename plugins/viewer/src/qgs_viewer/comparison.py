@@ -170,6 +170,11 @@ def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
     return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 
 
+def checkpoints(names: Sequence[str]) -> dict[str, Path]:
+    """Return the file of each model by short name (see `checkpoint_path`)."""
+    return dict(zip(numbered_names(names), map(checkpoint_path, names), strict=True))
+
+
 def open_models(
     names: Sequence[str],
     photos: str | None,
@@ -178,7 +183,7 @@ def open_models(
     overrides: Sequence[str] = (),
 ) -> list[Model]:
     """Load models for unseen scenes, or for held-out photos. Raises as `recipes_alike`."""
-    files = dict(zip(numbered_names(names), map(checkpoint_path, names), strict=True))
+    files = checkpoints(names)
     recipes = recipes_alike(files, photos, size, overrides)
     windows: PhotoWindows | None = None
     models = []
