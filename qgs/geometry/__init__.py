@@ -1,1 +1,1 @@
-"""Cameras, rays and rotations. Everything here computes in float32 or better."""
+"""Functions on cameras, rays and rotations. All compute in float32 or float64."""

@@ -1,4 +1,4 @@
-"""Constant tensors, created on their device."""
+"""Constant tensors, created directly on the device that uses them."""
 
 from collections.abc import Sequence
 
@@ -7,5 +7,8 @@ from torch import Tensor
 
 
 def constant(values: Sequence[float], like: Tensor) -> Tensor:
-    """Return `values` (N,) in the dtype and on the device of `like`, without waiting for a copy."""
+    """Return `values` (N,) as a tensor with the dtype and device of `like`.
+
+    The processor does not wait for a copy to the device.
+    """
     return torch.stack([like.new_full((), value) for value in values])

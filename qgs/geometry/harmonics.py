@@ -1,8 +1,8 @@
 """Real spherical harmonics of degrees 1 to 3, for colours that depend on the view direction.
 
 Order, signs and factors are those of the 3DGS release (Kerbl et al. 2023, utils/sh_utils.py) and of
-gsplat: m rises from -l to l in each degree l, with the Condon-Shortley phase. The formulas are in
-Sloan, Efficient Spherical Harmonic Evaluation (2013).
+gsplat: the order m rises from -l to l within each degree l, with the Condon-Shortley phase. The
+formulas are in Sloan, Efficient Spherical Harmonic Evaluation (2013).
 """
 
 import torch
@@ -13,7 +13,7 @@ from qgs.precision import full_precision
 from qgs.types import SH_COUNTS, Cameras, Gaussians
 
 SH_C0 = 0.28209479177387814
-"""Harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc (3DGS release)."""
+"""Harmonic of degree 0. In 3DGS files, colour = 0.5 + SH_C0 * f_dc with the coefficient f_dc."""
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _C3 = (
@@ -23,7 +23,10 @@ _C3 = (
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
-    """Evaluate the first `count` (3, 8 or 15) functions at unit `directions` (..., 3)."""
+    """Evaluate the first `count` (3, 8 or 15) harmonics, from degree 1 on, -> (..., count).
+
+    directions: unit vectors (..., 3).
+    """
     x, y, z = directions.unbind(-1)
     xx = x * x
     yy = y * y
@@ -42,10 +45,11 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
 
 @full_precision
 def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return the colours (B, V, G, 3) of Gaussians (B, G) seen by cameras (B, V), at least 0.
+    """Return the colours (B, V, G, 3), at least 0, of Gaussians (B, G) seen by cameras (B, V).
 
-    Without `sh` they are `colors`, (B, 1, G, 3) for all cameras. The direction points from the
-    camera's centre to the mean. Differentiable in colors, sh, means and c2w.
+    Gaussians without `sh` look the same from all cameras: the result is `colors` as (B, 1, G, 3).
+    View directions point from the camera's centre to the mean of the Gaussian. Differentiable in
+    colors, sh, means and c2w.
     """
     if gaussians.sh is None:
         return gaussians.colors[:, None]
@@ -60,8 +64,8 @@ def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
 def rotated(sh: Tensor, rotation: Tensor) -> Tensor:
     """Rotate coefficients (..., C, 3), and thus the colours they describe, by `rotation` (3, 3).
 
-    A rotated function is a sum of the functions of its degree. The factors are fitted in float64 to
-    values at random directions.
+    A rotated harmonic is a linear combination of the harmonics of its degree. The factors are
+    fitted in float64 to values at random directions.
     """
     directions = torch.randn(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     directions = F.normalize(directions, dim=-1)

@@ -1,4 +1,4 @@
-"""Transforms of poses to the frame and scale of the model (TokenGS release)."""
+"""Transforms of camera poses to the coordinate frame and scale of the model (TokenGS release)."""
 
 import math
 
@@ -15,7 +15,10 @@ _PARALLEL = 3e-4
 
 @full_precision
 def reference_pose(frame: str, c2w: Tensor) -> Tensor:
-    """Return the pose (..., 4, 4) that `views.frame` maps to the identity. c2w: (..., V, 4, 4)."""
+    """Return the pose (..., 4, 4) that becomes the identity in the model's frame.
+
+    frame: value of the recipe's `views.frame`. c2w: input poses (..., V, 4, 4).
+    """
     if frame == "given":
         return torch.eye(4).to(c2w).expand_as(c2w[..., 0, :, :])
     return mean_camera(c2w) if frame == "mean_cam" else c2w[..., 0, :, :]
@@ -23,9 +26,9 @@ def reference_pose(frame: str, c2w: Tensor) -> Tensor:
 
 @full_precision
 def mean_camera(c2w: Tensor) -> Tensor:
-    """Compute the reference pose of "mean_cam": mean position, mean forward and down axes.
+    """Compute the mean pose of cameras: mean position, mean forward axis and mean down axis.
 
-    The axes are orthonormalised by Gram-Schmidt. c2w (..., V, 4, 4) -> (..., 4, 4).
+    The mean axes are orthonormalised by Gram-Schmidt. c2w (..., V, 4, 4) -> (..., 4, 4).
     """
     _, down, forward, position = c2w.mean(dim=-3)[..., :3, :].unbind(-1)
     return look_at(position, forward, down)
@@ -33,7 +36,10 @@ def mean_camera(c2w: Tensor) -> Tensor:
 
 @full_precision
 def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
-    """Return OpenCV poses (..., 4, 4) at eye (..., 3) with axis `forward`, upright by `down`."""
+    """Return OpenCV poses (..., 4, 4) at position `eye` (..., 3) that look along `forward`.
+
+    down: a vector that points down in the image; it need not be orthogonal to `forward`.
+    """
     forward = F.normalize(forward, dim=-1)
     down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
     # Down is made orthogonal first, so that the view direction stays exact.
@@ -51,7 +57,7 @@ def relative_to(reference: Tensor, c2w: Tensor) -> Tensor:
 
 @full_precision
 def scaled(c2w: Tensor, scale: Tensor | float) -> Tensor:
-    """Return poses with translations multiplied by `scale` (a number or one per pose)."""
+    """Return poses whose translations are multiplied by `scale`, a number or one per pose."""
     factor = torch.as_tensor(scale, dtype=c2w.dtype, device=c2w.device)
     translation = c2w[..., :3, 3] * factor[..., None]
     top = torch.cat([c2w[..., :3, :3], translation[..., None]], -1)
@@ -60,18 +66,18 @@ def scaled(c2w: Tensor, scale: Tensor | float) -> Tensor:
 
 @full_precision
 def largest_distance(c2w: Tensor) -> Tensor:
-    """Return the largest distance from the first camera to another. c2w (..., V, 4, 4) -> (...)."""
+    """Return the largest distance from the first camera to any other: (..., V, 4, 4) -> (...)."""
     centres = c2w[..., :3, 3]
     return (centres - centres[..., :1, :]).norm(dim=-1).amax(-1)
 
 
 @full_precision
 def look_at_depth(c2w: Tensor) -> Tensor:
-    """Return the median depth (0-d) of the point nearest to the optical axes of c2w (V, 4, 4).
+    """Return the depth of the point that cameras c2w (V, 4, 4) look at, their median (0-d).
 
-    The point has the least sum of squared distances to the axes. The result is 0 if there is no
-    such point: the axes are parallel within about a degree, or the point lies behind the camera or
-    more than 30 degrees off its axis for more than a quarter of the cameras.
+    The point has the least sum of squared distances to the optical axes. The result is 0 if there
+    is no such point: the axes are parallel within about a degree, or the point lies behind the
+    camera or more than 30 degrees off its axis for more than a quarter of the cameras.
     """
     axes = c2w[:, :3, 2]
     centres = c2w[:, :3, 3]
@@ -91,7 +97,10 @@ def look_at_depth(c2w: Tensor) -> Tensor:
 
 @full_precision
 def mirrored(c2w: Tensor) -> Tensor:
-    """Return poses of the scene mirrored in x: R' = F R F, t' = F t with F = diag(-1, 1, 1)."""
+    """Return the poses of cameras in a scene mirrored in x.
+
+    Rotations become F R F and translations F t, with F = diag(-1, 1, 1).
+    """
     # On both sides, because a matrix mirrored once is not a rotation.
     flip = torch.diag(constant([-1.0, 1.0, 1.0, 1.0], c2w))
     return flip @ c2w @ flip

@@ -12,7 +12,7 @@ from qgs.types import Cameras
 def pixel_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
     """Return camera-frame directions with z = 1 through the pixel centres.
 
-    intrinsics (..., 4) -> (..., H, W, 3). Pixel centres lie at +0.5.
+    intrinsics (..., 4) -> (..., H, W, 3). The centre of the first pixel is (0.5, 0.5).
     """
     height, width = size
     options = {"dtype": intrinsics.dtype, "device": intrinsics.device}
@@ -36,7 +36,10 @@ def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def plucker_rays(cameras: Cameras) -> Tensor:
-    """Return Plücker maps (..., 6, H, W): moment o x d, then direction d (TokenGS release)."""
+    """Return maps (..., 6, H, W) of Plücker rays: moment o x d, then direction d.
+
+    o is the camera's centre. This order is that of the TokenGS release.
+    """
     origins, directions = camera_rays(cameras)
     moments = torch.linalg.cross(origins, directions)
     return torch.cat([moments, directions], -1).movedim(-1, -3)
@@ -46,7 +49,7 @@ def plucker_rays(cameras: Cameras) -> Tensor:
 def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
     """Return the mean Plücker ray of each patch, not renormalised.
 
-    plucker (B, V, 6, H, W) -> (B, V*H/P*W/P, 6), ordered view, row, column.
+    plucker (B, V, 6, H, W) -> (B, V*H/P*W/P, 6), ordered by view, row, column; P is the patch size.
     """
     # The mean of moments and directions is a ray through the middle, a little too short.
     pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
@@ -55,9 +58,10 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
 
 @full_precision
 def camera_centers(rays: Tensor, grid: tuple[int, int, int]) -> Tensor:
-    """Return world-frame camera centres (B, V, 3) from `patch_rays` and `grid` of a memory.
+    """Return world-frame camera centres (B, V, 3) from the rays and grid of an image memory.
 
-    rays (B, M, 6). Each centre is the point where the rays of its view meet, by least squares.
+    rays: `ImageMemory.patch_rays` (B, M, 6). Each centre is the point nearest to the rays of its
+    view, by least squares.
     """
     moments, directions = rays.unflatten(1, (grid[0], -1)).chunk(2, -1)
     # A moment o x d is the sum over axes of o_i (e_i x d).

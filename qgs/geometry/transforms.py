@@ -1,4 +1,4 @@
-"""Transforms of points to cameras and pixels, of quaternions, and of Gaussians."""
+"""Transforms of points to camera frames and pixels, of quaternions, and of Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,7 +35,7 @@ def unit(vectors: Tensor, otherwise: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> 
 
 @full_precision
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
-    """Return Hamilton products (..., 4), w x y z: the rotation `right`, then `left`."""
+    """Return Hamilton products (..., 4), w x y z; they rotate by `right` first, then by `left`."""
     w, v = left.split((1, 3), -1)
     w2, v2 = right.split((1, 3), -1)
     real = w * w2 - (v * v2).sum(-1, keepdim=True)
@@ -62,7 +62,7 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
 
 @full_precision
 def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
-    """Scale Gaussians by `factor` about the origin, then move them by the rigid pose (4, 4)."""
+    """Scale Gaussians by `factor` about the origin, then move them by the rigid `pose` (4, 4)."""
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
     pose = pose.to(gaussians.means)

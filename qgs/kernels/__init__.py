@@ -1,7 +1,7 @@
 """Loops compiled by numba, for the renderer `qgs/cpu` and SSIM.
 
-You can understand a model without reading them. Each kernel computes the same as a few lines of
-torch elsewhere, without tensors of all pairs. Tests compare it with those lines.
+They only save time and memory: each kernel computes the same as a few lines of torch in another
+module, without tensors over all pairs of Gaussian and pixel. Tests compare both versions.
 """
 
 from collections.abc import Callable
@@ -9,9 +9,9 @@ from typing import Any
 
 
 def kernel(function: Callable[..., Any], **more: Any) -> Any:
-    """Compile `function` with numba on first use; cache it on disk if a folder is writable.
+    """Compile `function` with numba on first use; cache the result on disk if possible.
 
-    more: further options of numba.
+    more: further options of `numba.njit`.
     """
     from numba import njit
 

@@ -1,11 +1,12 @@
 """Numba kernels of `qgs/cpu` that project Gaussians to splats, and their gradients.
 
-The formulas are those of `reference.project`; tests compare the kernels with its autograd. A unit
-of work is a range of one scene's Gaussians in all views of the scene, so that gradients are summed
-over views in a fixed order. Vectors are tuples; a matrix is a tuple of its rows.
+The formulas are those of `qgs.renderers.reference.project`; tests compare values and gradients with
+that function. A unit of work is a range of one scene's Gaussians in all views of the scene, so that
+gradients are summed over views in a fixed order. Vectors are tuples; a matrix is a tuple of rows.
 
-With C the rotation and p the position of c2w, F = R S the factor of the covariance and m the mean,
-the camera sees C^T (m - p) and the factor C^T F.
+Symbols: m mean, R rotation and S scales (diagonal) of a Gaussian, F = R S the factor of its
+covariance F F^T. C rotation and p position of c2w, W = C^T. The mean in the camera's frame is
+W (m - p), the factor W F. J is the Jacobian of the projection to pixels, L the loss.
 """
 
 import numpy as np
@@ -40,7 +41,7 @@ def _cross(a, b):
 
 @kernel
 def _plus(a, s, b):
-    """Return a + s b."""
+    """Return a + s b for vectors a, b and a number s."""
     return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
 
 
@@ -51,7 +52,7 @@ def _times(s, a):
 
 @kernel
 def _combine(a, rows):
-    """Return sum_i a_i rows_i."""
+    """Return the sum of `rows`, weighted by the entries of the vector a."""
     return _plus(_plus(_times(a[0], rows[0]), a[1], rows[1]), a[2], rows[2])
 
 
@@ -74,7 +75,7 @@ def _four(row):
 
 @kernel
 def _rotation(quat):
-    """Return the rows of the rotation matrix, the unit quaternion and the original norm."""
+    """Return the rotation matrix of a raw quaternion, the unit quaternion and the raw norm."""
     w, x, y, z = _four(quat)
     norm = max(np.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
     w = w / norm
@@ -91,7 +92,7 @@ def _rotation(quat):
 
 @kernel
 def _scaled_columns(rows, scale):
-    """Return the columns of R S."""
+    """Return the columns of R S from the rows of R and the three scales."""
     columns = _columns(rows)
     return (
         _times(scale[0], columns[0]), _times(scale[1], columns[1]), _times(scale[2], columns[2]),
@@ -105,7 +106,11 @@ def _dots(a, rows):
 
 @kernel
 def _axis(axis, seen, turned, focal, principal, size, margin):
-    """Return, for an image axis, the slope, the slope clamped to `margin`, and a row of J W R S."""
+    """Return x/z of the mean, x/z clamped, and the row of J W R S of an image axis (0: x, 1: y).
+
+    For the y axis read y/z. seen: mean in the camera's frame. turned: rows of W R S. margin: part
+    of the image size by which x/z may lie outside of the image before it is clamped.
+    """
     slope = seen[axis] / seen[2]
     low = (-margin * size - principal) / focal
     high = (size + margin * size - principal) / focal
@@ -115,7 +120,10 @@ def _axis(axis, seen, turned, focal, principal, size, margin):
 
 @kernel
 def _view(c2w, lens, mean, factor, margin, height, width):
-    """Return a camera's rotation, mean minus centre, camera-frame mean, W R S, both `_axis`."""
+    """Return a camera's view of a Gaussian: (C, m - p, W (m - p), W R S, x axis, y axis).
+
+    lens: fx, fy, cx, cy. mean: m. factor: columns of R S. The two axes are results of `_axis`.
+    """
     pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
     offset = _plus(_vector(mean), -_ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
     seen = _combine(offset, pose)
@@ -130,12 +138,13 @@ def _view(c2w, lens, mean, factor, margin, height, width):
 
 @kernel
 def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, splats):
-    """Fill splats (V, G, 9) for the Gaussians [first, last) of one scene.
+    """Fill splats (V, G, 9) for a range of Gaussians of one scene.
 
-    means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4).
-    limits: near, far, dilation, alpha_min, margin of the clamped Jacobian, height, width.
-    A contribution falls to alpha_min at the Mahalanobis distance sqrt(2 ln(opacity / alpha_min)).
-    Half a pixel, and a little in the power, are added against rounding.
+    means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4): fx, fy,
+    cx, cy. bounds: (first, last) index of the range, `last` excluded. limits: near, far, dilation,
+    alpha_min, margin of `_axis`, height, width. The fields of splats are listed in `rasterisation`.
+    A splat ends at the Mahalanobis distance sqrt(2 ln(opacity / alpha_min)), where its alpha falls
+    to alpha_min. Its extents get half a pixel more, against rounding.
     """
     near, far, dilation, alpha_min, margin, height, width = limits
     for g in range(bounds[0], bounds[1]):
@@ -179,7 +188,10 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
 
 @kernel
 def _covariance_slopes(row_x, row_y, splat, given, dilation):
-    """Return dL/drow_x and dL/drow_y, from dL/dconic = given[2:5]."""
+    """Return the gradients of the rows x and y of J W R S, from those of the conic, given[2:5].
+
+    splat: the fields of the splat, of which 2 to 4 are the conic (inverse 2D covariance).
+    """
     xx = _dot(row_x, row_x)
     yy = _dot(row_y, row_y)
     minors = _cross(row_x, row_y)
@@ -196,9 +208,11 @@ def _covariance_slopes(row_x, row_y, splat, given, dilation):
 
 @kernel
 def _axis_slopes(axis, focal, z, of_row, turned_z, of_pixel):
-    """Return slopes of (camera-frame coordinate, z, focal, principal, row of W R S, its row z).
+    """Return the gradients of the inputs of `_axis`, for one image axis.
 
-    For one image axis: pixel = principal + focal slope, row = focal / z (turned - held turned_z).
+    They are the gradients of x (or y) and z of the camera-frame mean, of focal length and principal
+    point, and of the rows x (or y) and z of W R S. axis: the result of `_axis`. of_row, of_pixel:
+    gradients of the row of J W R S and of the pixel coordinate. turned_z: row z of W R S.
     """
     slope, held, row = axis
     gain = focal / z
@@ -222,7 +236,10 @@ def _axis_slopes(axis, focal, z, of_row, turned_z, of_pixel):
 
 @kernel
 def _quat_slopes(quat, norm, m, out):
-    """Write dL/dquat of the raw quaternion, with m = dL/dR."""
+    """Write the gradient of a raw quaternion to `out` (4,).
+
+    quat: unit quaternion. norm: norm of the raw one. m: gradient of the rotation matrix.
+    """
     w, x, y, z = quat
     yz = m[2][1] - m[1][2]
     zx = m[0][2] - m[2][0]
@@ -243,7 +260,10 @@ def _quat_slopes(quat, norm, m, out):
 
 @kernel
 def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
-    """Add one splat's gradients to `out` (16,)."""
+    """Add one splat's gradients of camera parameters to `out` (16,): C by rows, p, fx, fy, cx, cy.
+
+    Arguments `of_...` are gradients of the splat's values.
+    """
     for i in range(3):
         for j in range(3):
             out[3 * i + j] += offset[i] * of_seen[j] + _dot(factor_rows[i], of_turned[j])
@@ -254,7 +274,10 @@ def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
 
 @kernel
 def _sum_parts(given, g, slopes):
-    """Write the sum over parts of a splat's slopes. given: (P, G, 10)."""
+    """Sum the gradients given[:, g] of splat number g over the P parts, to `slopes` (10,).
+
+    given: (P, G, 10).
+    """
     slopes[:] = given[0, g]
     for part in range(1, given.shape[0]):
         for i in range(slopes.shape[0]):
@@ -266,10 +289,11 @@ def project_backward_unit(
     means, scales, quats, c2w, lenses, bounds, limits, splats, given, wants_cameras,
     of_means, of_scales, of_quats, of_opacities, of_cameras,
 ):  # fmt: skip
-    """Compute the gradients of `project_unit` from those of the rasteriser, (V, P, G, 10).
+    """Compute the gradients of `project_unit` from `given`, the rasteriser's gradients.
 
-    It first adds the P partial gradients per view. Writes of_means (G, 3), of_scales (G, 3),
-    of_quats (G, 4) and of_opacities (G,), and adds to of_cameras (V, 16) if `wants_cameras`.
+    given: (V, P, G, 10), summed over the P stripes of an image first. Writes the gradients of_means
+    (G, 3), of_scales (G, 3), of_quats (G, 4) and of_opacities (G,). If `wants_cameras` is true, it
+    adds the gradients of cameras to of_cameras (V, 16).
     """
     _, _, dilation, _, margin, height, width = limits
     zeros = (_ZERO, _ZERO, _ZERO)

@@ -1,19 +1,22 @@
 """Numba kernels of `qgs/cpu` that blend splats into sums of features, and their gradients.
 
-A unit of work is a stripe of tile rows of one image. It sorts the splats that touch the stripe by
-depth, then processes tiles of 16 x 16 pixels, front to back. A row of a tile is 16 lanes without
-branches, in one flat float32 buffer at constant offsets, so that LLVM can vectorise the lanes.
+A unit of work is a stripe of one image, several rows of tiles. It sorts the splats that touch the
+stripe by depth. Then it blends the splats of each tile of 16 x 16 pixels, front to back. A row of a
+tile is 16 lanes (pixels) without branches, in a flat float32 buffer at constant offsets, so that
+LLVM can vectorise the lanes.
 
-Splats are rows of 9 float32: u, v, conic xx, xy, yy, depth, half extents in x and y (pixels; not
-positive for invisible splats), and the power of 2 below which alpha cannot reach alpha_min.
-Sums are 5 planes: w r, w g, w b, w z, w.
+A splat has 9 float32 fields: pixel u, v; conic (inverse 2D covariance) xx, xy, yy; depth; half
+extents in x and y (pixels; not positive for invisible splats); and the power of 2 below which alpha
+cannot reach alpha_min. An image has 5 sums over splats, w r, w g, w b, w z and w, where w is the
+weight of a splat at a pixel, r, g, b its colour and z its depth.
 
-For each row of a tile, the buffer has blocks of 16 lanes: the transmittance; 1 until the pixel
-stops, then 0; the sums (forward) or the values from `_load_gradients` (backward).
+For each row of a tile the buffer has 9 blocks of 16 lanes. Block 0 is the transmittance. Block 1 is
+1 until the pixel takes no more splats, then 0. The other blocks are the sums (forward pass) or the
+values from `_load_gradients` (backward pass).
 
-The backward pass repeats the forward pass, with the same skips and the same end. With
-v_i = dL/dw_i, transmittance T_i and the rest S_i = sum_{j>i} w_j v_j,
-dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
+The backward pass repeats the forward pass with the same skips. Let L be the loss, w_i the weight of
+splat i, v_i = dL/dw_i, T_i the transmittance before splat i, and S_i the sum of w_j v_j over the
+splats j behind it. Then dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 """
 
 import numpy as np
@@ -61,7 +64,8 @@ def _exp2(x):
 def _by_depth(splats, top, bottom, width):
     """Return the indices of splats that touch image rows [top, bottom), by ascending depth.
 
-    A stable radix sort: positive floats sort like their bits.
+    width: of the image. This is a stable radix sort on the bits of the depths; positive floats sort
+    like their bits.
     """
     count = splats.shape[0]
     order = np.empty(count, np.int32)
@@ -98,7 +102,7 @@ def _by_depth(splats, top, bottom, width):
 
 @kernel
 def _touching_rows(order, splats, top, bottom, out):
-    """Copy to `out` the splats of `order` that touch rows [top, bottom); return their number."""
+    """Copy the indices in `order` of splats that touch rows [top, bottom) to `out`; count them."""
     n = 0
     for i in range(order.shape[0]):
         g = order[i]
@@ -112,7 +116,10 @@ def _touching_rows(order, splats, top, bottom, out):
 
 @kernel
 def _open(state, live, rows, columns):
-    """Initialise a tile: transmittance 1 in block 0; 1 in block 1 for pixels in the image."""
+    """Initialise the buffer `state` of a tile: block 0 to 1, block 1 to 1 inside the image, rest 0.
+
+    live: becomes True for each tile row in the image. rows, columns: part of the tile in the image.
+    """
     state[:] = _ZERO
     for row in range(TILE):
         live[row] = row < rows
@@ -124,7 +131,7 @@ def _open(state, live, rows, columns):
 
 @kernel
 def _close_rows(state, live):
-    """Mark rows in which every pixel has stopped; return whether any row is still open."""
+    """Set live[row] to False for rows in which no pixel takes more splats; return `live.any()`."""
     for row in range(TILE):
         total = _ZERO
         base = row * _ROW + TILE
@@ -136,7 +143,12 @@ def _close_rows(state, live):
 
 @kernel
 def _blend_row(state, base, dx0, power_of, look, options):
-    """Blend a splat into one row. power(dx) = (quadratic dx + linear) dx + constant, in base 2."""
+    """Blend a splat into one row of a tile, at offset `base` of the buffer `state`.
+
+    At horizontal distance dx from the splat, alpha is opacity 2^power with
+    power = (quadratic dx + linear) dx + constant. dx0: distance of the first lane. look: opacity,
+    r, g, b, depth.
+    """
     (linear, quadratic, constant), (opacity, r, g, b, z) = power_of, look
     alpha_min, alpha_cap, transmittance_min = options
     for lane in range(_LANES):
@@ -160,10 +172,10 @@ def _blend_row(state, base, dx0, power_of, look, options):
 
 @kernel
 def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
-    """Repeat `_blend_row` and add to the 10 lane blocks of `totals`.
+    """Repeat `_blend_row` and add the splat's gradients to the 10 blocks of lanes in `totals`.
 
-    Blocks: h, h dx, h dy, h dx dx, h dx dy, h dy dy with h = dL/dpower (in base e), then the
-    gradients of depth, r, g, b.
+    The blocks are h, h dx, h dy, h dx dx, h dx dy, h dy dy, where h is the gradient of the power to
+    base e; then the gradients of depth, r, g, b. dx, dy: distance of the pixel from the splat.
     """
     (linear, quadratic, constant), (opacity, r, g, b, z) = power_of, look
     alpha_min, alpha_cap, transmittance_min = options
@@ -206,7 +218,10 @@ def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
 
 @kernel
 def _add_gradients(totals, xx, xy, yy, opacity, out):
-    """Reduce the lanes of `totals` and add one splat's gradients to `out` (10,)."""
+    """Sum `totals` of `_backward_row` over lanes and add one splat's gradients to `out` (10,).
+
+    Order of `out`: u, v, conic xx, xy, yy, depth, opacity, r, g, b.
+    """
     t = np.empty(GRADIENTS, np.float32)
     for block in range(GRADIENTS):
         total = _ZERO
@@ -226,10 +241,12 @@ def _add_gradients(totals, xx, xy, yy, opacity, out):
 
 @kernel
 def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
-    """Put sum_j w_j v_j of a tile in block 2, dL/dsums in blocks 3 to 7, depth in block 8.
+    """Write what `_backward_row` needs of a tile to blocks 2 to 8 of the buffer `state`.
 
-    v contains (z - depth) dL/dsums_z + (dL/dsums_w + depth dL/dsums_z). Relative to the pixel's
-    depth, large gradients of nearly transparent pixels do not cancel in float32.
+    Block 2 gets the sum of w_j v_j over all splats j (symbols: see the module), 3 to 6 the
+    gradients `slopes` of the first four sums, 7 the gradient of the sum of w, 8 the pixel's depth.
+    Depths z enter v as z minus the pixel's depth; this keeps the digits of gradients at nearly
+    transparent pixels, where large terms would otherwise cancel in float32.
     """
     for row in range(rows):
         for lane in range(columns):
@@ -251,7 +268,10 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
 
 @kernel
 def _rows_within(above, reach):
-    """Return the first and last row of a tile with pixel centres within `reach` of a splat."""
+    """Return the first and last row of a tile whose pixel centres lie within `reach` of a splat.
+
+    above: distance from the first row's pixel centres down to the splat, in pixels.
+    """
     first = max(0, int(np.ceil(above - reach)))
     last = min(TILE - 1, int(np.floor(above + reach)))
     return first, last
@@ -268,10 +288,11 @@ def _store_sums(state, sums, y0, x0, rows, columns):
 
 @kernel
 def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
-    """Process the tile rows [first, last) of one image with its splats (G, 9).
+    """Blend all splats (G, 9) of one image in the tile rows from tile_rows[0] up to tile_rows[1].
 
-    Fills sums (5, H, W). If `backward`, it instead adds the gradients of the forward pass to out
-    (G, 10). slopes: (5, H, W), gradient of the loss with respect to `sums`.
+    If `backward` is false, it fills sums (5, H, W). If true, it reads them, and adds the gradients
+    of the splats to out (G, 10). slopes: gradient of the loss with respect to `sums`, (5, H, W).
+    options: alpha_min, alpha_cap, transmittance_min.
     """
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)

@@ -1,6 +1,6 @@
 """Numba kernel of `qgs.similarity` for the sum of SSIM over a plane, and its gradient.
 
-The formula is that of `similarity_map`; tests compare the kernel with its autograd.
+The formula is that of `qgs.similarity.similarity_map`; tests compare values and gradients.
 """
 
 import numpy as np
@@ -15,10 +15,10 @@ _TWO = np.float32(2)
 
 @kernel
 def _windowed(planes, row, weights, framed, out):
-    """Write means (N, W) over windows around a row of planes (N, H, W), zero-padded, to `out`.
+    """Write the means over windows around each pixel of one row of `planes` to `out` (N, W).
 
-    weights: weights of pixels at distances 0 to _REACH from the centre.
-    framed: (N, W + 2 _REACH), overwritten.
+    planes: (N, H, W), zero outside. weights: weights of pixels at distances 0 to _REACH from the
+    window's centre. framed: working memory (N, W + 2 _REACH).
     """
     parts, height, width = planes.shape
     framed[:] = _ZERO
@@ -37,9 +37,10 @@ def _windowed(planes, row, weights, framed, out):
 
 @kernel
 def similarity_sum(moments, weights, stabilisers, slope):
-    """Return the sum of SSIM of x and y over all pixels; write its gradient in x to `slope`.
+    """Return the sum of SSIM of planes x and y over all pixels; write its gradient in x to `slope`.
 
-    moments: (4, H, W), x, y, x^2 + y^2 and x y. slope: (H, W).
+    moments: (4, H, W) with x, y, x^2 + y^2 and x y. weights: see `_windowed`. stabilisers: the
+    constants C1 and C2 of SSIM. slope: (H, W).
     """
     (_, height, width), (c1, c2), total = moments.shape, stabilisers, 0.0
     framed = np.empty((4, width + 2 * _REACH), np.float32)

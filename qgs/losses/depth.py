@@ -15,11 +15,11 @@ from qgs.wording import warn_once
 class DepthSurface(Loss):
     """Smooth L1 between the camera-frame z of each Gaussian's centre and the depth map.
 
-    It uses all target views with depth maps (`Views.depths`), and input views if `inputs` is set.
-    Each centre counts with its smallest error over the views. So a centre on a surface that any
-    view shows has the loss 0, even if another view does not see the surface. A view that is both
-    target and input (`training.judge_inputs`) does not count twice. A batch without depth maps has
-    the loss 0; the first such batch logs a warning.
+    The loss uses all target views with depth maps (`Views.depths`), and all input views with depth
+    maps if the option `inputs` is true. Each centre counts with its smallest error over the views.
+    So a centre on a surface that any view shows has the loss 0, even if other views do not see this
+    surface. A view that is both target and input (`training.judge_inputs`) counts once. A batch
+    without depth maps has the loss 0; the first such batch logs a warning.
     """
 
     name = "depth_surface"
@@ -28,18 +28,17 @@ class DepthSurface(Loss):
 
     class Config(Loss.Config):
         beta: float = Field(default=0.05, gt=0)
-        """Error at which the loss changes from quadratic to linear, in world units."""
+        """Error in world units at which the loss changes from quadratic to linear."""
         near: float = Field(default=0.025, gt=0)
-        """Camera-frame z, in world units, at or below which a view ignores a centre."""
+        """A view ignores Gaussians whose camera-frame z is at or below this, in world units."""
         inputs: bool = True
-        """Use input views besides target views."""
+        """Use the depth maps of input views in addition to those of target views."""
 
     config: Config
 
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """See `Loss`."""
         views = [target, inputs] if self.config.inputs else [target]
         measured = [view for view in views if view.depths is not None]
         means = prediction.gaussians.means
@@ -72,8 +71,9 @@ def surface_errors(
 ) -> tuple[Tensor, Tensor]:
     """Return the smooth L1 error in z of each point in each view, and its validity, (B, V, G).
 
-    An error is valid beyond `near`, inside the image, and where the depth of the pixel is known.
-    The pixel counts as constant in the gradient, so it moves a point along the view's axis.
+    An error is valid if the point lies beyond `near` and inside the image, and the depth of its
+    pixel is known. The gradient treats the pixel as fixed, so it moves the point along the optical
+    axis of the view. beta: error at which the loss changes from quadratic to linear.
     """
     assert views.depths is not None
     local = to_camera(points, views.cameras)  # (B, V, G, 3)

@@ -1,4 +1,4 @@
-"""Losses on images and opacities: `photometric` (TokenGS, LocusGS), `mask`, `opacity` (TokenGS)."""
+"""Losses on images, masks and opacities: `qgs/photometric`, `qgs/mask`, `qgs/opacity`."""
 
 from collections.abc import Iterable, Iterator
 
@@ -23,21 +23,23 @@ class Photometric(Loss):
         mse_weight: float = Field(default=1.0, ge=0)
         """Factor of the mean squared error. 0 drops the term."""
         l1_weight: float = Field(default=0.0, ge=0)
-        """Factor of the mean absolute error (TokenGS 2026.6: 0.8, without MSE). 0 drops it."""
+        """Factor of the mean absolute error (TokenGS 2026.6: 0.8, without MSE). 0 drops the
+        term."""
         ssim_weight: float = Field(default=0.2, ge=0)
         """Factor of (1 - SSIM) / 2. 0 drops the term."""
         padding: Padding = "same"
-        """Borders of SSIM: "same" pads with zeros (releases), "valid" uses whole windows only."""
+        """Treatment of image borders in SSIM. "same" pads images with zeros, as the TokenGS and
+        LocusGS releases do. "valid" uses only windows that lie inside the image."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         if config.ssim_weight and config.padding == "valid":
-            yield from too_small(context, WINDOW, "padding", "SSIM of whole windows")
+            yield from too_small(context, WINDOW, "padding", "SSIM without padding")
 
     def weights(self) -> tuple[float, float, float]:
-        """Return the weights of MSE, L1 and SSIM in the objective."""
+        """Return the factors of MSE, L1 and SSIM, each multiplied by the option `weight`."""
         c = self.config
         return c.weight * c.mse_weight, c.weight * c.l1_weight, c.weight * c.ssim_weight
 
@@ -58,7 +60,7 @@ class Photometric(Loss):
 
 
 class Opacity(Loss):
-    """Opacity loss: mean of -ln(opacity + eps) (TokenGS release, weight 0 in its recipes)."""
+    """Opacity loss, the mean of -ln(opacity + eps) (TokenGS release, weight 0 in its recipes)."""
 
     name = "opacity"
     renderings = "none"
@@ -67,7 +69,7 @@ class Opacity(Loss):
         weight: float = Field(default=0.1, ge=0)
         """Factor of this loss in the objective. 0 skips the loss."""
         eps: float = Field(default=1e-6, gt=0)
-        """Number added to the opacity, so that the logarithm is finite (TokenGS release)."""
+        """Number added to the opacity, so that the logarithm stays finite (TokenGS release)."""
 
     config: Config
 
@@ -80,7 +82,10 @@ class Opacity(Loss):
 
 
 class Mask(Loss):
-    """Mask loss: mean of (alpha - mask)^2 (TokenGS, LocusGS releases; in no published recipe)."""
+    """Mask loss, the mean of (alpha - mask)^2 over pixels.
+
+    The TokenGS and LocusGS releases have this loss; their published recipes do not use it.
+    """
 
     name = "mask"
     renderings = "each"
@@ -104,7 +109,10 @@ class Mask(Loss):
 
 
 def too_small(context: RecipeContext, side: int, option: str, measure: str) -> Iterator[Problem]:
-    """Yield a problem of `option` if the data's images have a side below `side` pixels."""
+    """Yield a problem of `option` if the data's images have a side shorter than `side` pixels.
+
+    measure: what needs such images, as the subject of the message.
+    """
     if context.image_size and min(context.image_size) < side:
         given = "{} x {} (H x W)".format(*context.image_size)
         reason = f"{measure} needs images of at least {side} pixels a side, but they are {given}"
@@ -118,7 +126,10 @@ def mean_squared_error(images: Tensor, truth: Tensor) -> Tensor:
 
 
 def mean_of_gaussians(values: Tensor, prediction: LayerPrediction) -> Tensor:
-    """Average values (B, G) over the Gaussians of existing queries, then over scenes (0-d)."""
+    """Average values (B, G) over the Gaussians of a scene, then over scenes (0-d).
+
+    Gaussians of empty places (`QueryState.mask`) do not count.
+    """
     values = at_least_float32(values)
     mask = prediction.state.mask
     if mask is None:

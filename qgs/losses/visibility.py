@@ -1,4 +1,4 @@
-"""`qgs/visibility`, a loss that moves unseen points towards the nearest target view (TokenGS)."""
+"""`qgs/visibility`, a loss that moves Gaussians outside of all target views towards the nearest."""
 
 from collections.abc import Iterable, Iterator
 from typing import Literal
@@ -17,31 +17,33 @@ _TINY_Z = 1e-8
 """Value of |z| below which z counts as 0, so that gradients of x / z stay finite."""
 
 INFINITE_PIXEL = 1e6
-"""Value for x / 0 with x != 0 (TokenGS release)."""
+"""Pixel coordinate used in place of x / 0 with x != 0 (TokenGS release)."""
 
 
 class VisibilityOptions(Loss.Config):
-    """Options of a visibility loss.
+    """Options of visibility losses.
 
-    A point behind the camera, like every clamped point, gets no gradient from that view. Views that
-    have the point in front of them still move it.
+    With `behind_camera` "invisible", a point behind a camera has no gradient from this camera, like
+    every clamped point. Views that have the point in front of them still move it.
     """
 
     clamp: float | None = Field(default=1.0, gt=0)
-    """Upper bound per point, in halves of an image side (release: 1). null: no bound."""
+    """Upper bound of a point's loss. The unit is half an image side (TokenGS, LocusGS releases: 1).
+    null: no bound."""
     near: float = Field(default=0.025, gt=0)
-    """Camera-frame z at or below which a point is behind the camera, in world units."""
+    """Points whose camera-frame z is at or below this, in world units, are behind the camera."""
     behind_camera: Literal["published", "invisible"] = "published"
-    """Rule for points behind the camera. "published" projects them mirrored, so they may count as
-    visible, as in both releases. "invisible" gives them the full `clamp` in that view."""
+    """Rule for points behind a camera. "published" projects them like other points, mirrored, so
+    they may count as visible, as in the TokenGS and LocusGS releases. "invisible" gives them the
+    loss `clamp` in this view."""
 
     @property
     def behind(self) -> float | None:
-        """Camera-frame z at or below which points are invisible; None ignores the sign of z."""
+        """Camera-frame z at or below which points are invisible; None if z does not matter."""
         return self.near if self.behind_camera == "invisible" else None
 
     def conflicts(self) -> Iterator[Problem]:
-        """Yield problems of options that contradict each other or have no effect."""
+        """Yield the problems of options that contradict each other or have no effect."""
         if self.behind_camera == "published":
             yield from without_effect(self, ("near",), "`behind_camera` is published")
         elif self.clamp is None:
@@ -54,14 +56,18 @@ class VisibilityOptions(Loss.Config):
 
 
 class Visibility(Loss):
-    """Visibility loss: mean of `view_visibility` over the means of all Gaussians."""
+    """Visibility loss: mean over all Gaussians of the distance to the nearest target view's image.
+
+    See `view_visibility` (TokenGS release).
+    """
 
     name = "visibility"
     renderings = "none"
 
     class Config(VisibilityOptions):
         infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
-        """Value for x / 0 with x != 0, in pixels. It has no effect if `clamp` is set."""
+        """Pixel coordinate used in place of x / 0 with x != 0. It has no effect if `clamp` is
+        set."""
 
     config: Config
 
@@ -96,18 +102,19 @@ def view_visibility(
 ) -> Tensor:
     """Return the distance (B, P) of each point to the nearest view's image; 0 if a view sees it.
 
-    The distance to a view is relu(|u| - 1) + relu(|v| - 1), with u and v scaled to [-1, 1] over the
-    image. The result is the minimum over views, at most `clamp` (TokenGS, LocusGS releases).
+    The distance to a view's image is relu(|u| - 1) + relu(|v| - 1), with the point's pixel u, v
+    scaled to [-1, 1] over the image. The result is the minimum over views, at most `clamp`
+    (TokenGS, LocusGS releases).
 
     points: (B, P, 3) world. cameras: (B, V).
-    behind: z at or below which a point is infinitely far from a view's image; None ignores the sign
-        of z.
-    z_guard: replaces z with |z| below it by +z_guard (LocusGS anchors). None keeps z; then x / 0 is
-        `infinite_pixel` and 0 / 0 is visible (TokenGS).
+    behind: camera-frame z at or below which a point is infinitely far from a view's image. None:
+        points behind the camera are projected like those in front.
+    z_guard: a camera-frame z between -z_guard and z_guard is replaced by z_guard (LocusGS anchors).
+        None keeps z; then x / 0 becomes `infinite_pixel`, and 0 / 0 counts as visible (TokenGS).
 
-    The gradient uses only the nearest view (the first of several), so that memory does not grow
-    with the number of views. Values and gradients are finite, unless `behind` is set without
-    `clamp`.
+    The gradient uses only the nearest view (the first one of equally near views), so that memory
+    does not grow with the number of views. Values and gradients are finite, unless `behind` is set
+    without `clamp`.
     """
     options = (behind, z_guard, infinite_pixel)
     # Find the nearest view first, so that only its graph is kept.
@@ -128,9 +135,10 @@ def _image_excess(
     z_guard: float | None,
     infinite_pixel: float,
 ) -> Tensor:
-    """Compute relu(|u| - 1) + relu(|v| - 1) of world points (B, P, 3) -> (B, P).
+    """Compute the distance of world points (B, P, 3) to a camera's image, see `view_visibility`.
 
-    cameras: (B, P), one for each point, or (B, 1); both give bitwise equal results.
+    cameras: (B, P), one for each point, or (B, 1), one for all points of a scene; both give bitwise
+    equal results (B, P).
     """
     # By sums, not a matrix product: one point and many must give the same bits.
     from_camera = points - cameras.c2w[..., :3, 3]

@@ -1,4 +1,4 @@
-"""Metrics of reconstructions, and baselines that need no model."""
+"""Quality metrics of reconstructions, and baselines that need no model."""
 
 from qgs.metrics.dispersion import Dispersion
 from qgs.metrics.images import Psnr, Ssim

@@ -9,9 +9,9 @@ from qgs.types import Cameras, Views
 
 
 def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
-    """Return the nearest input image for every target camera (B, T) -> (B, T, 3, H, W).
+    """Return the input image with the least `pose_distance` to each target: (B, T, 3, H, W).
 
-    The nearest one has the least `pose_distance`.
+    targets: cameras (B, T).
     """
     index = pose_distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
     scene = torch.arange(index.shape[0], device=index.device)[:, None]
@@ -19,33 +19,37 @@ def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
 
 
 def mean_colour(inputs: Views, targets: Cameras) -> Tensor:
-    """Fill images with the mean RGB of a scene's input views -> (B, T, 3, H, W)."""
+    """Return images (B, T, 3, H, W) filled with the mean RGB of the scene's input views."""
     colour = inputs.images.mean((1, 3, 4))
     return colour[:, None, :, None, None].expand(-1, targets.shape[1], -1, *targets.size)
 
 
 BASELINES = {"nearest_input": nearest_input, "mean_colour": mean_colour}
-"""Baselines by their names in results; tables replace underscores by blanks."""
+"""Baselines by their names in results; tables show spaces for underscores."""
 
 
 def worse_than_nearest(
     column: Column, model: float | None, nearest: float | None, remedy: str
 ) -> str:
-    """Return a remark with `remedy` if `nearest_input` scores better than the model, else ""."""
+    """Return a remark if the baseline `nearest_input` scores better than the model, else "".
+
+    model, nearest: values of the metric in `column`, for model and baseline. remedy: advice at the
+    end of the remark.
+    """
     if not column.beats(nearest, model):
         return ""
     return (
         f"the result is worse than a copy of the nearest photo: {column.heading} "
-        f"{column.shown(model)} against {column.shown(nearest)}; {remedy}"
+        f"{column.shown(model)}, copy {column.shown(nearest)}; {remedy}"
     )
 
 
 @full_precision
 def pose_distance(inputs: Tensor, targets: Tensor) -> Tensor:
-    """Return distances (B, T, V) between input poses (B, V, 4, 4) and targets (B, T, 4, 4).
+    """Return distances (B, T, V) between input poses (B, V, 4, 4) and target poses (B, T, 4, 4).
 
-    A distance is that of the camera centres, divided by the spread of the inputs, plus the angle
-    between the axes in radians.
+    A distance is the distance between camera centres, divided by the spread of the inputs' centres,
+    plus the angle between optical axes in radians.
     """
     centres = inputs[..., :3, 3]
     seen_from = targets[..., :3, 3]

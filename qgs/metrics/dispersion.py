@@ -1,4 +1,4 @@
-"""Dispersion, a metric for the scatter of the Gaussians of a query."""
+"""Dispersion, a metric for the spatial scatter of each query's Gaussians."""
 
 from collections.abc import Mapping
 
@@ -9,14 +9,14 @@ from qgs.contracts import Column, Metric, MetricInput
 from qgs.precision import full_precision
 
 OPACITY_USED = 1 / 255
-"""Opacity below which a Gaussian is never drawn: renderers skip alpha below 1/255."""
+"""Gaussians of a lower opacity are never rendered, because renderers skip alpha below 1/255."""
 
 
 class Dispersion(Metric):
     """Dispersion, the distance of Gaussians to the centroid of their query's Gaussians.
 
-    It is small if each query covers one place. LocusGS publishes the mean, which depends on a few
-    far Gaussians; the median does not.
+    A small value means that each query covers one region. LocusGS publishes the mean. A few far
+    Gaussians change the mean much, but not the median.
     """
 
     name = "dispersion"
@@ -30,7 +30,7 @@ class Dispersion(Metric):
         return {key: Column(h, "lower", unit="world units") for key, h in headings.items()}
 
     def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
-        """Return distances (1, G), and their median (1,)."""
+        """Return the distances (1, G), whose mean is the first value, and their median (1,)."""
         assert given.gaussians is not None
         distances = token_dispersion(given.gaussians.means, given.gaussians_per_query)
         return {"mean": distances, "median": torch.quantile(distances, 0.5, dim=-1)}

@@ -16,19 +16,25 @@ _MSE_FLOOR = 1e-10
 
 
 class Psnr(Metric):
-    """PSNR, the peak signal-to-noise ratio of each view. 6 dB more is half the error."""
+    """PSNR, the peak signal-to-noise ratio of each view; higher is better.
+
+    An increase of 6 dB halves the root mean squared error.
+    """
 
     name = "psnr"
     definition = "dB of images clipped to [0, 1], mean over views, then over scenes"
     column = Column("PSNR", "higher", digits=2, unit="dB")
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return PSNR (1, T)."""
+        """Return the PSNR in dB of each view, (1, T)."""
         return psnr(given.images, given.targets.images)
 
 
 class Ssim(Metric):
-    """SSIM, the structural similarity of each view (Wang et al. 2004). 1 is the photo itself."""
+    """SSIM, the structural similarity of each view and its photo (Wang et al. 2004).
+
+    Higher is better; 1 means equal images.
+    """
 
     name = "ssim"
     definition = "scikit-image: Gaussian window of 11, sigma 1.5, data range 1, borders left out"
@@ -37,25 +43,25 @@ class Ssim(Metric):
         """Options of SSIM."""
 
         covariance: SsimCovariance = "population"
-        """Kind of covariance. "population" follows Wang et al. 2004. "sample" is scikit-image's
-        default, which pixelSplat's evaluation and its successors use."""
+        """Kind of variances and covariance. "population" follows Wang et al. 2004. "sample" is
+        scikit-image's default, which the evaluation of pixelSplat and its successors uses."""
 
     config: Config
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the column; its heading names a covariance other than the default."""
+        """Return the column; its heading names the covariance unless it is the default."""
         covariance = self.config.covariance
         form = "" if covariance == "population" else f" ({covariance} covariance)"
         return {"": Column(f"SSIM{form}", "higher")}
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return SSIM (1, T); raise ValueError for images smaller than the window."""
+        """Return the SSIM of each view, (1, T); ValueError for images smaller than the window."""
         return ssim(given.images, given.targets.images, self.config.covariance)
 
 
 @full_precision
 def psnr(images: Tensor, truth: Tensor) -> Tensor:
-    """Compute PSNR in dB of images (..., 3, H, W), clipped to [0, 1] -> (...)."""
+    """Compute the PSNR in dB of images (..., 3, H, W), clipped to [0, 1] first, -> (...)."""
     # Clipped, as a saved picture would be.
     error = (images.clamp(0, 1) - truth.clamp(0, 1)).square().mean((-3, -2, -1))
     return -10 * error.clamp_min(_MSE_FLOOR).log10()
@@ -63,12 +69,13 @@ def psnr(images: Tensor, truth: Tensor) -> Tensor:
 
 @full_precision
 def ssim(images: Tensor, truth: Tensor, covariance: SsimCovariance = "population") -> Tensor:
-    """Compute the structural similarity of images (..., 3, H, W), clipped to [0, 1] -> (...).
+    """Compute the structural similarity of images (..., 3, H, W), clipped to [0, 1], -> (...).
 
     Equals scikit-image's `structural_similarity` with gaussian_weights, sigma 1.5 and data_range 1,
-    which leaves out the 5 pixels at the border. Covariance "sample" is its use_sample_covariance:
-    variances of the N = 11 * 11 pixels of a window are multiplied by N / (N - 1). It computes in
-    float64, because variances of flat images are small differences of squares.
+    which leaves out the 5 pixels at the border. Covariance "sample" stands for its option
+    use_sample_covariance: variances of the N = 11 * 11 pixels of a window are multiplied by
+    N / (N - 1). The computation is in float64, because variances of flat images are small
+    differences of squares.
     Raises ValueError if a side is shorter than the window of 11 pixels.
     """
     x, y = (image.clamp(0, 1).double() for image in (images, truth))

@@ -1,4 +1,4 @@
-"""Building blocks that several components share; plugins may use them too.
+"""Building blocks that several components share; plugins may import them.
 
 Axes: B scenes, T tokens, N queries, M image tokens, Q chosen queries, D width, h heads, d = D/h.
 """
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from qgs.contracts import AttentionWeights, ComponentConfig
 
 NORM_EPS = 1e-5
-"""Epsilon of every LayerNorm in both releases (PyTorch's default)."""
+"""Epsilon of every LayerNorm in the TokenGS and LocusGS releases (PyTorch's default)."""
 
 
 class NormConfig(ComponentConfig):
@@ -23,7 +23,7 @@ class NormConfig(ComponentConfig):
 
 
 class LayerScale(nn.Module):
-    """Factor per channel on a residual update, (..., D) -> (..., D), initially `init`."""
+    """Learned factor per channel of a residual update, (..., D) -> (..., D); starts at `init`."""
 
     def __init__(self, width: int, init: float) -> None:
         super().__init__()
@@ -47,17 +47,20 @@ class Mlp(nn.Module):
 
 
 def split_heads(x_BTD: Tensor, heads: int) -> Tensor:
-    """Split the heads: (B, T, D) -> (B, h, T, d)."""
+    """Split channels into attention heads: (B, T, D) -> (B, h, T, d)."""
     return rearrange(x_BTD, "b t (h d) -> b h t d", h=heads)
 
 
 def merge_heads(x_BhTd: Tensor) -> Tensor:
-    """Merge the heads: (B, h, T, d) -> (B, T, D)."""
+    """Merge attention heads into channels: (B, h, T, d) -> (B, T, D)."""
     return rearrange(x_BhTd, "b h t d -> b t (h d)")
 
 
 def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) -> AttentionWeights:
-    """Compute scaled dot-product attention weights in float32. bias: one for all heads, or each."""
+    """Compute scaled dot-product attention weights in float32.
+
+    bias: added to the logits; (B, 1, Q, T) for all heads, or (B, h, Q, T).
+    """
     # So that logits keep their spread for any width of a head.
     scale = q_BhQd.shape[-1] ** -0.5
     content_BhQT = torch.einsum("bhqd,bhtd->bhqt", q_BhQd.float(), k_BhTd.float()) * scale
@@ -81,7 +84,7 @@ class SelfAttentionCore(nn.Module):
         self.proj = nn.Linear(width, width)
 
     def project(self, x_BTD: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return queries, keys and values (B, h, T, d), after their norms."""
+        """Return queries, keys and values (B, h, T, d); queries and keys are normalised."""
         q_BhTd, k_BhTd, v_BhTd = (
             split_heads(part_BTD, self.heads) for part_BTD in self.qkv(x_BTD).chunk(3, -1)
         )
@@ -89,7 +92,10 @@ class SelfAttentionCore(nn.Module):
         return self.q_norm(q_BhTd).to(v_BhTd.dtype), self.k_norm(k_BhTd).to(v_BhTd.dtype), v_BhTd
 
     def forward(self, x_BTD: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Return (B, T, D). mask: (B, T), False for hidden tokens, or (B, T, T) for each reader."""
+        """Return the attention output (B, T, D).
+
+        mask: False hides a token: (B, T) from all tokens, or (B, T, T) with a row for each query.
+        """
         q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
         if mask is not None:
             mask = _by_head(mask if mask.ndim == 3 else mask[:, None])
@@ -99,7 +105,10 @@ class SelfAttentionCore(nn.Module):
     def explain(
         self, x_BTD: Tensor, queries: Tensor, mask: Tensor | None = None
     ) -> AttentionWeights:
-        """Return the attention of the tokens `queries` (Q,), indices; `mask` as in `forward`."""
+        """Return the attention weights of the tokens with indices `queries` (Q,).
+
+        mask: see `forward`.
+        """
         q_BhTd, k_BhTd, _ = self.project(x_BTD)
         bias_B1QT = None
         if mask is not None:
@@ -110,7 +119,7 @@ class SelfAttentionCore(nn.Module):
 
 
 class CrossAttentionCore(nn.Module):
-    """Pre-norm multi-head attention to given keys and values, with a bias on the logits."""
+    """Pre-norm multi-head attention to given keys and values, with an optional logit bias."""
 
     def __init__(self, width: int, heads: int, norm_eps: float = NORM_EPS) -> None:
         super().__init__()
@@ -121,13 +130,16 @@ class CrossAttentionCore(nn.Module):
         self.out_proj = nn.Linear(width, width)
 
     def project(self, x_BND: Tensor) -> Tensor:
-        """Return queries (B, h, N, d), after their norm."""
+        """Return the normalised queries (B, h, N, d)."""
         return self.q_norm(split_heads(self.q_proj(self.norm(x_BND)), self.heads))
 
     def forward(
         self, x_BND: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: Tensor | None = None
     ) -> Tensor:
-        """Return (B, N, D). bias: (B, N, M) for all heads, or (B, h, N, M); -inf hides a token."""
+        """Return the attention output (B, N, D).
+
+        bias: added to the logits, (B, N, M) for all heads or (B, h, N, M); -inf hides a token.
+        """
         # Keys are normalised by their encoder, in float32 under autocast, as these queries are.
         q_BhNd = self.project(x_BND).to(v_BhMd.dtype)
         k_BhMd = k_BhMd.to(v_BhMd.dtype)
@@ -138,7 +150,10 @@ class CrossAttentionCore(nn.Module):
     def explain(
         self, x_BND: Tensor, k_BhMd: Tensor, queries: Tensor, bias: Tensor | None = None
     ) -> AttentionWeights:
-        """Return the attention weights of `queries` (Q,), indices; `bias` as in `forward`."""
+        """Return the attention weights of the queries with indices `queries` (Q,).
+
+        bias: see `forward`.
+        """
         q_BhQd = self.project(x_BND)[:, :, queries]
         full = (len(x_BND), -1, x_BND.shape[1], k_BhMd.shape[2])
         bias_BhQM = None if bias is None else _by_head(bias).expand(full)[:, :, queries]
@@ -146,5 +161,5 @@ class CrossAttentionCore(nn.Module):
 
 
 def _by_head(bias: Tensor) -> Tensor:
-    """Add a head axis: (B, N, M) -> (B, 1, N, M); (B, h, N, M) stays."""
+    """Add a head axis, (B, N, M) -> (B, 1, N, M); return (B, h, N, M) unchanged."""
     return bias if bias.ndim == 4 else bias[:, None]

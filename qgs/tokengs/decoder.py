@@ -23,7 +23,7 @@ from qgs.types import ImageMemory, QueryState, Rendering, Views
 
 
 class LatentQueries(LearnedQueries):
-    """Queries that are N learned vectors without a position, the same in all scenes."""
+    """N learned query vectors without a position, the same in all scenes."""
 
     name = "latent"
 
@@ -43,7 +43,10 @@ class LatentQueries(LearnedQueries):
 
 
 class CrossSelfMlp(DecoderLayer):
-    """Layer of cross-attention, self-attention, MLP; adds each scaled update (TokenGS release)."""
+    """Decoder layer of cross-attention, self-attention and MLP, in this order (TokenGS release).
+
+    It multiplies the update of each part by a LayerScale and adds it to the features.
+    """
 
     name = "cross_self_mlp"
     sublayers = ("cross_attention", "self_attention", "feed_forward")
@@ -115,7 +118,7 @@ class ContentSelfAttention(SelfAttention):
 
 
 class MlpFeedForward(FeedForward):
-    """MLP with pre-norm: LayerNorm, then D -> ratio*D -> D with GELU."""
+    """MLP with pre-norm: LayerNorm, then linear layers D -> ratio*D -> D with GELU between."""
 
     name = "mlp"
 

@@ -17,9 +17,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class PatchEmbedding(nn.Module):
-    """Patch embedding: P x P convolution of stride P, LayerNorm; (X, C, H, W) -> (X, H/P*W/P, D).
+    """Patch embedding (X, C, H, W) -> (X, H/P*W/P, D): P x P convolution of stride P, LayerNorm.
 
-    X is B*V, the views of all scenes.
+    X = B*V counts the views of all scenes. P is the patch size.
     """
 
     def __init__(self, channels: int, width: int, patch_size: int, norm_eps: float) -> None:
@@ -51,14 +51,14 @@ class EncoderBlock(nn.Module):
 
 
 class PatchViT(PatchEncoder):
-    """ViT over the tokens of all views; its input is the sum of RGB and Plücker embeddings.
+    """Base of ViTs over the tokens of all views; a token is an RGB plus a Plücker embedding.
 
-    Subclasses decide which outputs of the blocks go into the memory.
+    Subclasses run the blocks and build the image memory.
     """
 
     class Config(NormConfig, PatchEncoder.Config):
         depth: int = Field(default=3, ge=0, le=256)
-        """Number of ViT blocks. 0 leaves the embeddings unchanged."""
+        """Number of ViT blocks. 0: the tokens are the embeddings."""
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width of the MLPs divided by the model's width; the result is rounded down."""
         layer_scale: float = Field(default=0.01, gt=0)
@@ -79,10 +79,10 @@ class PatchViT(PatchEncoder):
         )
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return weights for larger patches, if the new side is a multiple of the old one.
+        """Return weights enlarged to this component's patches, if the side is a multiple.
 
-        A patch with a side f times as long then gives the token of the old patch, computed on means
-        over f x f pixels.
+        With f times the side, the token of a new patch is what the old weights give for the patch
+        shrunk by averaging f x f pixels. Otherwise weights are returned unchanged.
         """
         # Its shapes give the size of our patches.
         own = self.state_dict()
@@ -99,7 +99,10 @@ class PatchViT(PatchEncoder):
 
 
 class MultiViewViT(PatchViT):
-    """ViT over all views, from RGB and Plücker embeddings, with one key-value layer."""
+    """ViT over the patches of all views, with one projection to keys and values at the end.
+
+    A token is the sum of an RGB and a Plücker embedding.
+    """
 
     name = "multiview_vit"
 
@@ -125,7 +128,7 @@ class MultiViewViT(PatchViT):
 def keys_and_values(
     features: Tensor, kv_proj: nn.Linear, k_norm: nn.LayerNorm
 ) -> tuple[Tensor, Tensor]:
-    """Return keys, normalised per head, and values (B, h, M, d) of features (B, M, C)."""
+    """Project features (B, M, C) to keys, normalised per head, and values, both (B, h, M, d)."""
     heads = kv_proj.out_features // 2 // k_norm.normalized_shape[0]
     k_BMD, v_BMD = kv_proj(features).chunk(2, -1)
     v_BhMd = split_heads(v_BMD, heads)
@@ -133,11 +136,11 @@ def keys_and_values(
 
 
 _KERNEL = "_embedding.proj.weight"
-"""Ending of the names of patch embeddings' kernels."""
+"""End of the parameter name of a patch embedding's kernel."""
 
 
 def _larger(kernel: Tensor, side: int) -> Tensor:
-    """Enlarge a kernel (D, C, p, p) to patches of `side`, a multiple of p; others stay."""
+    """Enlarge a kernel (D, C, p, p) to patches of `side`; unchanged unless a multiple of p."""
     if kernel.ndim != 4 or not kernel.numel() or side % kernel.shape[-1]:
         return kernel
     factor = side // kernel.shape[-1]

@@ -24,11 +24,11 @@ from qgs.tokengs.blocks import NormConfig
 from qgs.types import GaussianAttributes, QueryState
 
 CHANNELS = (3, 3, 3, 4, 1)
-"""Channels per Gaussian: position, RGB, scale, rotation, opacity (both releases)."""
+"""Channels per Gaussian: position, RGB, scale, rotation, opacity (TokenGS, LocusGS releases)."""
 
 
 class GaussianHead(Head):
-    """Linear head, D -> K * 14, followed by the published activations in float32."""
+    """Linear head, D -> K * 14, followed by the activations of TokenGS and LocusGS in float32."""
 
     name = "gaussian_head"
 
@@ -44,13 +44,15 @@ class GaussianHead(Head):
         z_init: float = 0.0
         """Initial bias of the raw z of positions (default 0; TokenGS 2026.6: log 1.1)."""
         norm: bool = False
-        """Use a LayerNorm before the linear layer (in neither release; helps small models)."""
+        """Use a LayerNorm before the linear layer. TokenGS and LocusGS have none; it helps small
+        models."""
         scale_cap: float = Field(default=0.075, gt=0)
         """Largest scale in world units. A raw scale of 0 gives 1/e of it."""
         scale_input_limit: float | None = Field(default=10.0, gt=0)
-        """Clamp raw scales to +- this before the exponential. null: no clamp (TokenGS)."""
+        """Limit of the absolute value of raw scales before the exponential. null: no limit
+        (TokenGS)."""
         opacity_bias: float = -2.0
-        """Number added to the opacity logit."""
+        """Number added to the opacity before the sigmoid."""
         quat_eps: float = Field(default=1e-4, gt=0)
         """Smallest divisor when raw quaternions are normalised (TokenGS: 1e-12)."""
 
@@ -105,9 +107,9 @@ def posact(
 ) -> Tensor:
     """Compute sign(t) (exp|t| - 1), linear near 0 and exponential far out (TokenGS release).
 
-    input_limit: clamps |t|. output_limit: clamps the size of the result. The LocusGS release uses
-    100 and 1000, TokenGS neither. The slope is 1 at 0, so that a head that starts at zero can
-    learn. It is 0 outside a limit.
+    input_limit: clamps |t|. output_limit: clamps the absolute result. None: no clamp. The LocusGS
+    release uses limits 100 and 1000, the TokenGS release none. The slope is 1 at t = 0, so that a
+    head that starts at zero can learn; it is 0 beyond a limit.
     """
     # Exp of a stray output would be infinite.
     if input_limit is not None:
@@ -130,9 +132,11 @@ class FreeCenters(Centers):
         z_offset: float = 1.0
         """Number added to z, in world units (1 in TokenGS, 0 in LocusGS's free-centre ablation)."""
         input_limit: float | None = Field(default=100.0, gt=0)
-        """Clamp raw offsets to +- this. null: no clamp (LocusGS 100, TokenGS null)."""
+        """Limit of the absolute value of raw offsets. null: no limit (LocusGS 100, TokenGS
+        null)."""
         output_limit: float | None = Field(default=1000.0, gt=0)
-        """Clamp offsets to +- this, in world units. null: no clamp (LocusGS 1000)."""
+        """Limit of the absolute value of posact(offset), in world units. null: no limit (LocusGS
+        1000, TokenGS null)."""
 
     config: Config
 

@@ -10,7 +10,7 @@ from torch.optim import AdamW
 from qgs.contracts import Optimizer, OptimizerConfig, ParameterGroup, TrainingConfig
 
 WARMUP_TIME = 0.1
-"""Largest fraction of a time budget for warm-up."""
+"""Largest fraction of a time budget that is used for warm-up."""
 
 Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
@@ -19,9 +19,9 @@ class OneCycleAdamW(Optimizer):
     """AdamW with a learning rate that rises and falls along cosines (LocusGS release).
 
     The rise ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that
-    comes first. It may also be linear. The fall follows the used fraction of the budget, the larger
-    one of steps and seconds. With steps alone this is torch's `OneCycleLR` with
-    pct_start = warmup / steps.
+    comes first. `warmup_shape` can make the rise linear. The fall follows the used fraction of the
+    steps or of the seconds, whichever is larger. Without a time budget this is torch's `OneCycleLR`
+    with pct_start = warmup / steps.
 
     A schedule for `learning_rate` replaces this cycle. Then warmup and divisors have no effect.
     """
@@ -29,22 +29,25 @@ class OneCycleAdamW(Optimizer):
     name = "adamw"
 
     class Config(OptimizerConfig):
-        """Options of the learning rate and of AdamW."""
+        """Options of the learning rate's cycle and of AdamW."""
 
         learning_rate: float = Field(default=4e-4, ge=0)
-        """Peak learning rate, at the end of the warm-up. A schedule replaces the cycle."""
+        """Peak learning rate, at the end of the warm-up. A schedule given here replaces the whole
+        cycle of warm-up and fall."""
         warmup: int = Field(default=2000, ge=0)
-        """Optimiser steps up to the peak. 0: start at the peak."""
+        """Optimiser steps until the learning rate reaches its peak. 0: start at the peak."""
         warmup_shape: Literal["cosine", "linear"] = "cosine"
-        """Shape of the rise to the peak."""
+        """Shape of the learning rate's rise to its peak."""
         initial_divisor: float = Field(default=25.0, ge=1)
-        """Peak rate divided by first rate."""
+        """Peak learning rate divided by the first learning rate."""
         final_divisor: float = Field(default=1000.0, gt=0)
-        """First rate divided by last rate, as in torch's OneCycleLR. Below 1 the last is larger."""
+        """First learning rate divided by the last one, as in torch's OneCycleLR. Below 1 the last
+        one is larger."""
         betas: tuple[Decay, Decay] = (0.9, 0.95)
         """AdamW's decay rates for the averages of gradients and of their squares."""
         weight_decay: float = Field(default=0.05, ge=0)
-        """AdamW's weight decay, for the parameters that decay. 0: none."""
+        """AdamW's weight decay. It applies to parameters for which `ModelComponent.decays` is true.
+        0: none."""
 
     def __init__(self, config: Config, training: TrainingConfig | None = None) -> None:
         super().__init__(config, training)
@@ -66,13 +69,13 @@ class OneCycleAdamW(Optimizer):
             )
 
     def build(self, groups: Sequence[ParameterGroup]) -> AdamW:
-        """Build a fused AdamW; groups that do not decay get no `weight_decay`."""
+        """Build torch's fused AdamW; groups with `decays` false get a weight decay of 0."""
         decay = self.options.weight_decay
         own = [{**group, "weight_decay": decay if group["decays"] else 0.0} for group in groups]
         return AdamW(own, lr=self.peak, betas=self.options.betas, fused=True)
 
     def learning_rate(self, step: int, seconds: float) -> float:
-        """Return the schedule's rate, or else the one-cycle rate."""
+        """Return the learning rate of the recipe's schedule, or without one that of the cycle."""
         if self.follows_schedule:
             return super().learning_rate(step, seconds)
         # steps - 1: the last step has the last rate, as in torch's OneCycleLR.
@@ -93,7 +96,7 @@ class OneCycleAdamW(Optimizer):
         return _cosine(self.peak, self.last, min(part, 1.0))
 
     def state(self) -> Mapping[str, float | None]:
-        """Return the start of the fall, as a fraction of the budget."""
+        """Return the fraction of the budget at which the fall starts; None before the fall."""
         return {"descent_starts": self._descent_starts}
 
     def load_state(self, state: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Kinds of schedules, which a recipe can use for numbers that change during training."""
+"""Kinds of schedules, by which a recipe makes numeric options change during training."""
 
 import math
 from bisect import bisect_right
@@ -14,20 +14,22 @@ Step: TypeAlias = Annotated[int, Field(ge=0)]
 
 
 class Constant(Schedule):
-    """A constant number, the same as a plain number."""
+    """A constant number; it has the same effect as a plain number."""
 
     schedule: Literal["constant"]
-    """A constant number, the same as a plain number."""
+    """A constant number; it has the same effect as a plain number."""
     value: float
     """The constant number."""
 
     def number(self, step: int) -> float:
-        """See `Schedule`."""
         return self.value
 
 
 class _Listed(Schedule):
-    """Schedule with ascending steps `at`, one of `values` for each step, and `more` values."""
+    """Schedule with a list `at` of ascending steps and a list `values` of numbers.
+
+    more: how many more numbers than steps there are.
+    """
 
     more: ClassVar[int] = 0
     values: tuple[float, ...]
@@ -42,50 +44,48 @@ class _Listed(Schedule):
         if len(self.values) != wanted:
             raise OptionError(
                 f"{len(steps)} steps in `at` need {wanted} values, got {len(self.values)}",
-                "`linear` and `cosine` need one value per step in `at`, `steps` one more",
+                "give `linear` and `cosine` one value per step in `at`, and `steps` one value more",
             )
         return self
 
     @property
     def corners(self) -> tuple[int, ...]:
-        """See `Schedule`."""
         return self.at
 
 
 class Steps(_Listed):
-    """Steps: `values[0]` first, then each further value from its step on."""
+    """Step function: `values[0]` at first, and `values[i + 1]` from step `at[i]` on."""
 
     more: ClassVar[int] = 1
     schedule: Literal["steps"]
-    """One number for each range of steps."""
+    """Step function: one constant number for each range of training steps."""
     values: tuple[float, ...]
-    """The numbers, one more than the steps in `at`."""
+    """The numbers in order, one more than there are steps in `at`."""
     at: tuple[Annotated[int, Field(ge=1)], ...] = Field(min_length=1)
-    """Ascending steps; each starts the next value."""
+    """Ascending steps. At each of them the next value starts."""
 
     def number(self, step: int) -> float:
-        """See `Schedule`."""
         return self.values[bisect_right(self.at, step)]
 
     @property
     def corners(self) -> tuple[int, ...]:
-        """See `Schedule`. The last step before each jump is a corner too."""
+        """Steps in `at`, and the last step before each of them."""
         before = [max(at - 1, 0) for at in self.at]
         return (*before, *self.at)
 
 
 class Linear(_Listed):
-    """Interpolation between numbers over ranges of steps; constant before and after."""
+    """Interpolation between the numbers `values` at the steps `at`; constant outside of `at`."""
 
     schedule: Literal["linear", "cosine"]
-    """Interpolation on lines, or on half cosines, which are slow at both ends."""
+    """Interpolate linearly, or along half cosines, whose slope is 0 at both ends."""
     values: tuple[float, ...] = Field(min_length=2)
-    """The numbers at the steps in `at`. The first also holds before, the last after them."""
+    """The numbers at the steps in `at`. The first one also holds before the first step, the last
+    one after the last step."""
     at: tuple[Step, ...]
     """Ascending steps, one for each of `values`."""
 
     def number(self, step: int) -> float:
-        """See `Schedule`."""
         after = bisect_right(self.at, step)
         if after in (0, len(self.at)):
             return self.values[min(after, len(self.at) - 1)]
@@ -100,4 +100,4 @@ class Linear(_Listed):
 SCHEDULES: Mapping[str, type[Schedule]] = {
     "constant": Constant, "steps": Steps, "linear": Linear, "cosine": Linear
 }  # fmt: skip
-"""Kinds of schedules, by their name in a recipe."""
+"""Classes of schedules, by their name in a recipe."""

@@ -1,4 +1,4 @@
-"""`qgs/layers`, supervision of chosen layers with larger weights for later ones (LocusGS)."""
+"""Supervision of chosen decoder layers (`qgs/layers`), and an objective (`qgs/one_pass`)."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -18,7 +18,10 @@ from qgs.types import Views
 
 
 class LayerSupervision(Supervision):
-    """Supervision of S layers, with ends of rounds; the m-th has weight m / (1 + ... + S)."""
+    """Supervision of chosen decoder layers and of the last layer of each feedback round.
+
+    The m-th of all S supervised layers has the weight m / (1 + ... + S) (LocusGS release).
+    """
 
     name = "layers"
 
@@ -57,7 +60,7 @@ class LayerSupervision(Supervision):
 
 
 class OnePass(Objective):
-    """Objective of one pass: the recipe's losses of a prediction from all input views."""
+    """Objective of one forward pass: the recipe's losses of a prediction from all input views."""
 
     name = "one_pass"
 
