@@ -65,8 +65,7 @@ def test_the_loop_by_hand_trains_and_saves_a_scene(tmp_path, monkeypatch, capsys
     out = tmp_path / "scene.ply"
     smaller = ["model.queries.count=64", "data.image_size=[32, 32]"]
     recipe.write_text(annotated(resolve("tiny/locus.yaml", smaller)))
-    command = [EXAMPLE, recipe, 11, out]
-    monkeypatch.setattr("sys.argv", [str(argument) for argument in command])
+    monkeypatch.setattr("sys.argv", [*map(str, (EXAMPLE, recipe, 11, out))])
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     first, last = re.findall(r"loss (\S+)", capsys.readouterr().out)
     assert float(last) < float(first)

@@ -77,8 +77,8 @@ def test_reading_ahead_leaves_the_autocast_of_training_alone():
         first = torch.nn.functional.linear(x, weight).grad_fn
         batches(ROOMS, 2, 1)
         second = torch.nn.functional.linear(x, weight).grad_fn
-    casts = [node.next_functions[-1][0].next_functions[0][0] for node in (first, second)]
-    assert casts[0] is casts[1]
+    one, other = (node.next_functions[-1][0].next_functions[0][0] for node in (first, second))
+    assert one is other
 
 
 def test_closing_ends_the_thread():

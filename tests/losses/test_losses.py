@@ -17,7 +17,6 @@ from qgs.metrics.images import ssim
 from qgs.types import Cameras, Views
 from qgs.wording import warn_once
 
-VIEWS = Views(TRUTH, CAMERAS)
 POINTS = GOLDEN["points"]
 
 
@@ -42,7 +41,8 @@ def test_terms_have_weights_and_those_of_weight_zero_are_left_out():
 
 
 def test_mask_without_masks_is_refused():
-    must_refuse("qgs/mask needs views with masks", judged, Mask(Mask.Config()), VIEWS)
+    views = Views(TRUTH, CAMERAS)
+    must_refuse("qgs/mask needs views with masks", judged, Mask(Mask.Config()), views)
 
 
 def test_gradients_of_visibility_are_finite_everywhere():
