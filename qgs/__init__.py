@@ -37,8 +37,9 @@ for _other in Path(__file__).resolve().parents[1].glob("qgs-[0-9]*-info"):
     )
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
-"""Setting of PyTorch's CPU allocator: use huge pages for large tensors. It works if qgs is imported
-before any allocation. With 4 KiB pages a forward pass takes about 5 % longer. 0 switches it off."""
+"""Setting of PyTorch's CPU allocator that uses huge pages for large tensors. Without it a forward
+pass takes about 5 % longer. It has no effect if a tensor was allocated before qgs is imported. 0
+switches it off."""
 
 _ELSEWHERE = {
     "CONTRACT_VERSION": "qgs.contracts.plugin",
@@ -54,7 +55,7 @@ _ELSEWHERE = {
     "save_ply": "qgs.reconstruction.scene_formats",
     "trace": "qgs.reconstruction.trace",
 }
-"""Modules of the public names outside of `qgs.types`."""
+"""Module of each public name that is not in `qgs.types`."""
 
 __all__ = [
     "CONTRACT_VERSION",

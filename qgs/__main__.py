@@ -1,4 +1,7 @@
-"""`python -m qgs` is the command `qgs`; launchers such as torchrun start it by this name."""
+"""Entry point of `python -m qgs`, the same as the command `qgs`.
+
+Launchers such as torchrun start modules.
+"""
 
 from qgs.cli import main
 

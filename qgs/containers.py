@@ -1,4 +1,4 @@
-"""Base of tensor containers, with checks of shapes, iteration and mapping over tensors."""
+"""Base class of tensor containers; functions that check shapes, list, map and join tensors."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -12,25 +12,25 @@ _DIGITS = {str(size): size for size in range(10)}
 
 
 class TensorContainer:
-    """A frozen dataclass of tensors, containers and mappings of them."""
+    """Base of frozen dataclasses whose fields are tensors, containers, or mappings of these."""
 
     def __init_subclass__(cls) -> None:
-        """Give every class this `__repr__`; `dataclass` then keeps it."""
+        """Set `__repr__` on every subclass, so that `dataclass` does not write one."""
         cls.__repr__ = TensorContainer.__repr__
 
     def __repr__(self) -> str:
-        """Return shapes, types and devices, without values."""
+        """Return shapes, dtypes and devices of the tensors, without values."""
         # Values of a million Gaussians would not help.
         parts = [f"{n}: {tuple(x.shape)} {x.dtype} {x.device}" for n, x in named_tensors(self)]
         lines = "\n  ".join(["", *parts])
         return f"{type(self).__name__}({lines}\n)"
 
     def replace(self, **changes: Any) -> Self:
-        """Return a new container with other values in some fields."""
+        """Return a copy of the container in which the fields in `changes` are replaced."""
         return replace(cast(Any, self), **changes)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """Apply `Tensor.to` to every tensor; a dtype also converts geometry."""
+        """Apply `Tensor.to` to every tensor. A dtype converts cameras and other geometry too."""
         return map_tensors(lambda x: x.to(*args, **kwargs), self)
 
 
@@ -56,14 +56,14 @@ def map_tensors(function: Callable[[Tensor], Any], value: Any) -> Any:
 
 
 def concatenated(parts: Sequence[_C], dim: int) -> _C:
-    """Concatenate the tensors of all `parts`, containers or tuples of containers, along `dim`.
+    """Concatenate equal tensors of all `parts`, containers or tuples of containers, along `dim`.
 
-    Raises ValueError if one part has a tensor that another one lacks.
+    Raises ValueError if a tensor is in some parts and missing (None) in others.
     """
     found = [dict(named_tensors(part)) for part in parts]
     for other in found:
         if some := sorted(other.keys() ^ found[0].keys()):
-            raise ValueError(f"all or none must have {', '.join(some)}")
+            raise ValueError(f"{', '.join(some)} must be in all parts or in none")
     # `map_tensors` comes to the tensors in the order of their names.
     names = iter(found[0])
 
@@ -75,7 +75,10 @@ def concatenated(parts: Sequence[_C], dim: int) -> _C:
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
-    """Yield all tensors that `map_tensors` finds, with dotted names. name: the name of `value`."""
+    """Yield the dotted name and the tensor for all tensors that `map_tensors` finds in `value`.
+
+    name: start of all names.
+    """
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, TensorContainer | Mapping | list | tuple):
@@ -95,8 +98,8 @@ def check_shapes(
 ) -> None:
     """Raise ValueError unless the fields of `container` have `shapes`, such as "B N 3".
 
-    A letter stands for the same size wherever it occurs, "..." for the same leading axes. `known`
-    has the sizes of some letters. Fields that are None pass.
+    A letter stands for the same size in all fields, "..." for the same leading axes. known: sizes
+    of letters that are known beforehand. Fields that are None are not checked.
     """
     sizes: dict[str, Any] = {**_DIGITS, **(known or {})}
     for name, spec in shapes.items():

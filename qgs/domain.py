@@ -1,6 +1,6 @@
-"""Trained range of views, and checks of other views against it.
+"""The range of cameras that a model was trained on, and checks of new cameras against this range.
 
-It compares only cameras in the model's frame, so it works for any data.
+Only cameras in the model's frame are compared, not images, so this works for any data.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from qgs.geometry.poses import look_at_depth
 from qgs.types import Cameras
 
 OUTLIERS = 0.05
-"""Fraction of values ignored at each end of a range, such as depths of parallel axes."""
+"""Fraction of values that is ignored at each end of a range, because there may be outliers."""
 TOLERANCE = 1.25
-"""Factor by which views may leave the trained range without counting as outside."""
+"""Factor by which a value may exceed the trained range and still count as inside."""
 KEY = "trained_on"
-"""Key of `Domain.text` in the extra metadata of a checkpoint."""
+"""Key under which a checkpoint's metadata stores `Domain.text`."""
 
 WORDS = {
     "views": "there are {} input views",
@@ -30,20 +30,24 @@ WORDS = {
     "depth": "the point they look at is {} away",
     "fov": "their field of view is {} degrees wide",
 }
-"""Measurements of a sample, as phrases; lengths are in the model's units."""
+"""Names of the measurements of a sample, each with a phrase; lengths are in the model's units."""
 REMEDY = "try another scale of the world, other input views, or train on views like these"
-"""Advice for bringing views into the trained range."""
+"""Advice for views outside of the trained range."""
 
 
 @dataclass
 class Domain:
-    """Measurements over `samples` samples, by the names in WORDS; only two ends after loading."""
+    """Measurements of the cameras of `samples` samples.
+
+    values: all measured values, by the names in WORDS. A domain that was loaded from a checkpoint
+    has only the smallest and largest value of each range.
+    """
 
     values: dict[str, list[float]] = field(default_factory=dict)
     samples: int = 0
 
     def see(self, inputs: Cameras, targets: Cameras) -> None:
-        """Add a sample: cameras (1, V_in) and (1, V_out) in the model's frame."""
+        """Measure a sample and add the values. Cameras are (1, V), in the model's frame."""
         # In float32 a cosine near 1 is off by angles of 0.02 degrees.
         c2w = inputs.c2w[0].double()
         measured = {"views": [float(len(c2w))]}
@@ -67,7 +71,7 @@ class Domain:
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Range (least, largest) by name, without the OUTLIERS at each end."""
+        """Smallest and largest value by name, without the fraction OUTLIERS at each end."""
         found = {}
         for name, values in self.values.items():
             left_out = int(OUTLIERS * len(values))
@@ -87,7 +91,10 @@ class Domain:
 
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Domain:
-        """Return the domain of a parsed `text`; raise ValueError, TypeError or KeyError."""
+        """Return the domain of a parsed `text`.
+
+        Raises ValueError, TypeError or KeyError for damaged content.
+        """
         domain = cls(samples=int(plain["samples"]))
         for name, (low, high) in plain["ranges"].items():
             ends = [math.inf if end is None else float(end) for end in (low, high)]
@@ -98,7 +105,7 @@ class Domain:
         return domain
 
     def differences(self, found: Domain) -> dict[str, str]:
-        """Describe, by name, each range in which `found` leaves the trained range."""
+        """Return a phrase, by name, for each measurement of `found` outside of this domain."""
         phrases: dict[str, str] = {}
         seen = found.ranges
         for name, trained in self.ranges.items():
@@ -110,9 +117,9 @@ class Domain:
 
 
 def verdict(trained: Domain, found: Domain) -> str:
-    """Compare views with the training views in a sentence, with advice if they differ.
+    """Return a sentence on whether cameras lie in the trained range, with advice if they do not.
 
-    trained: the domain of the training; empty if unknown.
+    trained: the domain of the training; empty if it is unknown. found: the domain of the cameras.
     """
     if not trained.values:
         return "the checkpoint does not record the views on which this model was trained"
@@ -128,6 +135,6 @@ def verdict(trained: Domain, found: Domain) -> str:
 
 
 def _shown(values: tuple[float, float]) -> str:
-    """Return a range as text, three digits."""
+    """Return a range as text, with three digits."""
     low, high = (f"{value:.3g}" if math.isfinite(value) else "infinitely far" for value in values)
     return low if low == high else f"{low} to {high}"

@@ -1,4 +1,4 @@
-"""Entry points, found in the metadata of installed distributions."""
+"""Loading of entry points, found in the metadata of installed distributions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 INSTALL_ALL = 'run `pip install "query-gaussians[all]"`, which has all plug-ins of this project'
-"""Advice for a missing part of another distribution."""
+"""Advice in messages about a missing plug-in."""
 
 
 class ExtensionError(ValueError):
@@ -19,9 +19,9 @@ class ExtensionError(ValueError):
 
 
 def installed(group: str) -> tuple[EntryPoint, ...]:
-    """Return the entry points of `group`, with those installed since the last call.
+    """Return the entry points of `group`, including distributions installed since the last call.
 
-    It imports nothing.
+    No distribution is imported.
     """
     # Reading all metadata takes some 10 ms, so that it is repeated only after a change of sys.path.
     searched = [path for path in sys.path if os.path.exists(path)]

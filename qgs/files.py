@@ -1,4 +1,4 @@
-"""Atomic writes of files and folders; files of JSON records."""
+"""Atomic writing of files and folders, and reading of files of JSON records."""
 
 import errno
 import json
@@ -23,10 +23,10 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, which it replaces when the block ends well.
+    """Yield a temporary path to write to; its file replaces `path` when the block ends well.
 
-    Makes missing parent folders; the file gets the usual permissions whatever wrote it. The new
-    file is on the disk before it replaces the old one, which stays where the block raises.
+    If the block raises, `path` stays unchanged. Missing parent folders are made. The new file gets
+    the usual permissions, and is on the disk before it replaces the old one.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def naming_full_disk(path: Path) -> Iterator[None]:
-    """Turn an error for lack of disk space into an OSError with `path` and the remedy."""
+    """Turn an error for lack of disk space in the block into an OSError with `path` and advice."""
     try:
         yield
     except OSError as error:
@@ -58,13 +58,14 @@ def naming_full_disk(path: Path) -> Iterator[None]:
             raise
         free = shutil.disk_usage(path.parent).free
         raise OSError(
-            f"{path} could not be written ({error.strerror}); {decimal(free)} are free. Earlier "
-            "files are whole: free space and repeat the command, a training with --resume"
+            f"{path} could not be written ({error.strerror}): only {decimal(free)} of disk space "
+            "are left. Please free space and repeat the command; continue a training with "
+            "--resume. Earlier files are undamaged"
         ) from error
 
 
 def is_leftover(path: Path) -> bool:
-    """Return whether `path` is the temporary file of `replacing` or of safetensors (.tmpXXXXXX)."""
+    """Return whether `path` is a temporary file of `replacing` or of safetensors (.tmpXXXXXX)."""
     name = r"\..+\.\d+\.tmp|\.tmp[A-Za-z0-9]{6}"
     return bool(re.fullmatch(name, path.name)) and path.is_file()
 
@@ -82,9 +83,10 @@ def _synchronise(path: Path) -> None:
 def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Path]:
     """Yield a temporary folder whose entries move into `folder` when the block ends well.
 
-    An entry takes the place of all that was under its name, folders included; what else `folder`
-    holds stays. When the block raises, `folder` stays as it was. mark: the entry of earlier
-    results; FileExistsError where one would replace what lies in a folder without it.
+    An entry replaces the file or folder of the same name; all other entries of `folder` stay. If
+    the block raises, `folder` stays unchanged.
+    mark: name of an entry that every earlier result has. Raises FileExistsError if an entry would
+    be replaced and `folder` has no entry `mark`.
     """
     target = Path(folder)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -98,7 +100,7 @@ def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Pat
         names = sorted(entry.name for entry in fresh.iterdir())
         there = [name for name in names if (target / name).exists()]
         if there and mark not in there:
-            what = f"{target} holds {listed(there)}, of no earlier result"
+            what = f"{target} holds {listed(there)}, which are no earlier result"
             raise FileExistsError(f"{what}: choose another folder")
         try:
             for name in names:
@@ -116,22 +118,22 @@ def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Pat
 
 
 def refuse_existing(target: Path) -> None:
-    """Raise FileExistsError if `path` exists."""
+    """Raise FileExistsError if `target` exists, or is a link to a missing file."""
     if target.exists() or target.is_symlink():
         raise FileExistsError(f"{target} exists and is never overwritten; choose another name")
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write `text` as UTF-8 to `path`, whole or not at all."""
+    """Write `text` as UTF-8 to `path`, completely or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
-    """Return the records of `path` with a "step"; none when the file does not exist.
+    """Read JSON records, one on each line, that have a "step"; none if `path` does not exist.
 
-    Damaged lines are skipped with a warning, an unfinished last line silently: a killed process
-    leaves one.
+    Damaged lines are skipped with a warning. An unfinished last line, which a killed process
+    leaves, is skipped without one.
     """
     if not path.is_file():
         return []

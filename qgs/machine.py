@@ -1,4 +1,4 @@
-"""Memory and cores of this machine: available bytes, errors for too little, work in threads."""
+"""Memory and cores of this machine: available memory, errors for lack of it, work in threads."""
 
 import os
 import sys
@@ -14,11 +14,14 @@ from rich.filesize import decimal
 
 
 class TooLargeError(ValueError):
-    """Error for a request that does not fit into memory; the message has the numbers."""
+    """Error for a request that does not fit into memory."""
 
 
 def refuse_more_than_memory(what: str, needed: int, advice: str) -> None:
-    """Raise TooLargeError if `needed` bytes, a lower bound, exceed the available memory."""
+    """Raise TooLargeError if `needed` bytes, a lower bound, exceed the available memory.
+
+    what: the request, as the subject of the message. advice: a sentence at the end.
+    """
     limit = available_bytes()
     if needed > limit:
         raise TooLargeError(
@@ -28,7 +31,10 @@ def refuse_more_than_memory(what: str, needed: int, advice: str) -> None:
 
 
 def available_bytes() -> int:
-    """Return the bytes that this process can still use, limited by machine and control group."""
+    """Return the bytes of memory that this process can still use.
+
+    The memory of the machine and the limit of the process's control group (container) count.
+    """
     limits = [sys.maxsize]
     with suppress(OSError, ValueError, KeyError):  # not on Linux
         sizes = _numbers(Path("/proc/meminfo"))

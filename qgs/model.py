@@ -1,4 +1,4 @@
-"""The model: an encoder of views, queries in decoder layers, and a head for Gaussians."""
+"""The model: an encoder of views, decoder layers that update queries, and a head for Gaussians."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, cast
@@ -36,12 +36,12 @@ from qgs.types import (
 class QueryGaussianModel(nn.Module):
     """A model that turns photos into the Gaussians of its queries, in one forward pass.
 
-    refinements: the different refinements; layers may share one. `refinement_of` has the index for
-        each decoder layer.
+    refinements: the distinct refinement modules; layers may share one. `refinement_of` has the
+        index of the refinement for each decoder layer.
     recipe: the resolved recipe of this model; None for a model built by hand.
-    releases: plugins of that recipe, like `Recipe.releases`, as imported when it was built.
-    trained_on: statistics of the training views from its checkpoint, or None.
-    loaded_from: the absolute path of its checkpoint, for `qgs.load`; "" if it was not loaded.
+    releases: distribution and version of the recipe's plugins when the model was built.
+    trained_on: range of the training's cameras, from the checkpoint; None if it is unknown.
+    loaded_from: absolute path of the checkpoint that `qgs.load` read; "" for other models.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class QueryGaussianModel(nn.Module):
 
     @property
     def depth(self) -> int:
-        """Number of decoder layers that an evaluation runs, including rounds of feedback."""
+        """Number of decoder layers that an evaluation runs, with those repeated by feedback."""
         return len(self.decoder) + self.feedback.rounds * self.feedback.layers
 
     def forward(
@@ -92,8 +92,8 @@ class QueryGaussianModel(nn.Module):
     ) -> Prediction:
         """Reconstruct every scene of `views`, whose cameras are in the model's world.
 
-        layers: see `predict`. state: the initial state; None uses the state of the queries.
-        Raises ValueError for photos without cameras if encoder, queries or feedback read cameras.
+        layers: see `predict`. state: the initial query state; None computes it by `queries`.
+        Raises ValueError for `Photos` if encoder, queries or feedback read cameras.
         """
         # NumPy's cameras are float64, the weights hardly ever.
         views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))
@@ -105,7 +105,7 @@ class QueryGaussianModel(nn.Module):
         return self.predict(views, memory, initial, layers)
 
     def _without_cameras(self, photos: Photos) -> Views:
-        """Return `photos` for parts that read no cameras; raise ValueError if one does."""
+        """Return `photos` typed as Views; raise ValueError if a part of the model reads cameras."""
         readers = [
             type(part).__name__
             for part in (self.encoder, self.queries, self.feedback)
@@ -131,11 +131,12 @@ class QueryGaussianModel(nn.Module):
 
         views, memory: the encoder's input and output.
         state: the queries before the first layer, for the same scenes.
-        layers: numbers of further layers to decode, besides the last layer of the decoder and of
-            each round. 1 is the first layer; layers of rounds get the following numbers. 0 is the
-            initial state, only in a decoder of depth 0. None: the supervised layers in training, no
-            further ones in evaluation.
-        Raises ValueError for a layer that does not exist and for another number of scenes.
+        layers: numbers of layers to decode, in addition to the last layer of the decoder and of
+            each feedback round. 1 is the first layer; layers that rounds repeat get the following
+            numbers. 0 is the initial state, only in a decoder of depth 0. None stands for the
+            supervised layers in training, and for no additional layers in evaluation.
+        Raises ValueError for a layer that does not exist, and if `memory` and `state` have
+        different numbers of scenes.
         """
         if layers is None:
             layers = self.supervision.weights().keys() if self.training else ()
@@ -186,5 +187,5 @@ class QueryGaussianModel(nn.Module):
     def render(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render (B, G) Gaussians from (B, V) cameras, see `qgs.contracts.Renderer`."""
+        """Render Gaussians (B, G) from cameras (B, V), see `qgs.contracts.Renderer`."""
         return self.renderer(gaussians, cameras, background)

@@ -1,4 +1,4 @@
-"""Local paths, fsspec URLs, and zip archives that are read in place."""
+"""Reading of files at local paths, at fsspec URLs, and inside zip archives."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from upath import UPath
 from qgs.terminal import without_secrets
 
 LARGEST = 500_000_000
-"""Largest file that is read as a whole, in bytes; fits an uncompressed 120-megapixel photo."""
+"""Largest file in bytes that is read as a whole; an uncompressed 120-megapixel photo fits."""
 
 # Parsed JSON may take forty times as much memory.
 _LARGEST_JSON = 50_000_000
@@ -23,7 +23,7 @@ _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplement
 
 
 def opened_path(path: str | Path | UPath) -> UPath:
-    """Return `path`, a URL or local, as a UPath. Raises ValueError for an unusable file system."""
+    """Return a local path or URL as a UPath; raise ValueError for an unusable file system."""
     try:
         url = UPath(path)
         # The package of a file system may be missing, and its constructor may raise anything.
@@ -37,7 +37,7 @@ def opened_path(path: str | Path | UPath) -> UPath:
 
 
 def is_local(path: Path | UPath) -> bool:
-    """Return whether the system can open `path` by its name, as torch and zipfile do."""
+    """Return whether `path` is local, so that libraries such as torch can open it by name."""
     return isinstance(path, Path)
 
 
@@ -50,7 +50,7 @@ def listing(folder: UPath) -> list[UPath]:
 
 
 def open_file(path: Path | UPath) -> IO[bytes]:
-    """Open `path` for reading bytes. Raises OSError. A remote file is read whole by `read_file`."""
+    """Open `path` for reading bytes; a remote file is read as a whole first. Raises OSError."""
     if not is_local(path):
         # Decoders seek often, and each seek would be a request to the server.
         return io.BytesIO(read_file(path))
@@ -61,7 +61,7 @@ def open_file(path: Path | UPath) -> IO[bytes]:
 
 
 def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
-    """Return the bytes of `path`. Raises OSError for over `most` bytes or a damaged archive."""
+    """Return the bytes of `path`; raise OSError for more than `most` bytes or a damaged archive."""
     # Held while it is read: a thread that uses `path` at the same moment may replace its archive,
     # which closes once nobody holds it.
     system: Any = getattr(path, "fs", None)
@@ -79,8 +79,8 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
 def read_json(path: UPath, fix: str) -> Any:
     """Return the content of a JSON file.
 
-    fix: the remedy for the error message. Raises ValueError if the file is not JSON, and the
-    OSErrors of `read_file`.
+    fix: advice at the end of the error message. Raises ValueError if the file is not JSON, and the
+    errors of `read_file`.
     """
     content = read_file(path, _LARGEST_JSON)
     try:

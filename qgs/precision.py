@@ -1,4 +1,4 @@
-"""Precision of a model's computation: autocast, and float32 or better for geometry."""
+"""Precision of a model's computation: autocast, and at least float32 for geometry."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -16,13 +16,14 @@ HALF = (torch.float16, torch.bfloat16)
 
 
 Precision: TypeAlias = Literal["float32", "bf16"]
-"""Values of `training.precision` and of the precision in `qgs bench`. Weights stay float32."""
+"""Precisions for `training.precision` and `qgs bench`. Weights are float32 in both."""
 
 
 def autocast(precision: Precision, device: str) -> torch.autocast:
-    """Return the context that makes a model compute in `precision`; geometry leaves it by itself.
+    """Return the context in which a model computes in `precision`.
 
-    bfloat16 has the exponents of float32, so gradients need no scaling.
+    Functions on geometry stay in float32 by `full_precision`. bfloat16 has the same exponents as
+    float32, so gradients need no scaling.
     """
     return torch.autocast(device, torch.bfloat16, enabled=precision == "bf16")
 
@@ -35,9 +36,9 @@ def at_least_float32(x: Tensor) -> Tensor:
 def full_precision(function: F) -> F:
     """Run `function` outside autocast, with half-precision tensor arguments raised to float32.
 
-    `qgs.containers.map_tensors` finds the tensors. Arguments without a half-precision tensor are
-    passed on unchanged. A raised ImageMemory is a copy, and its `once` starts empty. float64 stays
-    float64, so that gradient checks work.
+    Tensors inside containers, mappings, lists and tuples are raised too. Arguments without a
+    half-precision tensor are passed on unchanged. A raised ImageMemory is a copy whose cache (see
+    `once`) is empty. float64 stays float64, so that gradient checks work.
     """
 
     @wraps(function)

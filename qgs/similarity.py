@@ -21,11 +21,11 @@ Padding: TypeAlias = Literal["same", "valid"]
 
 
 def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1.0) -> Tensor:
-    """Return SSIM around every pixel of images (..., H, W) in [0, 1]: eq. 13, Gaussian window.
+    """Return the SSIM (eq. 13) of x and y in a Gaussian window around every pixel.
 
-    padding: "same" pads with zeros, as the releases do; "valid" uses only windows inside the image.
-    "valid" raises ValueError for images smaller than a window. correction: factor of the variances
-    and the covariance.
+    x, y: images (..., H, W) in [0, 1]. padding: "same" pads with zeros, as the TokenGS and LocusGS
+    releases do. "valid" uses only windows inside the image, and raises ValueError for images
+    smaller than a window. correction: factor of the variances and the covariance.
     """
     height, width = x.shape[-2:]
     if padding == "valid" and min(height, width) < WINDOW:
@@ -48,7 +48,7 @@ def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1
 
 @full_precision
 def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
-    """Return the mean of `similarity_map`, 0-d; on a CPU a kernel takes a tenth of the time."""
+    """Return the mean of `similarity_map` (0-d), on a CPU by a kernel if possible, for speed."""
     # Subclasses that torch uses to count or trace hold no numbers and cannot become arrays.
     plain = type(images) is type(truth) is Tensor and images.is_cpu
     single = images.dtype == truth.dtype == torch.float32
@@ -58,7 +58,7 @@ def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
 
 
 class _Mean(torch.autograd.Function):
-    """Mean SSIM of images and truth (..., H, W) over whole images, with zero padding."""
+    """Mean SSIM of images and truth (..., H, W) with zero padding, computed by a CPU kernel."""
 
     @staticmethod
     def forward(ctx: Any, images: Tensor, truth: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Safe standard output and error: no control characters, no passwords; tables and lines."""
+"""Terminal output without control characters and passwords; printing of tables and lines."""
 
 import re
 import sys
@@ -18,17 +18,20 @@ _TOKEN = (
 
 
 def without_secrets(text: str) -> str:
-    """Return `text` with *** for users, passwords, tokens and signatures in URLs."""
+    """Return `text` with *** in place of users, passwords, tokens and signatures in URLs."""
     return re.sub(_TOKEN, r"\1***", re.sub(_USER, "***@", text))
 
 
 def shown(text: str) -> str:
-    r"""Return `text` `without_secrets`, with control characters escaped, such as \x1b, \u202e."""
+    r"""Return `text` without secrets and with control characters escaped, such as \x1b, \u202e."""
     return re.sub(_RAW, lambda found: ascii(found[0])[1:-1], without_secrets(text))
 
 
 class _Shown:
-    """Text stream that writes `shown` text. rich_proxied_file: for Rich, which adds codes."""
+    """Text stream that passes all text through `shown` before it is written.
+
+    rich_proxied_file: the original stream, to which Rich writes its own control codes.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self.rich_proxied_file = stream
@@ -47,7 +50,7 @@ class _Shown:
 
 
 def show_safely() -> None:
-    """Pass everything that this process prints from now on through `shown`; Rich still colours."""
+    """Pass everything that this process prints from now on through `shown`; keep Rich's colours."""
     import rich.text
 
     # Rich calls this on all text that it draws.
@@ -61,7 +64,10 @@ def show_safely() -> None:
 def print_table(
     console: Console, title: str, rows: Sequence[Sequence[str]], **options: Any
 ) -> None:
-    """Print a table. rows: headers first; all but the first column align right. options: Rich's."""
+    """Print a table whose columns align right, except the first.
+
+    rows: the headers, then the cells of each row. options: arguments of Rich's `Table`.
+    """
     table = Table(title=escape(title) or None, title_justify="left", **options)
     for place, header in enumerate(rows[0]):
         table.add_column(header, justify="right" if place else "left", overflow="fold")

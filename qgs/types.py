@@ -2,10 +2,10 @@
 
 Axes: B scenes, V views, H x W pixels, N queries, K Gaussians per query, G = N*K Gaussians,
 M image tokens, D width, h heads, d = D/h. Model code ends the names of tensors with their axes,
-such as `x_BND`; a digit is a fixed size. Fields of containers and arguments that a contract names
+such as `x_BND`; a digit is a fixed size. Fields of containers and arguments named by a contract
 have no such ending.
 
-Frames: "world" is the frame of the first input camera after poses are normalised; cameras are
+Frames: "world" is the model's frame, by default that of the first input camera; cameras are
 OpenCV (x right, y down, z forward).
 
 Containers are frozen. A component returns a new container and never changes its inputs.
@@ -49,7 +49,7 @@ class Cameras(TensorContainer):
 
     @property
     def shape(self) -> torch.Size:
-        """Batch shape, usually (B, V)."""
+        """Shape of the batch of cameras, usually (B, V)."""
         return self.c2w.shape[:-2]
 
     @property
@@ -86,9 +86,9 @@ class Views(TensorContainer):
 
     masks: (B, V, 1, H, W) in [0, 1], 1 on the object to reconstruct; None without masks.
     times: (B, V), time of each photo; None for static scenes.
-    target_time: (B, 1), time at which to reconstruct the scene.
-    depths: (B, V, 1, H, W), camera-frame z in world units, 0 where unknown; None without maps, or
-        if no loss reads them.
+    target_time: (B, 1), time at which to reconstruct the scene; None for static scenes.
+    depths: (B, V, 1, H, W), camera-frame z in world units, 0 where unknown; None without depth
+        maps, or if no loss reads them.
     """
 
     images: Tensor
@@ -106,20 +106,20 @@ class Views(TensorContainer):
         _check_unit_images(self)
 
     def select(self, index: Any) -> Self:
-        """Select the views at `index` (a slice or a list of ints) of every scene; keep the time."""
+        """Select the views at `index` (slice or list of ints) of every scene; keep target_time."""
         # All parts but the time have the views as their second axis.
         chosen = map_tensors(lambda x: x[:, index], self.replace(target_time=None))
         return chosen.replace(target_time=self.target_time)
 
     def joined(self, other: Self) -> Self:
-        """Append `other` views of the same scenes, with the same image size and the same parts."""
+        """Append `other` views of the same scenes; image size and present fields must be equal."""
         both = concatenated([x.replace(target_time=None) for x in (self, other)], 1)
         return both.replace(target_time=self.target_time)
 
 
 @dataclass(frozen=True)
 class ImageMemory(TensorContainer):
-    """Output of the encoder for the decoder: M tokens and their properties.
+    """Image memory, the encoder's output for the decoder: M tokens and their properties.
 
     features: (B, M, C), for components that project their own keys and values; C is the model's
         width D, or another width of the encoder.
@@ -157,11 +157,11 @@ class ImageMemory(TensorContainer):
         return part
 
     def once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
-        """Return `compute()`, computed for the first layer and cached for the other layers.
+        """Return `compute()`, computed in the first decoder layer and cached for later layers.
 
-        `compute` must read only this memory. Start `name` with your plugin's name. Copies of the
-        memory start with an empty cache. A result from a call without gradients, or in inference
-        mode, is computed again for a call with gradients.
+        name: key of the cache; start it with your plugin's name. `compute` must read only this
+        memory. Copies of the memory start with an empty cache. Results without gradients, or from
+        inference mode, are not used for calls with gradients.
         """
         # What was made without gradients is of no use to a pass that needs them.
         key = (name, torch.is_grad_enabled(), torch.is_inference_mode_enabled())
@@ -174,9 +174,9 @@ class ImageMemory(TensorContainer):
 class QueryState(TensorContainer):
     """The state of every query: features (B, N, D) and named fields (B, N, ...).
 
-    mask: (B, N) bool, False for empty places, if scenes of a batch have different numbers of
-        queries; None if all places hold queries. Values at empty places are finite, no query reads
-        them, and their Gaussians have opacity 0.
+    mask: (B, N) bool, for scenes with different numbers of queries; False marks padding. None: no
+        padding. Values of padding are finite, no query reads them, and the Gaussians of padding
+        have opacity 0.
     """
 
     features: Tensor
@@ -202,7 +202,7 @@ class QueryState(TensorContainer):
         return name in self.fields
 
     def replace(self, **changes: Any) -> Self:
-        """Return a new state; `fields` are added to the present ones or replace them."""
+        """Return a changed copy. `fields` extends its fields and replaces those of equal name."""
         fields = {**self.fields, **changes.pop("fields", {})}
         return super().replace(fields=fields, **changes)
 
@@ -217,17 +217,18 @@ _OF_GAUSSIANS = {
 }
 
 SH_COUNTS = (3, 8, 15)
-"""Counts of spherical-harmonic coefficients for degrees 1 to 1, 2 or 3; `colors` is degree 0."""
+"""Numbers of spherical-harmonic coefficients for degrees 1 to 1, 1 to 2 and 1 to 3; degree 0 is
+`colors`."""
 
 
 def _check_gaussians(container: Any, **shapes: str) -> None:
-    """Raise ValueError for wrong shapes of the common fields of Gaussians, or of `shapes`."""
+    """Raise ValueError for wrong shapes of the common fields of Gaussians and those in `shapes`."""
     check_shapes(container, **shapes, **_OF_GAUSSIANS)
     sh = container.sh
     if sh is not None and sh.shape[-2] not in SH_COUNTS:
         raise ValueError(
             f"{type(container).__name__}.sh has {sh.shape[-2]} coefficients per Gaussian; give 3, "
-            "8 or 15, those of degrees 1 to 3 (degree 0 is `colors`)"
+            "8 or 15, for degrees from 1 to 1, 2 or 3 (degree 0 is `colors`)"
         )
 
 
@@ -238,7 +239,8 @@ class GaussianAttributes(TensorContainer):
     offsets: (B, N, K, 3) raw, before any activation; a `centers` component turns them into means.
     scales: (B, N, K, 3) positive, world units. quats: (B, N, K, 4) unit, w x y z.
     opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1], even if `sh` is set.
-    sh: (B, N, K, C, 3), features: (B, N, K, F), see `Gaussians`; None for none.
+    sh: (B, N, K, C, 3), see `Gaussians`. features: (B, N, K, F), see `Gaussians`. Either may be
+        None.
     """
 
     offsets: Tensor
@@ -259,10 +261,11 @@ class Gaussians(TensorContainer):
 
     means: (B, G, 3) world. scales: (B, G, 3) standard deviations, world units.
     quats: (B, G, 4) unit, w x y z. opacities: (B, G). colors: (B, G, 3) RGB.
-    sh: (B, G, C, 3) coefficients of real spherical harmonics in the world frame, RGB, of degrees 1
-        to 1, 2 or 3 (C = 3, 8, 15) in the order of `qgs.geometry.harmonics`. Seen along the
-        direction d, the colour is max(colors + sum_i Y_i(d) sh_i, 0). None: `colors` everywhere.
-    features: (B, G, F) other values to render, over 0; None for none.
+    sh: (B, G, C, 3) RGB coefficients of real spherical harmonics in the world frame, for degrees 1
+        to 1, 2 or 3 (C = 3, 8 or 15), in the order of `qgs.geometry.harmonics`. Seen along the
+        direction d, the colour is max(colors + sum_i Y_i(d) sh_i, 0) with the harmonics Y_i. None:
+        the colour is `colors` from all directions.
+    features: (B, G, F) further values to render, over a background of 0; None if there are none.
     """
 
     means: Tensor
@@ -285,7 +288,7 @@ class Gaussians(TensorContainer):
         return map_tensors(lambda x: x[index], self)
 
     def most_opaque(self, count: int) -> Self:
-        """Return the `count` most opaque Gaussians of each scene, or all, in their order."""
+        """Return the `count` most opaque Gaussians of each scene in their order; all if fewer."""
         # Sorted again, so that files keep the order of the queries.
         chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
 
@@ -303,9 +306,9 @@ class Gaussians(TensorContainer):
 class Rendering(TensorContainer):
     """Rendered images: rgb (B, V, 3, H, W), alpha and depth (B, V, 1, H, W).
 
-    `rgb` is over the background. `alpha` is in [0, 1]. `depth` is the expected camera-frame z,
-    sum(w z) / sum(w), or 0 where no Gaussian was hit. `features` (B, V, F, H, W) are sum(w f), over
-    0; None for Gaussians without features.
+    With the weight w of each Gaussian at a pixel: `rgb` is blended over the background. `alpha` is
+    sum(w), in [0, 1]. `depth` is the mean camera-frame z, sum(w z) / sum(w), or 0 where no Gaussian
+    was hit. `features` (B, V, F, H, W) is sum(w f); None for Gaussians without features f.
     """
 
     rgb: Tensor
@@ -320,9 +323,9 @@ class Rendering(TensorContainer):
 
 @dataclass(frozen=True)
 class SpatialSupport(TensorContainer):
-    """Spatial support of queries, for pictures: an ellipsoid per query.
+    """Spatial support of queries, to visualise: an ellipsoid per query.
 
-    centers: (B, N, 3) world. axes: (B, N, 3, 3), its semi-axes as columns, world units.
+    centers: (B, N, 3) world frame. axes: (B, N, 3, 3), semi-axes as columns, in world units.
     """
 
     centers: Tensor
@@ -342,10 +345,10 @@ class LayerPrediction(TensorContainer):
 
 @dataclass(frozen=True)
 class Prediction(TensorContainer):
-    """Output of a forward pass: Gaussians and state of the last layer, and of all decoded layers.
+    """Output of a forward pass: Gaussians and query state of the last layer.
 
-    layers: LayerPrediction by ascending layer number. 1 is the first layer; 0 is the initial state,
-        only in a decoder of depth 0.
+    layers: prediction of each decoded layer, by ascending layer number. 1 is the first layer; 0 is
+        the initial state, only in a decoder of depth 0.
     """
 
     gaussians: Gaussians

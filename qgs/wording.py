@@ -1,4 +1,4 @@
-"""Wording of messages and tables."""
+"""Functions that word parts of messages and tables."""
 
 import logging
 import os
@@ -11,9 +11,9 @@ _log = logging.getLogger(__name__)
 
 
 def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
-    """List the first `most` of `names`, and the number of further ones; "" for none.
+    """Join the first `most` of `names` to a text, with the number of the rest, "and 3 more".
 
-    Long names are cut, names with unprintable characters are escaped.
+    The text is "" without names. Long names are cut; names with unprintable characters are escaped.
     """
     shown = [*map(str, names)]
     more = f" and {len(shown) - most} more" if len(shown) > most else ""
@@ -21,12 +21,12 @@ def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
 
 
 def numbered(frame: int, name: str) -> str:
-    """Return a frame's number and photo, such as "3 (images/0004.png)"; "3" without a name."""
+    """Return a frame's number and name, such as "3 (images/0004.png)", or "3" without a name."""
     return f"{frame} ({name})" if name not in ("", str(frame)) else str(frame)
 
 
 def counted(number: int, what: str) -> str:
-    """Return a number with its noun, such as "1 thread" or "12 threads"."""
+    """Return a number with the noun `what`, such as "1 thread" or "12 threads"."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
@@ -37,7 +37,11 @@ def name_shown(name: str, most: int = 500) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """Return an exception on one line, without its type if the message is for users."""
+    """Return an exception's message as one line.
+
+    The exception's type is added, except for ValueError and FileNotFoundError, whose messages are
+    written for users.
+    """
     message = " ".join(str(error).split())
     if isinstance(error, ValueError | FileNotFoundError) and message:
         return message
@@ -57,13 +61,16 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
 
 
 def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
-    """Return a fix for a message: the nearest choice, or the list of choices."""
+    """Return advice for a message: the choice nearest to `word`, or else the list of choices.
+
+    noun: what the choices are, such as "components"; it starts the list.
+    """
     near = nearest(word, choices)
     return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices), 30) or 'none'}"
 
 
 def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Return names of models or recipes without the folders that they share and suffixes."""
+    """Return names of models or recipes: paths without their common folder and without suffix."""
     files = [os.path.abspath(path) for path in paths]
     shared = os.path.commonpath([os.path.dirname(file) for file in files])
     suffix = r"\.(ya?ml|safetensors)$"

@@ -1,1 +1,1 @@
-"""Pictures and figures."""
+"""Pictures (arrays of pixels) and Matplotlib figures."""

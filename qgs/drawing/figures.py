@@ -1,4 +1,4 @@
-"""Style of all figures, and grids of pictures with a depth scale."""
+"""Matplotlib style of all figures, and figures of picture grids with a depth scale."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -18,12 +18,12 @@ COLUMN_INCHES = 1.9
 
 
 def figure_style() -> AbstractContextManager[None]:
-    """Return Matplotlib settings of every figure, for the `with` block only."""
+    """Return a context manager that sets the Matplotlib style of all figures within its block."""
     return style.context(Path(__file__).with_name("figures.mplstyle"))
 
 
 def figure_picture(figure: Figure, dpi: int = 120) -> Picture:
-    """Return the figure as a picture."""
+    """Render a figure to a picture (H, W, 3)."""
     buffer = BytesIO()
     with figure_style():
         figure.savefig(buffer, format="png", dpi=dpi)
@@ -35,9 +35,10 @@ def grid_figure(
     columns: Sequence[str],
     depths: tuple[float, float] | None = None,
 ) -> Figure:
-    """Draw rows of pictures under column titles.
+    """Draw a grid of pictures, with titles above the columns.
 
-    depths: range of a depth scale beside the last row; None for no scale.
+    rows: pictures of each row, by the row's label. columns: titles. depths: (near, far) of a depth
+    scale beside the last row; None draws no scale.
     """
     height, width, _ = next(iter(rows.values()))[0].shape
     row_inches = COLUMN_INCHES * height / width

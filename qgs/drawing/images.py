@@ -1,4 +1,4 @@
-"""Pictures (H, W, 3) uint8 of RGB, depth and other values; PNG and GIF files."""
+"""Pictures, arrays (H, W, 3) of uint8, from tensors of RGB, depth or other values; PNG and GIF."""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -22,20 +22,23 @@ GAP = 4
 
 
 def rgb_picture(image: Tensor) -> Picture:
-    """Return RGB (3, H, W), clipped to [0, 1], as a picture."""
+    """Convert an RGB tensor (3, H, W), clipped to [0, 1], to a picture."""
     pixels = image.detach().float().clamp(0, 1).mul(255).round().byte()
     return pixels.permute(1, 2, 0).cpu().numpy()
 
 
 def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
-    """Draw depth (1, H, W) from near (light) to far (dark); pixels without depth (0) are grey."""
+    """Draw a depth map (1, H, W) in colours from light at `near` to dark at `far`.
+
+    Pixels of depth 0 (unknown) are grey.
+    """
     picture = shaded(depth, near, far, DEPTH_MAP)
     picture[depth.detach()[0].cpu().numpy() <= 0] = NOTHING
     return picture
 
 
 def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
-    """Draw values (1, H, W) from `low` to `high` in the colours of a Matplotlib map."""
+    """Draw values (1, H, W) in colours from `low` to `high`. colors: name of a Matplotlib map."""
     from matplotlib import colormaps
 
     shade = (values.detach().float().cpu().numpy()[0] - low) / max(high - low, 1e-12)
@@ -43,7 +46,7 @@ def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
 
 
 def depth_range(depths: Tensor) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of values above 0, for a common scale of pictures."""
+    """Return the 2nd and 98th percentile of depths above 0, as the colour scale of pictures."""
     depths = depths.detach()
     seen = depths[depths > 0].float()
     if not seen.numel():
@@ -54,14 +57,14 @@ def depth_range(depths: Tensor) -> tuple[float, float]:
 
 
 def side_by_side(pictures: list[Picture]) -> Picture:
-    """Join pictures of equal height in a row, with white gaps."""
+    """Join pictures of equal height into one row, with white gaps between."""
     left = ((0, 0), (GAP, 0), (0, 0))
     padded = [np.pad(picture, left, constant_values=255) for picture in pictures]
     return np.concatenate(padded, 1)[:, GAP:]
 
 
 def png_bytes(picture: Picture) -> bytes:
-    """Return a picture as the bytes of a PNG file."""
+    """Encode a picture as the bytes of a PNG file."""
     buffer = BytesIO()
     Image.fromarray(picture).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
@@ -74,7 +77,7 @@ def write_png(picture: Picture, path: str | Path) -> None:
 
 
 def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:
-    """Write frames of one size as an endless GIF with one palette."""
+    """Write pictures of one size as an endless animated GIF with one palette."""
     # One palette for all: others would make still pixels flicker.
     sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
     palette = sample.quantize(256, method=Image.Quantize.MEDIANCUT)
@@ -90,7 +93,10 @@ def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: fl
 
 
 def finer(cameras: Cameras, side: int) -> Cameras:
-    """Return the same cameras with at least `side` pixels on the longer side, a whole multiple."""
+    """Return the same cameras for larger images, with a longer side of about `side` pixels.
+
+    Both sides grow by the same whole factor.
+    """
     height, width = cameras.size
     factor = max(1, round(side / max(height, width)))
     return Cameras(cameras.c2w, cameras.intrinsics * factor, (height * factor, width * factor))

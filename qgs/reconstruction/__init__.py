@@ -1,1 +1,1 @@
-"""Reconstruction: from photos in any world to a scene, its files, and a look inside models."""
+"""Reconstruction of scenes from photos, files of results, and recording of a model's internals."""

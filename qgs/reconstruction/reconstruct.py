@@ -1,4 +1,4 @@
-"""Reconstruction from photos and a model in one call: inputs, scale, forward pass, remarks."""
+"""Reconstruction of a scene in one call: choice of photos, scale, forward pass, remarks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,27 +34,31 @@ def reconstruct(
     overrides: Sequence[str] = (),
     tune: str | None = None,
 ) -> Reconstruction:
-    """Reconstruct one scene as `qgs reconstruct` does, in the frame of the recipe.
+    """Reconstruct one scene from photos, as the command `qgs reconstruct` does.
 
-    The scale is the recipe's too; `find_scale` searches a constant one for photos not trained on.
+    Cameras are moved to the frame and scale of the model's recipe. If the recipe's scale is
+    constant and the photos are not training data, `find_scale` searches the scale.
 
-    photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, which all
-        become inputs unless `frames` names some. OpenCV cameras, images in [0, 1].
-    inputs: how many; the recipe's number by default.
-    frames: which photos, by number or file name; by default see `qgs.data.inputs`.
-    compare: photos to compare with, "none" or no frames for none; of a folder, by default those
-        near the inputs of every eighth photo, which is held out.
-    size, scene: of a folder: (H, W), by default see `chosen_scene`; name, where it holds several.
-    overrides: of the recipe's `views`, such as "views.scale=auto".
-    tune: fit queries or latents to the inputs first, see `qgs.evaluate.tuning.tuning_settings`.
+    photos: a folder of photos and cameras, or its URL. Or Views (1, V) with OpenCV cameras in any
+        world and images in [0, 1]; all of them are inputs unless `inputs` or `frames` is given.
+    inputs: number of input photos; None uses the recipe's number.
+    frames: input photos, by number or file name; None chooses them, see `qgs.data.inputs`.
+    compare: photos with which the result is compared, or "none". None uses held-out photos near the
+        inputs; in a folder every eighth photo is held out.
+    size: (H, W) of images from a folder; for None see `chosen_scene`.
+    scene: name of the scene, for a folder of several scenes.
+    overrides: changes of the recipe's `views`, such as "views.scale=auto".
+    tune: part to fit to the inputs first, see `qgs.evaluate.tuning.tuning_settings`; None: no
+        tuning.
 
-    Raises ValueError without a recipe, for several scenes, for images out of range, as the data do.
+    Raises ValueError if the model has no recipe, for Views of several scenes and for images out of
+    range, and the errors of reading the folder.
     """
     recipe = _recipe(model, overrides, tune)
     seen: Sequence[int] | None = None
     if isinstance(photos, Views):
         if size is not None or scene is not None:
-            raise ValueError("`size` and `scene` are for folders: Views have one scene and size")
+            raise ValueError("`size` and `scene` work only for folders, not for Views: remove them")
         found: Scene = GivenScene(photos)
         if frames is None and inputs is None:
             frames = range(len(found))
@@ -85,15 +89,15 @@ def reconstruct(
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
-    """Return the model's recipe with other `views` and tuning. Raises ValueError without one."""
+    """Return the model's recipe with changed `views` and tuning; ValueError without a recipe."""
     if model.recipe is None:
         raise ValueError(
             "this model was built by hand and has no recipe, so the frame and scale of its world "
-            "are not known; build it with qgs.compose, or bring cameras into its world yourself"
+            "are not known; build it with qgs.compose, or move cameras to its world and call it"
         )
     # The weights fit only the model options of the recipe.
     if foreign := [text for text in overrides if not text.startswith("views.")]:
-        raise ValueError(f"only options of `views` can be set here, got {listed(foreign)}")
+        raise ValueError(f"overrides can only change options of `views`, got {listed(foreign)}")
     return resolve(model.recipe, [*overrides, *tuning_settings(tune)])
 
 
@@ -105,11 +109,13 @@ def choose_frames(
     compare: Sequence[int] | None,
     trained_on: Domain | None = None,
 ) -> Window:
-    """Return input and compared frames of `scene`.
+    """Return the input frames of `scene` and the frames to compare the result with.
 
-    frames, compare: by default the best of `ranked_windows`; where times are known, inputs spread
-    over them, and views of one time between. trained_on: of the model. Raises ValueError for frames
-    that do not exist or come twice, and for too few.
+    inputs: number of inputs; None uses `views.inputs`. frames, compare: inputs and compared frames
+    that the user chose. None chooses them: the best window of `ranked_windows`, or in scenes with
+    times inputs spread over time, and compared frames of one time between them. trained_on: the
+    model's trained range. Raises ValueError for frames that do not exist or repeat, and for too few
+    frames.
     """
     views = views.model_copy(update={"inputs": inputs or views.inputs})
     # A model whose checkpoint records no range takes any views.
@@ -131,13 +137,16 @@ def choose_frames(
 
 
 def checked_window(total: int, frames: Sequence[int], compare: Sequence[int] = ()) -> Window:
-    """Return input and compared frames. Raises ValueError if one repeats or does not exist."""
+    """Return input and compared frames; raise ValueError if a frame repeats or does not exist.
+
+    total: number of frames of the scene.
+    """
     every = [*frames, *compare]
     if missing := [frame for frame in every if not 0 <= frame < total]:
         raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
     if twice := sorted({frame for frame in every if every.count(frame) > 1}):
         raise ValueError(
-            f"frames named twice: {listed(twice)}; inputs and compared frames must differ"
+            f"these frames are named twice: {listed(twice)}; inputs and compared frames must differ"
         )
     return tuple(frames), tuple(compare)
 
@@ -145,11 +154,14 @@ def checked_window(total: int, frames: Sequence[int], compare: Sequence[int] = (
 def _over_time(
     scene: Scene, times: Tensor, views: ViewsConfig, frames: Sequence[int] | None
 ) -> Window:
-    """Return inputs, and at most NOVEL frames of one time between them, held-out ones first."""
+    """Return inputs spread over time, and at most NOVEL compared frames of one time between them.
+
+    Compared frames are held-out frames if there are any. frames: inputs that the user chose.
+    """
     if frames is None:
         usable = moments(scene)
         if views.inputs > len(usable):
-            raise ValueError(f"there are {len(usable)} times, too few for {views.inputs} inputs")
+            raise ValueError(f"{views.inputs} inputs need as many times; there are {len(usable)}")
         first = max(len(usable) - max(views.gap[1] + 1, views.inputs), 0) // 2
         frames = spread(usable[first : len(usable) - first], views.inputs)
     between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
@@ -161,7 +173,7 @@ def _over_time(
 
 
 def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
-    """Return the remarks for the user on photos and result."""
+    """Return remarks for the user on the photos and on the result's quality."""
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
@@ -175,7 +187,7 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
 
 
 def choice(sample: Sample, scene: Scene) -> str:
-    """Return a sentence on the photos of `sample` and on held-out ones."""
+    """Return a text that names inputs and compared photos, and counts the held-out photos."""
     text = f"inputs {listed(map(scene.frame_name, sample.input_frames))}"
     if sample.target_frames:
         text += f", compared with {listed(map(scene.frame_name, sample.target_frames))}"

@@ -1,4 +1,4 @@
-"""The reconstruction of one scene: Gaussians, renderings, scores against photos."""
+"""The result of a reconstruction: Gaussians, renderings, and their scores against photos."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,12 +20,15 @@ from qgs.reconstruction.scale import FoundScale
 from qgs.types import Cameras, Gaussians, Rendering
 
 KINDS = ("input", "novel", "seen in training")
-"""Kinds of views. In a folder that the model was trained on, only held-out views are novel."""
+"""Kinds of scored views: an input, a view new to the model, or a view of its training data."""
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """A rendered view against its photo, of one of KINDS; PSNR in dB. baselines: not of inputs."""
+    """Quality of a rendered view, compared with its photo.
+
+    kind: one of KINDS. psnr: in dB. baselines: PSNR of each baseline by name; empty for an input.
+    """
 
     frame: int
     kind: str
@@ -35,10 +38,12 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Gaussians (1, G) of a sample by `model`, in its world, rendered from all views of the sample.
+    """Gaussians (1, G) that `model` made of a sample, in the model's world, and their quality.
 
-    tuning, refinement: records of how the Gaussians were changed. remarks: for the user. scale: how
-    the scale was found, None where it was set.
+    rendering: from all views of the sample, inputs first. scores: one for each of these views.
+    tuning, refinement: settings with which the Gaussians were fitted to photos; None if they were
+    not. remarks: sentences for the user. scale: result of the search for the scale; None without a
+    search.
     """
 
     model: QueryGaussianModel
@@ -53,26 +58,23 @@ class Reconstruction:
 
     @property
     def worse_than_nearest(self) -> str:
-        """See `qgs.metrics.baselines`; on the compared views."""
+        """Remark if a copy of the nearest input has a higher PSNR on compared views, else ""."""
         compared = [score for score in self.scores if score.baselines]
         if not compared:
             return ""
         model = sum(score.psnr for score in compared) / len(compared)
         nearest = sum(score.baselines["nearest_input"] for score in compared) / len(compared)
-        remedy = f"{REMEDY}; `qgs refine` fits the result to its photos, or longer to more of them"
+        remedy = f"{REMEDY}; or fit the result to its photos, to more photos or longer (qgs refine)"
         return worse_than_nearest(Psnr.column, model, nearest, remedy)
 
     @property
     def in_photos_world(self) -> Gaussians:
-        """Gaussians (1, G) in the frame and unit of the photos' cameras, as for `save_ply`.
-
-        means are in float64 where float32 would lose them, as far from zero.
-        """
+        """Gaussians (1, G) in the frame and unit of the photos' cameras."""
         reference, scale = self.sample.world
         return moved(self.gaussians, reference, 1 / float(scale))
 
     def render(self, cameras: Cameras) -> Rendering:
-        """Render from cameras (1, V) in the photos' world; depth is in its unit."""
+        """Render from cameras (1, V) in the photos' world; depths are in the unit of that world."""
         reference, scale = (part.to(cameras.c2w.device) for part in self.sample.world)
         # In float64: coordinates of maps have seven digits before the point.
         c2w = scaled(relative_to(reference, cameras.c2w.double()), scale).float()
@@ -82,14 +84,14 @@ class Reconstruction:
         return replace(seen, depth=seen.depth / float(scale))
 
     def save(self, out: str | PathLike[str]) -> list[Path]:
-        """Write the files of `qgs reconstruct` and return their paths."""
+        """Write the same files as `qgs reconstruct` to the folder `out`; return their paths."""
         # Matplotlib is slow to import.
         from qgs.reconstruction.saving import write_reconstruction
 
         return write_reconstruction(self, Path(out))
 
     def __repr__(self) -> str:
-        """Scene, views with PSNR, the scale that was found, and the remarks."""
+        """Return the scene's name, the PSNR of each view, the scale that was found, and remarks."""
         lines = [f"Reconstruction of {self.sample.scene}: {self.gaussians.count:,} Gaussians"]
         for score in self.scores:
             lines.append(f"{score.kind} {self.sample.label(score.frame)} {score.psnr:.2f} dB")
@@ -111,10 +113,10 @@ def reconstruct_sample(
     seen: Collection[int] = (),
     changed: Gaussians | None = None,
 ) -> Reconstruction:
-    """Return the Gaussians of `sample`, rendered from its views, on the model's device.
+    """Reconstruct `sample` on the model's device, render its views and score them.
 
-    seen: frames that the model was trained on. changed: use these Gaussians instead of a forward
-    pass.
+    seen: frames that the model was trained on. changed: Gaussians to use in place of those from a
+    forward pass.
     """
     device = next(model.parameters()).device
     # Views come from the data on the CPU.
@@ -131,7 +133,7 @@ def reconstruct_sample(
 
 
 def _scores(sample: Sample, rendering: Rendering, seen: Collection[int]) -> list[ViewScore]:
-    """Compare renderings with photos, and those of targets with the baselines."""
+    """Score each rendered view against its photo, and the baselines at the target views."""
     inputs = sample.inputs
     targets = sample.targets
     photos = torch.cat([inputs.images, targets.images], 1)
@@ -150,5 +152,5 @@ def _scores(sample: Sample, rendering: Rendering, seen: Collection[int]) -> list
 
 
 def sample_cameras(sample: Sample) -> Cameras:
-    """Return the cameras (1, V) of inputs, then targets."""
+    """Return the cameras (1, V) of a sample: those of the inputs, then those of the targets."""
     return concatenated([sample.inputs.cameras, sample.targets.cameras], 1)

@@ -1,4 +1,4 @@
-"""The files of a reconstruction: PLY, pictures of all views, an orbit, cameras.json."""
+"""Files of a reconstruction: PLY, pictures of all views, an orbit as GIF, cameras.json."""
 
 import json
 import math
@@ -23,12 +23,15 @@ ORBIT_FRAMES = 48
 ORBIT_SIDE = 320
 FRAMES_PER_SECOND = 16
 SWAY = 0.12
-"""Motion to the side of an orbit, per distance to what is seen."""
+"""Sideways motion of an orbit, as a fraction of the depth of the scene."""
 OVERVIEW_COLUMNS = 8
 
 
 def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
-    """Return a loop (1, frames) past the input cameras (1, V), swaying by SWAY times `depth`."""
+    """Return cameras (1, frames) on a smooth loop past the input cameras (1, V).
+
+    The loop sways sideways by SWAY times `depth`, and looks at points at this depth.
+    """
     angles = torch.arange(frames, device=inputs.c2w.device) * (2 * math.pi / frames)
     count = inputs.shape[1]
     # From 0, the first input, to count - 1, the last, and back.
@@ -50,10 +53,11 @@ def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
 def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
     """Write gaussians.ply, overview.png, views/, depth/, orbit.gif and cameras.json into `out`.
 
-    All is in the model's world; cameras.json has the similarity to that of the photos. An
-    earlier result is replaced, all at the end; FileExistsError for other entries of these names.
-    With the suffix of a scene writer (.ply, .splat, ...) `out` is one file of the Gaussians, in the
-    world of the photos.
+    These files are in the model's world; cameras.json has the transform to the photos' world. The
+    files of an earlier result are replaced together when all are complete. Raises FileExistsError
+    if `out` holds files of these names that are no earlier result.
+    If `out` has the suffix of a scene format (.ply, .splat, ...), only this file is written, with
+    the Gaussians in the photos' world.
     """
     # A file holds Gaussians alone, so they are in the world of the photos.
     if out.suffix.lower() in scene_writers():
@@ -80,7 +84,7 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
 
 
 def _pictures(result: Reconstruction) -> dict[str, list[Picture]]:
-    """Return photo, render and depth of every view."""
+    """Return pictures of the photo, the rendering and the depth of every view, by kind."""
     sample = result.sample
     rendering = result.rendering
     near, far = depth_range(rendering.depth)
@@ -93,7 +97,7 @@ def _pictures(result: Reconstruction) -> dict[str, list[Picture]]:
 
 
 def overview(result: Reconstruction) -> Picture:
-    """Draw photos over renders and depth, of at most OVERVIEW_COLUMNS views, inputs first."""
+    """Draw rows of photos, renderings and depths, for the first OVERVIEW_COLUMNS scored views."""
     scores = result.scores
     # Inputs come first in `scores`, so they stay where the row is too long.
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
@@ -132,7 +136,7 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
         "refinement": result.refinement,
         "background": result.model.renderer.config.background,
         "to_photos": {
-            "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
+            "rule": "point p of this world is reference_c2w applied to p / scale in photos' world",
             "reference_c2w": reference.tolist(),
             "scale": float(scale),
             "search": asdict(result.scale) if result.scale else None,

@@ -1,8 +1,9 @@
-"""The scale of a scene's world: the factor at which a model renders the photos best.
+"""Search for the scale of a scene: the factor of camera positions at which a model renders best.
 
-Photos have a world in any unit, a model sees the unit of its training. The model runs on the inputs
-at several factors, and the photos that it renders decide. Inputs alone mislead: at a factor that is
-too small, surfaces close to the cameras render them well, so further photos are judged as well.
+Camera positions of photos may be in any unit, but a model needs the unit of its training. So the
+model runs on the inputs at several factors, and the PSNR of rendered photos decides. Inputs alone
+mislead: at a factor that is too small, surfaces close to the cameras reproduce them well. So a few
+photos that are no inputs are scored too.
 """
 
 import math
@@ -24,35 +25,37 @@ from qgs.types import Views
 from qgs.wording import listed
 
 FURTHER = 2
-"""Most photos that are judged with the inputs."""
+"""Largest number of photos that are scored in addition to the inputs."""
 STEP = 1.6
-"""Ratio of neighbouring factors at first."""
+"""Ratio of neighbouring factors in the coarse search."""
 MOST = 16
-"""Most factors that are tried before the search refines."""
+"""Largest number of factors in the coarse search."""
 BASELINES = (0.06, 0.25)
-"""Least and largest baseline if the training's are unknown."""
+"""Smallest and largest distance between inputs, for models that do not record the trained range."""
 BELOW = 2.0
-"""Factor by which the search goes below the least baseline of the training."""
+"""Factor by which the search goes below the smallest distance between inputs in training."""
 ABOVE = 4.0
-"""Factor by which the search goes above the largest baseline of the training."""
+"""Factor by which the search goes above the largest distance between inputs in training."""
 NEAREST = 0.8
-"""Least depth that cameras look at if the training's is unknown."""
+"""Smallest depth at which cameras look, for models that do not record the trained range."""
 REACH = 6.0
-"""The search brings what cameras look at to REACH times the least depth."""
+"""The search moves the point that cameras look at up to REACH times the smallest trained depth."""
 PENALTY = 5.0
-"""Penalty in dB per e-fold by which depths are below those of the training; for inputs alone."""
+"""Penalty in dB if depths are smaller than in training by a factor e. It applies only if no photo
+but the inputs is scored."""
 POOR = 14.0
-"""PSNR in dB of the judged photos below which no scale fits; novel views then average 12 dB."""
+"""PSNR in dB of the scored photos below which no scale fits; novel views then average 12 dB."""
 PIXELS = 2**18
-"""Most pixels of inputs in one forward pass; this limits memory."""
+"""Largest number of input pixels in one forward pass, which limits memory."""
 
 
 @dataclass(frozen=True)
 class FoundScale:
-    """The best factor of all translations, and the photos that it was found on.
+    """Result of the search: the best factor of camera positions, and its quality.
 
-    psnr: mean of the inputs and, counted twice, of the `further` photos, in dB. names: of their
-    files. tried: each factor with its psnr.
+    further: scored photos that are no inputs. names: the names of their files. psnr: mean PSNR in
+    dB of inputs and further photos, where further photos have twice the weight. tried: all tried
+    factors, each with its `psnr`.
     """
 
     factor: float
@@ -63,28 +66,32 @@ class FoundScale:
 
     @property
     def poor(self) -> str:
-        """Remark if no factor gave a good result or only inputs were judged, else ""."""
+        """Remark if no factor gave a good result or only inputs were scored, else ""."""
         # NaN is poor too.
         if not self.psnr >= POOR:
             return (
                 f"no scale fits: the best gives only {self.psnr:.1f} dB; choose inputs that "
-                "overlap more (frames), or give the scale"
+                "overlap more (frames), or set views.scale_factor"
             )
         if self.further:
             return ""
-        return "inputs alone can mislead the search: add photos between them, or give the scale"
+        return (
+            "the scale was found on input photos only and may be wrong: add photos between them, "
+            "or set views.scale_factor"
+        )
 
     @property
     def text(self) -> str:
-        """Factor, photos and quality."""
+        """Sentence on the factor, the scored photos and their PSNR."""
         judged = f"the inputs and {listed(self.names)}" if self.names else "the inputs"
         return f"scale {self.factor:.3g}, found on {judged}: {self.psnr:.1f} dB"
 
 
 def photo_settings(views: ViewsConfig, own: bool, overrides: Sequence[str] = ()) -> ViewsConfig:
-    """Return `views` for photos of a user: `search` for a constant scale not set for them.
+    """Return `views` with the scale "search" in place of "constant", for photos in unknown units.
 
-    own: whether the model was trained on these photos. overrides: settings of `views`.
+    The constant scale stays if the model was trained on these photos (`own`), or if `overrides`,
+    changes of the recipe by the user, set the scale.
     """
     known = own or any(text.startswith("views.scale") for text in overrides)
     search = views.scale == "constant" and not known
@@ -92,7 +99,7 @@ def photo_settings(views: ViewsConfig, own: bool, overrides: Sequence[str] = ())
 
 
 def constant_scale(views: ViewsConfig, factor: float) -> ViewsConfig:
-    """Return `views` with this factor of all translations."""
+    """Return `views` with the constant scale `factor`."""
     return views.model_copy(update={"scale": "constant", "scale_factor": factor})
 
 
@@ -102,11 +109,13 @@ def find_scale(
 ) -> FoundScale:
     """Search the factor at which `model` renders inputs and `further_photos` of `scene` best.
 
-    Factors STEP apart cover what the trained ranges allow, and more past an end that is best;
-    thirds of a step lie around the best, and the last one is the vertex of a parabola in log scale.
-    Without further photos one of three or more inputs is judged and not given to the model; of two,
-    factors that bring what the cameras look at nearer than in training lose PENALTY. model: in
-    evaluation mode; the search runs where it is.
+    The coarse search tries factors with ratio STEP over `search_range`, and more factors while the
+    best one is at an end. The fine search tries thirds of a step around the best, and then the
+    vertex of a parabola through the three best scores in log scale.
+
+    If the scene has no further photos, but three or more inputs, the middle input is scored and not
+    given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
+    model: must be in evaluation mode; the search runs on its device.
     """
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
@@ -137,10 +146,10 @@ def find_scale(
 
 
 def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
-    """Return at most FURTHER photos from the middle of the inputs, without held-out ones.
+    """Return at most FURTHER photos from the middle of the inputs, to score factors with.
 
-    Photos to compare with are left out too. The middle is where the largest `pose_distance` from
-    the inputs is smallest. Scenes that move have no such photos.
+    These are the photos whose largest `pose_distance` to an input is smallest. Inputs, compared
+    photos and held-out photos are left out. Scenes with times have no such photos.
     """
     left = [f for f in range(len(scene)) if f not in {*inputs, *compared, *scene.held_out}]
     if scene.times is not None or not left:
@@ -151,9 +160,10 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
 
 
 def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
-    """Return both ends of the search, and the least factor at which depths are as in training.
+    """Return the least and largest factor to try, and the factor below which scores are lowered.
 
-    The last is 0 where the depth that the cameras look at is unknown.
+    Below the third number, depths are smaller than in training; it is 0 if the depth at which the
+    cameras look is unknown. trained: the model's trained range. frames: the inputs.
     """
     depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
@@ -175,10 +185,10 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
 
 @dataclass
 class _Trial:
-    """PSNR of `sample`, whose factor is 1, at the factors low * step ** place.
+    """Scores of factors of camera positions; the factor of a place is low * step ** place.
 
-    tried: means of inputs and of further photos by place. nearest: a factor below which PENALTY
-    goes off the score.
+    sample: its cameras have the factor 1. nearest: factor below which PENALTY lowers the score.
+    tried: mean PSNR of the inputs and mean PSNR of further photos, by place.
     """
 
     model: QueryGaussianModel
@@ -207,7 +217,7 @@ class _Trial:
         return -math.inf if math.isnan(found) else found
 
     def best(self, places: Sequence[float]) -> float:
-        """Try these places; return the best of all so far."""
+        """Score these places; return the best place of all that were scored so far."""
         new = [place for place in places if place not in self.tried]
         each = max(PIXELS // self.inputs.images[:, :, 0].numel(), 1)
         for start in range(0, len(new), each):
@@ -224,13 +234,13 @@ class _Trial:
         return max(self.tried, key=self.score)
 
     def past(self, place: float) -> Sequence[float]:
-        """Return places past the ends of those tried where `place` is such an end, else none."""
+        """Return two places beyond `place` if it is the first or last tried place, else none."""
         if place == min(self.tried):
             return [place - 6, place - 3]
         return [place + 3, place + 6] if place == max(self.tried) else []
 
     def vertex(self, place: float) -> float:
-        """Return the offset from `place` to the vertex of the parabola through three scores."""
+        """Return the offset from `place` to the best place, by a parabola through three scores."""
         if not {place - 1, place + 1} <= self.tried.keys():
             return 0.0
         left, middle, right = (self.score(place + side) for side in (-1, 0, 1))
@@ -239,7 +249,7 @@ class _Trial:
 
 
 def at_factors(views: Views, factors: Tensor) -> Views:
-    """Return views (1, V) as (F, V), with translations multiplied by each of `factors` (F,)."""
+    """Repeat views (1, V) as (F, V), with camera positions multiplied by each of `factors` (F,)."""
     many = map_tensors(lambda tensor: tensor.expand(len(factors), *tensor.shape[1:]), views)
     c2w = scaled(many.cameras.c2w, factors[:, None])
     return replace(many, cameras=replace(many.cameras, c2w=c2w))

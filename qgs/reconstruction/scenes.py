@@ -1,4 +1,4 @@
-"""Photos of a user as one scene: from a folder, its URL or Views."""
+"""One scene from photos of a user: from a folder, from its URL or from Views."""
 
 from collections.abc import Sequence
 from os import PathLike, fspath
@@ -17,7 +17,7 @@ from qgs.types import Cameras, Views
 from qgs.wording import listed, warn_once
 
 HOLDOUT = 8
-"""Every n-th photo of a user's scene is held out, as papers on novel views do (Mip-NeRF 360)."""
+"""Every HOLDOUT-th photo of a user's scene is held out to score the result (Mip-NeRF 360)."""
 FrameNames: TypeAlias = str | Sequence[int | str]
 Size: TypeAlias = tuple[int, int]
 
@@ -29,11 +29,12 @@ def read_photos(
     frames: FrameNames | None = None,
     scene: str | None = None,
 ) -> Views:
-    """Photos and cameras of a folder, or its URL, as Views (1, V) in the photos' own world.
+    """Read the photos and cameras of a folder or URL as Views (1, V), in the photos' own world.
 
-    size: (H, W) to crop and resize to; of the first photo by default. frames: numbers or file
-    names; all by default. scene: name, where the folder holds several. Raises FileNotFoundError,
-    ValueError, and TooLargeError for more photos than fit into memory.
+    size: (H, W) to which photos are cropped and resized; None uses the size of the first photo.
+    frames: numbers or file names of photos; None reads all. scene: name of the scene, for a folder
+    of several. Raises FileNotFoundError, ValueError, and TooLargeError for more photos than fit
+    into memory.
     """
     found = photo_scene(fspath(folder), size, scene)
     wanted = range(len(found)) if frames is None else frame_list(frames, "frames", found)
@@ -43,9 +44,9 @@ def read_photos(
 
 
 def photo_scene(path: str, size: Size | None, name: str | None) -> Scene:
-    """Return the scene called `name` at `path`, or the only one.
+    """Return the scene called `name` at `path`; None stands for the only scene.
 
-    size: (H, W) of images; by default the stored size of the first photo.
+    size: (H, W) of images; None uses the stored size of the first photo.
     """
     source, _ = open_for(path, size, None, installed_sources())
     scene = named_scene(source, path, name)
@@ -58,15 +59,17 @@ def photo_scene(path: str, size: Size | None, name: str | None) -> Scene:
 def chosen_scene(
     recipe: Recipe, path: str, size: Size | None, name: str | None, holdout: bool = True
 ) -> tuple[Scene, Sequence[int] | None]:
-    """Return the scene called `name` at `path`, or the only one, for a model of `recipe`.
+    """Open a scene for a model of `recipe`; return it and the frames that the model was trained on.
 
-    And the frames that the model was trained on; None for other photos than the training's.
-    size: (H, W) of its images; by default the recipe's, or for other photos `whole_size`. holdout:
-    hold out every HOLDOUT-th photo that nobody else splits. Raises ValueError without a size.
+    The frames are None if `path` is not part of the model's training data.
+    name: name of the scene; None stands for the only one.
+    size: (H, W) of images; None uses the recipe's size for training data, else `whole_size`.
+    holdout: hold out every HOLDOUT-th photo if `path` is no training data and has no own split.
+    Raises ValueError if neither `size` nor the recipe gives a size.
     """
     if recipe.data_config is None and size is None:
         raise ValueError(
-            "the checkpoint's recipe has no data, so its image size is not known: give `size`, "
+            "the recipe of the model has no data, so the image size is not known: give `size`, "
             "such as 256x256"
         )
     source, is_training_data = open_for(path, size, recipe.data_config, installed_sources())
@@ -82,22 +85,27 @@ def chosen_scene(
 
 
 def _resized(source: SceneSource, config: SceneSourceConfig, size: Size) -> SceneSource:
-    """Return `source` opened again, with the options `config` and images of this size."""
+    """Return `source` opened again, with the options `config` and images of size (H, W)."""
     return type(source)(config.model_copy(update={"image_size": size}))
 
 
 def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
-    """Return options with every HOLDOUT-th photo held out, unless `scene` or they have a split."""
+    """Return `config` with every HOLDOUT-th photo held out.
+
+    It is returned unchanged if the scene or the options already hold out photos, or if the options
+    have no `holdout`.
+    """
     # A listing's own split, or one in the options, is somebody's decision.
     split = scene.held_out or getattr(config, "holdout", None) != 0
     return config if split else config.model_copy(update={"holdout": HOLDOUT})
 
 
 def whole_size(scene: Scene, multiple: int | None) -> Size:
-    """Return (H, W) at which a model sees the photos of `scene`, opened at the trained size, whole.
+    """Return the image size (H, W) at which photos of a user are resized without cropping.
 
-    The shorter side is the trained one, the aspect that of the first photo, both sides multiples
-    of `multiple`; the trained size without one, and where images are made to measure.
+    The shorter side is about that of the trained size, the aspect ratio that of the first photo,
+    and both sides are multiples of `multiple`. If `multiple` is None or images are generated, the
+    result is the trained size. scene: must be opened at the trained size.
     """
     trained = scene.cameras.size
     stored = scene.stored_size(0)
@@ -110,7 +118,7 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
 
 
 def size_multiple(recipe: Recipe) -> int | None:
-    """Return the divisor of both sides of the model's images; None if their size is fixed."""
+    """Return the number that must divide both image sides; None if the image size is fixed."""
     # The part is known without building a model.
     part = recipe.parts["model", "encoder"]
     assert issubclass(part.component, Encoder)
@@ -118,17 +126,18 @@ def size_multiple(recipe: Recipe) -> int | None:
 
 
 def installed_sources() -> dict[str, type[Component]]:
-    """Return all installed sources by PLUGIN/NAME; warn of plugins that cannot be loaded."""
+    """Return all installed data sources by PLUGIN/NAME; warn of plugins that cannot be loaded."""
     registry, broken = load_usable_plugins()
     for problem in broken:
-        warn_once(f"left out: {problem}")
+        warn_once(f"a plug-in is left out: {problem}")
     return registry.components("data")
 
 
 def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
-    """Return the scene called `name` of `source`, opened at `path`, or the only one.
+    """Return the scene called `name` of `source`; None stands for its only scene.
 
-    Raises ValueError where there is none of that name, or several without a name.
+    Raises ValueError if no scene has this name, or if `name` is None and there are several scenes.
+    path: location of the source, for messages.
     """
     splits: tuple[Split, ...] = ("train", "test")
     places: dict[str, tuple[Split, int]] = {}
@@ -144,9 +153,10 @@ def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
 
 
 def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
-    """Return frame numbers of "0,8,x.jpg" or [0, 8, "x.jpg"]; folders of a photo may be left out.
+    """Convert photos named by the user, "0,8,x.jpg" or [0, 8, "x.jpg"], to frame numbers.
 
-    Raises ValueError for what is neither a number nor the name of one photo of `scene`.
+    File names may lack leading folders. Raises ValueError for text that is neither a number nor the
+    name of exactly one photo of `scene`. option: name of the option, for the message.
     """
     names = [scene.frame_name(frame) for frame in range(len(scene))]
     numbers: list[int] = []
@@ -160,48 +170,52 @@ def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
         if len(found) != 1:
             fits = f"fits {listed(map(scene.label, found))}" if found else "is no photo"
             raise ValueError(
-                f"{option}: {part!r} {fits}. Give numbers or file names of photos with commas "
-                f"between, such as 0,8,16, of {scene.label(0)} to {scene.label(len(names) - 1)}"
+                f"{option}: {part!r} {fits}. Give numbers or file names of photos, separated by "
+                f"commas, such as 0,8,16, from {scene.label(0)} to {scene.label(len(names) - 1)}"
             )
         numbers += found
     return numbers
 
 
 class GivenScene(Scene):
-    """Views (1, V) as a scene. ValueError for several scenes, wrong images and a target time."""
+    """Views (1, V) that a user gave, as a scene.
+
+    Raises ValueError for several scenes, images out of range and a target time.
+    """
 
     name = "views"
 
     def __init__(self, views: Views) -> None:
         if views.images.shape[0] != 1:
             raise ValueError(
-                f"one scene is reconstructed at a time, got {views.images.shape[0]}; of several "
-                "take one, such as map_tensors(lambda x: x[:1], views)"
+                f"one scene is reconstructed at a time, got {views.images.shape[0]}; select one, "
+                "such as the first: map_tensors(lambda x: x[:1], views)"
             )
         # Resampling overshoots [0, 1] a little at edges.
         low, high = map(float, views.images.aminmax())
         if low < -0.5 or high > 1.5:
             raise ValueError(
-                f"images have values from {low:.3g} to {high:.3g} and must lie in [0, 1]: divide "
-                "8-bit values by 255, undo a subtracted mean"
+                f"images have values from {low:.3g} to {high:.3g}, but must lie in [0, 1]: divide "
+                "8-bit values by 255, and undo a normalisation"
             )
         if views.target_time is not None:
             raise ValueError(
-                "a target_time is the time of compared photos: name those by `compare`"
+                "these Views have a target_time, but the result is compared at the time of photos: "
+                "remove it and name the photos by `compare`"
             )
         self.views = views = views.to("cpu")
         self.times = None if views.times is None else views.times[0].double()
 
     @property
     def cameras(self) -> Cameras:
-        """See `Scene`."""
+        """Cameras (F,) of the views, with float64 poses."""
         cameras = self.views.cameras[0]
         return Cameras(cameras.c2w.double(), cameras.intrinsics, cameras.size)
 
     def images(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`."""
+        """Return images (len(frames), 3, H, W)."""
         return self.views.images[0, list(frames)].float()
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`."""
+        """Return masks (len(frames), 1, H, W), 1 on the object; None without masks."""
         return None if self.views.masks is None else self.views.masks[0, list(frames)].float()

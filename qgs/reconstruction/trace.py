@@ -1,4 +1,4 @@
-"""Recording of states and attention while a model runs, for chosen layers and queries.
+"""Recording of query states and attention while a model runs, for chosen layers and queries.
 
 with qgs.trace(model, layers=[1, 4], queries=[3, 17]) as trace:
     prediction = model(views)
@@ -24,7 +24,11 @@ ATTENTIONS = ("cross_attention", "self_attention")
 
 @dataclass
 class LayerTrace(TensorContainer):
-    """A layer's Q queries: states (B, Q, ...) and attention."""
+    """Record of one layer, for the Q chosen queries of B scenes.
+
+    before, after: states (B, Q, ...) before the layer and after its refinement. The attention
+    weights are None if the layer has no attention of this kind or does not explain it.
+    """
 
     before: QueryState
     after: QueryState | None = None
@@ -33,9 +37,10 @@ class LayerTrace(TensorContainer):
 
 
 class Trace:
-    """The last forward pass: indices (Q,), `layers` by number from 1, grid (V, H/P, W/P).
+    """Record of the last forward pass.
 
-    Filled by hooks; layers run in order, though rounds and refinements share modules.
+    queries: indices (Q,) of the recorded queries. layers: records by number; 1 is the first layer.
+    grid: (V, H/P, W/P), grid of image tokens; None if tokens are no patches.
     """
 
     def __init__(self, wanted: Sequence[int], queries: Sequence[int] | None) -> None:
@@ -48,13 +53,13 @@ class Trace:
         self._current = 0
 
     def _start(self, module: nn.Module, args: Any) -> None:
-        """Forget the previous pass when the model begins."""
+        """Delete the record of the previous pass when the model starts."""
         self.layers.clear()
         self.grid = None
         self._current = 0
 
     def _enter(self, module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
-        """Note a layer that begins, and the queries that it gets."""
+        """Record the state before a layer when the layer starts."""
         state, memory = args
         self._current += 1
         self.grid = memory.grid
@@ -67,13 +72,13 @@ class Trace:
 
     @torch.no_grad()
     def _explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:
-        """Keep the weights of an attention that begins."""
+        """Record the attention weights of a sublayer, named `part`, when the sublayer starts."""
         if self._current in self._wanted:
             weights = module.explain(*args, self.queries.to(args[0].features.device))
             setattr(self.layers[self._current], part, weights)
 
     def _leave(self, module: nn.Module, args: Any, state: QueryState) -> None:
-        """Keep the queries of a layer, which ends with its refinement."""
+        """Record the state after a layer when its refinement ends."""
         if self._current in self._wanted:
             self.layers[self._current].after = self._chosen(state)
 
@@ -88,12 +93,12 @@ def trace(
     layers: Collection[int] | None = None,
     queries: Sequence[int] | None = None,
 ) -> Iterator[Trace]:
-    """Record states and attention weights of `queries` in `layers` (numbers; None: all of them).
+    """Record states and attention weights in forward passes within the `with` block.
 
-    Rounds of feedback count on: a decoder of 4 layers that repeats two has 5 and 6 in the first.
-
-    It uses forward hooks, removed at the end, and the contracts' `explain`; without gradients.
-    Raises ValueError for layers or queries that do not exist.
+    layers: numbers of layers; None records all. 1 is the first layer. Layers repeated in rounds of
+    feedback get the following numbers: if a decoder of 4 layers repeats two, the first round has
+    layers 5 and 6. queries: indices of queries; None records all.
+    Recorded tensors have no gradients. Raises ValueError for layers or queries that do not exist.
     """
     numbers = _checked(layers, range(1, model.depth + 1), "layers")
     if model.queries.count is not None:

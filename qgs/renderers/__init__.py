@@ -1,4 +1,4 @@
-"""The built-in renderers, and `auto`, which chooses one by device."""
+"""The built-in renderers, and `qgs/auto`, which chooses one of them by device."""
 
 from collections.abc import Iterable
 
@@ -14,20 +14,23 @@ __all__ = ["COMPONENTS", "AutoRenderer", "CpuRenderer", "GsplatRenderer", "Torch
 
 
 class AutoRenderer(Renderer):
-    """Renderer that uses gsplat for Gaussians on CUDA, and `qgs/cpu` for all others."""
+    """Renderer that uses `qgs/gsplat` for Gaussians on CUDA and `qgs/cpu` for all others."""
 
     name = "auto"
     camera_gradients = GsplatRenderer.camera_gradients
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Return problems of options that gsplat lacks, also on the CPU, for equal results."""
+        """Return the problems of options that gsplat lacks.
+
+        They are refused on the CPU too, so that results do not depend on the device.
+        """
         return GsplatRenderer.problems(config, context)
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """See `Renderer`. Raises RuntimeError if the package that it needs is not installed."""
+        """Render, see `Renderer`; raise RuntimeError if gsplat is needed and not installed."""
         kind = GsplatRenderer if gaussians.means.is_cuda else CpuRenderer
         # Created in each call, because options may follow a schedule.
         return kind(self.config)(gaussians, cameras, background)

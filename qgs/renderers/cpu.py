@@ -1,4 +1,4 @@
-"""`qgs/cpu`, a renderer in numba that blends tiles of 16 x 16 pixels."""
+"""`qgs/cpu`, a renderer for CPUs, compiled by numba, that blends tiles of 16 x 16 pixels."""
 
 from itertools import pairwise, product
 from typing import Any, TypeAlias
@@ -37,7 +37,7 @@ class CpuRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """See `Renderer`. Raises ValueError for tensors that are not on the CPU."""
+        """Render, see `Renderer`; raise ValueError for tensors that are not on the CPU."""
         check_inputs(gaussians, cameras)
         if gaussians.means.device.type != "cpu":
             raise ValueError(
@@ -67,10 +67,10 @@ class CpuRenderer(Renderer):
 
 
 class _Splat(torch.autograd.Function):
-    """Function that computes sums (B, V, 5, H, W) of w r, w g, w b, w z, w.
+    """Function that sums r, g, b, depth and 1 over splats, weighted by w -> (B, V, 5, H, W).
 
-    Inputs: colors (B, V, G, 3) or (B, 1, G, 3), means, scales, quats, opacities, c2w, intrinsics;
-    size and options.
+    w is the weight of a splat at a pixel. Inputs: colors (B, V, G, 3) or (B, 1, G, 3), means,
+    scales, quats, opacities, c2w, intrinsics; image size and options of the renderer.
     """
 
     @staticmethod
@@ -162,7 +162,7 @@ class _Splat(torch.autograd.Function):
 
 
 def _limits(config: RendererConfig, size: tuple[int, int]) -> list[tuple[Any, ...]]:
-    """Return the kernels' options for the projection and for the blending."""
+    """Return the options of the projection kernel and those of the blending kernel."""
     projection = (config.near, config.far, config.dilation, config.alpha_min, CLAMP_MARGIN, *size)
     blending = (config.alpha_min, config.alpha_cap, config.transmittance_min)
     return [tuple(map(np.float32, options)) for options in (projection, blending)]
@@ -173,7 +173,10 @@ def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
 
 
 def _parts(splats: Any, size: tuple[int, int]) -> tuple[list[_Part], list[_Part]]:
-    """Return numbered ranges of Gaussians, and of tile rows (several if images are few)."""
+    """Return units of work: numbered ranges of Gaussians, and numbered ranges of tile rows.
+
+    An image is divided into several ranges of rows if there are few images.
+    """
     batch, views, count, _ = splats.shape
     chunks = pairwise([*range(0, count, _CHUNK), count])
     rows = -(-size[0] // _TILE)

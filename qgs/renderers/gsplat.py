@@ -1,4 +1,4 @@
-"""`qgs/gsplat`, a renderer with the CUDA kernels of gsplat 1.5.3."""
+"""`qgs/gsplat`, a renderer that uses the CUDA kernels of gsplat 1.5.3."""
 
 from collections.abc import Iterable
 from importlib import import_module
@@ -18,8 +18,8 @@ from qgs.types import Cameras, Gaussians, Rendering
 class GsplatRenderer(Renderer):
     """Renderer for float32 tensors on CUDA.
 
-    gsplat has no gradient for intrinsics, so intrinsics that require one are refused. Its kernels
-    use fixed alpha_min, alpha_cap and transmittance_min, equal to the defaults.
+    gsplat has no gradient for intrinsics, so intrinsics that require a gradient are refused. In its
+    kernels alpha_min, alpha_cap and transmittance_min are fixed to the defaults of these options.
     """
 
     name = "gsplat"
@@ -33,13 +33,16 @@ class GsplatRenderer(Renderer):
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Return problems of options that differ from the fixed values of gsplat's kernels."""
+        """Return the problems of options that differ from the fixed values of gsplat's kernels."""
         return _unsupported(config)
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """See `Renderer`; ValueError for tensors not on CUDA, RuntimeError without gsplat."""
+        """Render, see `Renderer`.
+
+        Raises ValueError for tensors that are not on CUDA, RuntimeError if gsplat is missing.
+        """
         check_inputs(gaussians, cameras)
         _check_supported(gaussians, cameras)
         # gsplat's kernels divide by their number.

@@ -1,4 +1,4 @@
-"""`qgs/torch`, a dense reference renderer in autograd: every Gaussian at every pixel.
+"""`qgs/torch`, a reference renderer with autograd that computes every Gaussian at every pixel.
 
 The EWA projection follows Zwicker et al. 2001 and gsplat 1.5.3.
 """
@@ -22,12 +22,13 @@ CLAMP_MARGIN = 0.15
 def project(
     gaussians: Gaussians, cameras: Cameras, near: float, far: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Project Gaussians (B, G) to cameras (B, V) of the same dtype, with autocast off.
+    """Project Gaussians (B, G) to cameras (B, V) of the same dtype; autocast must be off.
 
     Returns pixels (B, V, G, 2); entries xx, xy, yy (B, V, G, 3) of inverse covariances, pixel^-2;
-    depths (B, V, G), camera-frame z; and visibility (B, V, G), bool. For Gaussians dropped by near,
-    far or an overflow, the other values are finite placeholders with zero gradients. Differentiable
-    in means, scales, quats (normalised here), c2w and intrinsics.
+    depths (B, V, G), camera-frame z; and visibility (B, V, G), bool. A Gaussian is invisible beyond
+    near or far, or if its covariance overflows; its pixel, covariance and depth are then finite
+    placeholders with zero gradients. Differentiable in means, scales, quats (normalised here), c2w
+    and intrinsics.
     """
     centres = to_camera(gaussians.means, cameras)  # (B, V, G, 3)
     in_range = (centres[..., 2] >= near) & (centres[..., 2] <= far)
@@ -46,10 +47,12 @@ def project(
 
 
 def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor:
-    """Return J W R S (B, V, G, 2, 3) from W R S (B, V, G, 3, 3) and camera-frame means.
+    """Return the factors J W R S (B, V, G, 2, 3) of 2D covariances.
 
-    In the Jacobian J, x/z and y/z are clamped to 15 % of the image beyond its borders, as in
-    gsplat. Without it, a Gaussian farther off screen could spread over the whole image.
+    J is the Jacobian of the projection, W the rotation to the camera, R and S rotation and scales
+    of a Gaussian. factors: W R S (B, V, G, 3, 3). centres: camera-frame means (B, V, G, 3).
+    In J, x/z and y/z are clamped to 15 % of the image beyond its borders, as in gsplat. Without
+    clamping, a Gaussian farther off screen could spread over the whole image.
     """
     focal, principal = cameras.intrinsics[:, :, None].split(2, -1)
     sides = cameras.size[::-1]
@@ -62,7 +65,10 @@ def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor
 
 
 def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
-    """Return the inverse (..., 3) of F F^T + dilation for F (..., 2, 3), and if it exists."""
+    """Return the inverses (..., 3) of 2D covariances, entries xx, xy, yy, and if they exist.
+
+    The covariance is F F^T + dilation * I, with F from `factors` (..., 2, 3).
+    """
     row_x, row_y = factors.unbind(-2)
     xx = (row_x * row_x).sum(-1)
     xy = (row_x * row_y).sum(-1)
@@ -76,9 +82,10 @@ def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
 
 
 class TorchRenderer(Renderer):
-    """Reference renderer for tests: any device, float32 or float64.
+    """Reference renderer for tests, for any device and in float32 or float64.
 
-    Time and memory grow with G x H x W. Gaussians at the same depth are drawn in their given order.
+    Time and memory grow with G x H x W. Gaussians at the same depth are blended in the order in
+    which they are given.
     """
 
     name = "torch"
@@ -86,7 +93,7 @@ class TorchRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """See `Renderer`; half-precision inputs are rendered in float32."""
+        """Render, see `Renderer`; half-precision inputs are rendered in float32."""
         check_inputs(gaussians, cameras)
         config = self.config
         with torch.autocast(gaussians.means.device.type, enabled=False):
@@ -115,7 +122,10 @@ class TorchRenderer(Renderer):
 
 
 def resolve(sums: Tensor, background: Tensor) -> Rendering:
-    """Convert sums (B, V, C, H, W) of w r, w g, w b, w features, w z, w to a Rendering."""
+    """Convert sums (B, V, C, H, W) over Gaussians to a Rendering.
+
+    The channels are r, g, b, features, z and 1, each multiplied by the weight of the Gaussian.
+    """
     rgb, features, depth, alpha = sums.tensor_split([3, sums.shape[2] - 2, sums.shape[2] - 1], 2)
     # Depth is 0, not NaN, where nothing was hit.
     hit = torch.where(alpha > 0, alpha, 1.0)
@@ -134,7 +144,10 @@ def _weights(
     size: tuple[int, int],
     config: RendererConfig,
 ) -> Tensor:
-    """Return the weights (G, H, W) of an image's splats (G, ...), sorted front to back."""
+    """Return the blending weights (G, H, W) of splats at all pixels of an image.
+
+    means, conics, opacities: of the splats, (G, ...), sorted front to back.
+    """
     height, width = size
     # Pixel centres are at .5: (0, 0) is the corner of the image.
     u = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
