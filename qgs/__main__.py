@@ -1,6 +1,6 @@
 """Entry point of `python -m qgs`, the same as the command `qgs`.
 
-Launchers such as torchrun start modules.
+Launchers such as torchrun start the command through this module.
 """
 
 from qgs.cli import main

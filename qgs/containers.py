@@ -56,7 +56,7 @@ def map_tensors(function: Callable[[Tensor], Any], value: Any) -> Any:
 
 
 def concatenated(parts: Sequence[_C], dim: int) -> _C:
-    """Concatenate equal tensors of all `parts`, containers or tuples of containers, along `dim`.
+    """Concatenate `parts`, containers or tuples of containers, tensor by tensor along `dim`.
 
     Raises ValueError if a tensor is in some parts and missing (None) in others.
     """

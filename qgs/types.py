@@ -126,8 +126,8 @@ class ImageMemory(TensorContainer):
     keys, values: (B, h, M, D/h), computed once for all decoder layers.
     patch_rays: (B, M, 6) float32 world-frame Plücker rays (moment, direction), averaged over each
         patch and not renormalised. None if tokens are not single patches, or cameras are unknown.
-    grid: (V, H/P, W/P), M is its product; tokens are ordered by view, row, column. None for tokens
-        that are not patches, such as learned latents.
+    grid: (V, H/P, W/P) for patches of side P, with the product M; tokens are ordered by view, row,
+        column. None for tokens that are not patches, such as learned latents.
 
     The encoder's `writes` lists the parts that are not None.
     """

@@ -98,7 +98,7 @@ class RecipeContext:
 class Problem:
     """A fault of an option, and how to fix it.
 
-    option: dotted path below the component, "" for the component itself.
+    option: dotted path of the option inside the component; "" for the component itself.
     """
 
     option: str
@@ -130,9 +130,9 @@ class Component(metaclass=ABCMeta):
     The contract of a slot sets `slot`. A component sets `name` and nests a class `Config` with its
     options. Classmethods are called with a valid config before anything is built.
 
-    Rules for `forward`: The scenes of a batch are independent. It changes no inputs, parameters or
-    buffers. It draws random numbers only in training, from torch's global generator. Every tensor
-    that it reads gets a gradient.
+    Rules for `forward`: It treats the scenes of a batch independently. It changes no inputs,
+    parameters or buffers. It draws random numbers only in training, from torch's global generator.
+    Every tensor that it reads gets a gradient.
     """
 
     slot: ClassVar[str]

@@ -181,10 +181,11 @@ class ViewSampler(Component):
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
         """Return the input and target frames of each window that evaluation scores in a scene.
 
-        The default is empty: `EvaluationPlan` then chooses windows in the order of frames.
+        The default is an empty list: evaluation then makes windows around held-out frames, or draws
+        samples if there are none.
         """
         return []
 
     def options(self, step: int) -> Any:
-        """Return `config`, its scheduled options with their values after `step` training steps."""
+        """Return `config` with its scheduled options at their values after `step` steps."""
         return at_step(self.config, self.schedules, step)

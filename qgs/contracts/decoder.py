@@ -96,7 +96,7 @@ class CrossAttention(ModelComponent):
         memory: ImageMemory,
         queries: Tensor,  # (Q,) indices
     ) -> AttentionWeights | None:
-        """Return the attention weights of `queries` to visualise; None if there are none."""
+        """Return the attention weights of `queries` for visualisation; None if it has none."""
         return None
 
 
@@ -113,7 +113,10 @@ class SelfAttention(ModelComponent):
         """Return the update of the query features, before LayerScale."""
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights | None:
-        """Return the attention weights to visualise, or None. queries: indices (Q,)."""
+        """Return the attention weights of `queries` for visualisation; None if it has none.
+
+        queries: indices (Q,).
+        """
         return None
 
 

@@ -27,12 +27,12 @@ class Schedule(ComponentConfig):
 
     @property
     def corners(self) -> tuple[int, ...]:
-        """Steps after 0 between which the number is monotonic, so extremes lie there or at 0."""
+        """Steps after 0 between which the value is monotonic, so extremes lie there or at 0."""
         return ()
 
 
 def at_step(config: ConfigT, schedules: Mapping[str, Schedule], step: int) -> ConfigT:
-    """Return `config` with the values of `schedules` after `step` steps, rounded for integers."""
+    """Return `config` with the values of `schedules` after `step` steps; integers are rounded."""
     numbers = {name: schedule.number(step) for name, schedule in schedules.items()}
     for name in numbers:
         if isinstance(getattr(config, name), int):

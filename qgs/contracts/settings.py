@@ -129,7 +129,8 @@ class EvaluationConfig(ComponentConfig):
     """Seed for drawing the samples. It has no effect where `samples` has no effect."""
     index: str | None = None
     """JSON file with the views to score, relative to the working directory, in pixelSplat's format:
-    {scene: null | {"context": [frames], "target": [frames]}}. null draws the views."""
+    {scene: null | {"context": [frames], "target": [frames]}}. Scenes with null are skipped. Without
+    a file (null), views are drawn."""
     protocol: str | None = None
     """Name of these evaluation settings in tables. null uses the name of the index file."""
     tuning: Tuned = "queries"

@@ -9,6 +9,6 @@ from torch import Tensor
 def constant(values: Sequence[float], like: Tensor) -> Tensor:
     """Return `values` (N,) as a tensor with the dtype and device of `like`.
 
-    The processor does not wait for a copy to the device.
+    The CPU does not wait for a copy to the device.
     """
     return torch.stack([like.new_full((), value) for value in values])

@@ -73,7 +73,7 @@ def largest_distance(c2w: Tensor) -> Tensor:
 
 @full_precision
 def look_at_depth(c2w: Tensor) -> Tensor:
-    """Return the depth of the point that cameras c2w (V, 4, 4) look at, their median (0-d).
+    """Return the depth (0-d) of the point that cameras c2w (V, 4, 4) look at, median over cameras.
 
     The point has the least sum of squared distances to the optical axes. The result is 0 if there
     is no such point: the axes are parallel within about a degree, or the point lies behind the

@@ -142,7 +142,7 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
 
     means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4): fx, fy,
     cx, cy. bounds: (first, last) index of the range, `last` excluded. limits: near, far, dilation,
-    alpha_min, margin of `_axis`, height, width. The fields of splats are listed in `rasterisation`.
+    alpha_min, margin of `_axis`, height, width. `qgs.kernels.rasterisation` lists splat fields.
     A splat ends at the Mahalanobis distance sqrt(2 ln(opacity / alpha_min)), where its alpha falls
     to alpha_min. Its extents get half a pixel more, against rounding.
     """

@@ -102,7 +102,7 @@ def _by_depth(splats, top, bottom, width):
 
 @kernel
 def _touching_rows(order, splats, top, bottom, out):
-    """Copy the indices in `order` of splats that touch rows [top, bottom) to `out`; count them."""
+    """Copy indices in `order` of splats that touch rows [top, bottom) to `out`; return how many."""
     n = 0
     for i in range(order.shape[0]):
         g = order[i]
@@ -145,7 +145,7 @@ def _close_rows(state, live):
 def _blend_row(state, base, dx0, power_of, look, options):
     """Blend a splat into one row of a tile, at offset `base` of the buffer `state`.
 
-    At horizontal distance dx from the splat, alpha is opacity 2^power with
+    At horizontal distance dx from the splat, alpha is opacity * 2^power with
     power = (quadratic dx + linear) dx + constant. dx0: distance of the first lane. look: opacity,
     r, g, b, depth.
     """

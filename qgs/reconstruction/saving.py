@@ -97,7 +97,7 @@ def _pictures(result: Reconstruction) -> dict[str, list[Picture]]:
 
 
 def overview(result: Reconstruction) -> Picture:
-    """Draw rows of photos, renderings and depths, for the first OVERVIEW_COLUMNS scored views."""
+    """Draw rows of photos, renderings and depths of the first OVERVIEW_COLUMNS scored views."""
     scores = result.scores
     # Inputs come first in `scores`, so they stay where the row is too long.
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)

@@ -31,13 +31,14 @@ STEP = 1.6
 MOST = 16
 """Largest number of factors in the coarse search."""
 BASELINES = (0.06, 0.25)
-"""Smallest and largest distance between inputs, for models that do not record the trained range."""
+"""Smallest and largest baseline to assume if the model does not record those of its training. A
+baseline is the largest distance between the inputs of a sample."""
 BELOW = 2.0
-"""Factor by which the search goes below the smallest distance between inputs in training."""
+"""Factor by which the search goes below the smallest baseline of the training."""
 ABOVE = 4.0
-"""Factor by which the search goes above the largest distance between inputs in training."""
+"""Factor by which the search goes above the largest baseline of the training."""
 NEAREST = 0.8
-"""Smallest depth at which cameras look, for models that do not record the trained range."""
+"""Smallest depth at which cameras look, to assume if the model does not record its training's."""
 REACH = 6.0
 """The search moves the point that cameras look at up to REACH times the smallest trained depth."""
 PENALTY = 5.0
@@ -71,13 +72,13 @@ class FoundScale:
         if not self.psnr >= POOR:
             return (
                 f"no scale fits: the best gives only {self.psnr:.1f} dB; choose inputs that "
-                "overlap more (frames), or set views.scale_factor"
+                "overlap more (frames), or set the scale (--scale, views.scale_factor)"
             )
         if self.further:
             return ""
         return (
             "the scale was found on input photos only and may be wrong: add photos between them, "
-            "or set views.scale_factor"
+            "or set the scale (--scale, views.scale_factor)"
         )
 
     @property

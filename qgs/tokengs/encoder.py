@@ -79,10 +79,11 @@ class PatchViT(PatchEncoder):
         )
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return weights enlarged to this component's patches, if the side is a multiple.
+        """Return weights of a model with smaller patches, enlarged to this component's patches.
 
-        With f times the side, the token of a new patch is what the old weights give for the patch
-        shrunk by averaging f x f pixels. Otherwise weights are returned unchanged.
+        If the new side is f times the old one, with a whole number f, a new patch gets the token
+        that the old weights give for the patch shrunk by averaging f x f pixels. Otherwise the
+        weights are returned unchanged.
         """
         # Its shapes give the size of our patches.
         own = self.state_dict()
@@ -140,7 +141,7 @@ _KERNEL = "_embedding.proj.weight"
 
 
 def _larger(kernel: Tensor, side: int) -> Tensor:
-    """Enlarge a kernel (D, C, p, p) to patches of `side`; unchanged unless a multiple of p."""
+    """Enlarge a kernel (D, C, p, p) to patches of `side`, if `side` is a multiple of p."""
     if kernel.ndim != 4 or not kernel.numel() or side % kernel.shape[-1]:
         return kernel
     factor = side // kernel.shape[-1]
