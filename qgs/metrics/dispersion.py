@@ -45,7 +45,7 @@ def token_dispersion(means: Tensor, gaussians_per_query: int) -> Tensor:
     """
     if means.shape[-2] % gaussians_per_query:
         raise ValueError(
-            f"{means.shape[-2]} Gaussians cannot be divided into queries of {gaussians_per_query}"
+            f"{means.shape[-2]} Gaussians cannot be split into {gaussians_per_query} for each query"
         )
     tokens = means.unflatten(-2, (-1, gaussians_per_query))
     return (tokens - tokens.mean(-2, keepdim=True)).norm(dim=-1).flatten(-2)

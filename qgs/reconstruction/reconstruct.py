@@ -161,7 +161,7 @@ def _over_time(
     if frames is None:
         usable = moments(scene)
         if views.inputs > len(usable):
-            raise ValueError(f"{views.inputs} inputs need as many times; there are {len(usable)}")
+            raise ValueError(f"photos have {len(usable)} times, too few for {views.inputs} inputs")
         first = max(len(usable) - max(views.gap[1] + 1, views.inputs), 0) // 2
         frames = spread(usable[first : len(usable) - first], views.inputs)
     between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]

@@ -95,7 +95,7 @@ def _unsupported(config: ComponentConfig) -> list[Problem]:
     return [
         Problem(
             option,
-            f"gsplat's kernels fix it at {getattr(defaults, option):g}, "
+            f"gsplat's kernels fix this option at {getattr(defaults, option):g}, "
             f"got {getattr(config, option):g}",
             "remove the option, or choose qgs/torch or qgs/cpu as renderer",
         )
