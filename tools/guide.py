@@ -48,8 +48,7 @@ SECTIONS = {".".join(path) or "Top level": config for path, config in SETTINGS.i
 
 def filled(page: str) -> str:
     """`page` as the site needs it, with all parts that are written from the code."""
-    parts = {"recipe reference": reference, "checks": check_list}
-    page = PART.sub(lambda found: parts[found[1]](), page)
+    page = PART.sub(lambda found: PARTS[found[1]](), page)
     page = ENTRY.sub(lambda found: _block(found[1], found[2]), page)
     return TO_FILE.sub(_cross_reference, page)
 
@@ -94,7 +93,8 @@ def _entry(name: str, options: str | None) -> str:
 
 def _part(name: str, text: str) -> str:
     # The recipe reference is long, and every new option changes it: the repository links to it.
-    text = check_list() if name == "checks" else text
+    if name != "recipe reference":
+        text = PARTS[name]()
     return f"<!-- from the code: {name} -->\n{text}<!-- end -->"
 
 
@@ -133,9 +133,7 @@ def reference() -> str:
     return filled_template(
         "guide_reference.md.jinja",
         sections=SECTIONS,
-        slots=slots.SLOTS,
-        own_sections=slots.SECTIONS,
-        model_slots=slots.MODEL_SLOTS,
+        slots=slots,
         registry=REGISTRY,
         option_table=option_table,
         fields_of=fields_of,
@@ -160,6 +158,17 @@ def fields_of(component: type[Component]) -> Mapping[str, Mapping[str, Any]]:
     if config is None:
         return {}
     return {"reads": component.fields_read(config), "writes": component.fields_written(config)}
+
+
+def contract_list() -> str:
+    """Return the signatures of all contracts, and the containers that they exchange, Markdown."""
+    return filled_template(
+        "guide_contracts.md.jinja", slots=slots, inspect=inspect, resolve=resolve_name
+    )
+
+
+PARTS = {"recipe reference": reference, "checks": check_list, "contracts": contract_list}
+"""What writes each part of a page, by its name."""
 
 
 def main() -> None:

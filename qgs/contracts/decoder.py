@@ -1,7 +1,8 @@
 """Contracts of the decoder's slots: `layer` and its sublayers, `refinement`, `feedback`.
 
 An attention or feed-forward component holds its norms and its output projection; the decoder layer
-adds LayerScale and the residual sum. A refinement runs after each layer.
+multiplies the update that they return by LayerScale and adds it to the features. A refinement runs
+after each layer.
 """
 
 from abc import abstractmethod

@@ -15,10 +15,11 @@ from qgs.types import LayerPrediction, Rendering, Views
 class Loss(Component, torch.nn.Module):
     """Loss: (LayerPrediction, Rendering, target Views, input Views) -> one term or several.
 
-    A loss implements `term`; this class multiplies it by the option `weight`. Training calls the
-    loss for each supervised layer, with a rendering from the target cameras and all input views of
-    the prediction. It minimises the sum of all terms, weighted by layer. Term names are unique
-    within a recipe. Every term is differentiable in the prediction or in the rendering.
+    A loss defines `term`; this class multiplies it by `weight` and its schedule. Training calls
+    the loss for each supervised layer, with a rendering from the target cameras and all input views
+    of the prediction. It minimises the sum of all terms, weighted by layer. A term is one number to
+    minimise; `history.jsonl` has it under its name, which is unique within a recipe. Every term has
+    a gradient in the prediction or in the rendering.
 
     renderings: the target views that one call needs, because training may render few at a time
         (`training.render_views`). "each": a term is a mean over views, so training may call the

@@ -119,7 +119,11 @@ class SelfAttentionCore(nn.Module):
 
 
 class CrossAttentionCore(nn.Module):
-    """Pre-norm multi-head attention to given keys and values, with an optional logit bias."""
+    """Multi-head attention to given keys and values, with a bias on the logits.
+
+    It applies LayerNorm to the features, projects them to queries, and normalises the queries of
+    each head. It uses keys and values as given, and projects the result.
+    """
 
     def __init__(self, width: int, heads: int, norm_eps: float = NORM_EPS) -> None:
         super().__init__()
@@ -136,9 +140,10 @@ class CrossAttentionCore(nn.Module):
     def forward(
         self, x_BND: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: Tensor | None = None
     ) -> Tensor:
-        """Return the attention output (B, N, D).
+        """Return (B, N, D).
 
-        bias: added to the logits, (B, N, M) for all heads or (B, h, N, M); -inf hides a token.
+        bias: added to the logits; (B, N, M) for all heads, or (B, h, N, M). B and N may be 1. -inf
+            hides a token.
         """
         # Keys are normalised by their encoder, in float32 under autocast, as these queries are.
         q_BhNd = self.project(x_BND).to(v_BhMd.dtype)

@@ -36,9 +36,9 @@ def test_the_code_of_the_five_ideas_computes_its_formula_and_keeps_its_contract(
 ):
     code = blocks("ideas.md", "python")
     # a module that other processes can import too
-    Path("component_of_the_guide.py").write_text(code["near.py"])
+    Path("component_of_the_guide.py").write_text(code["ahead.py"])
     monkeypatch.syspath_prepend(tmp_path)
-    near = import_module("component_of_the_guide").NearCenters
+    near = import_module("component_of_the_guide").AheadCenters
     centers = near(near.Config(distance=2.0), ModelDims(16, 2, 1))
     means = centers(torch.zeros(1, 8, 4, 3), QueryState(torch.zeros(1, 8, 16)))
     assert means.tolist() == [[[[0.0, 0.0, 2.0]] * 4] * 8]

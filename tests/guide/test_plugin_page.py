@@ -1,4 +1,4 @@
-"""The code of "Write a plugin in 15 minutes", without an installation.
+"""The code of "Write a plug-in in 15 minutes", without an installation.
 
 The slow tests in tests/outside type every command of the page in a fresh environment.
 """
@@ -64,20 +64,13 @@ def test_the_source_keeps_its_contract(package, tmp_path):
 
 def test_the_recipes_work_and_what_the_page_says_is_refused(package):
     plugins = [package.plugin]
-    recipe = resolve("frustum.yaml", plugins=plugins)
+    recipe = resolve("loss.yaml", plugins=plugins)
     assert recipe.tree["model"]["decoder"]["cross_attention"]["type"] == "sightline/abstaining"
-    assert isinstance(recipe.build_model("meta").centers, package.FrustumCenters)
+    assert {*recipe.build_losses()} == {"visibility", "color"}
+    assert isinstance(recipe.build_losses()["color"], package.Charbonnier)
     for name in ("depth.yaml", "cnn.yaml"):
         assert resolve(name, plugins=plugins)
     assert {*resolve("widening.yaml", plugins=plugins).tree["plugins"]} >= {"locus", "sightline"}
-    must_refuse(
-        "far must be more than near, 9\n  fix: set it farther",
-        resolve,
-        "frustum.yaml",
-        ["model.centers.near=9"],
-        plugins=plugins,
-        kind=RecipeError,
-    )
     needed = r"`sightline/deepen` needs sightline\.log_depth [\s\S]*use `sightline/deep`"
     must_refuse(
         needed,

@@ -110,7 +110,7 @@ def test_every_command_of_the_tutorial(fresh, tmp_path):
     folder = tmp_path / "qgs-sightline"
     assert (folder / "run/checkpoint.safetensors").is_file()
     assert list((folder / "dist").glob("qgs_sightline-*.whl"))
-    assert "sightline/frustum" in output
+    assert "sightline/charbonnier" in output
     run(fresh, "pip uninstall -q -y qgs-sightline", tmp_path)
 
 

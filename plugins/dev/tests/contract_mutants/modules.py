@@ -44,7 +44,7 @@ class FixedNumberOfHeads(Extended, ContentCrossAttention):
         self.core = CrossAttentionCore(dims.width, 2, self.config.norm_eps)
 
 
-@mutant("unmet_requirement_fails_at_compose", "view size is not")
+@mutant("unmet_reads_fail_at_compose", "view size is not")
 @mutant("strides_make_no_difference", "view size is not")
 class ViewsAField(PlacesByALayer):
     """Takes a field for contiguous; queries expand theirs to all scenes."""

@@ -19,7 +19,7 @@ from qgs.tokengs import (
 )
 from qgs.types import GaussianAttributes, QueryState
 
-CHECK = "reads_within_requires"
+CHECK = "reads_are_declared"
 
 
 PLACE: Fields = {"place.center": FieldSpec((3,), frame="world")}
@@ -95,26 +95,26 @@ class ReadsAnUndeclaredRendering(Loss):
         return {"small": prediction.gaussians.scales.mean() + rendering.rgb.sum()}
 
 
-@mutant("requires_are_read", "requires memory.features, but")
+@mutant("declared_reads_are_used", "requires memory.features, but")
 class RequiresTooMuch(ContentCrossAttention):
     @classmethod
     def fields_read(cls, config):
         return MEMORY_FIELDS
 
 
-@mutant("writes_equal_provides", "place.center: written in")
+@mutant("writes_are_declared", "place.center: written in")
 class WritesMore(NoRefinement):
     def forward(self, state):
         return state.replace(fields={"place.center": state.features[..., :3].clone()})
 
 
-@mutant("unmet_requirement_fails_at_compose", "KeyError")
+@mutant("unmet_reads_fail_at_compose", "KeyError")
 class NeedsAFieldUndeclared(ContentSelfAttention):
     def forward(self, state):
         return super().forward(state) + state["place.center"].sum(-1, keepdim=True)
 
 
-@mutant("writes_equal_provides", "unrelated.center: lost in")
+@mutant("writes_are_declared", "unrelated.center: lost in")
 class LayerLosesFields(CrossSelfMlp):
     def forward(self, state, memory):
         state, memory = super().forward(state, memory)

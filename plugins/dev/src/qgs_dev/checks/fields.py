@@ -45,8 +45,8 @@ PLUGIN = "under_test"
 GIVEN = "given_fields"
 
 
-def check_reads_within_requires(case: Case) -> None:
-    """Require that a component reads only fields in `requires`, from the state and the memory.
+def check_reads_are_declared(case: Case) -> None:
+    """Require that a component reads only fields in `reads`, from the state and the memory.
 
     Testing whether a field exists counts as reading. Pass other fields on with
     `QueryState.replace`. A loss that declares no renderings must not read one.
@@ -114,8 +114,8 @@ def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
     return changed
 
 
-def check_requires_are_read(case: Case) -> None:
-    """Require that every field in `requires` is read, so that no recipe is refused needlessly.
+def check_declared_reads_are_used(case: Case) -> None:
+    """Require that every field in `reads` is read, so that no recipe is refused needlessly.
 
     Features of Gaussians may be read from their rendering.
     """
@@ -144,8 +144,8 @@ def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
         yield mapped(inputs, lambda n, x, other=other: other[n] if n.endswith(ends) else x)
 
 
-def check_writes_equal_provides(case: Case) -> None:
-    """Require that written fields are those in `provides`, with the shape and dtype given there.
+def check_writes_are_declared(case: Case) -> None:
+    """Require that written fields are those in `writes`, with the shape and dtype given there.
 
     Components other than queries pass on all other fields unchanged; a refinement also passes on
     the features.
@@ -177,8 +177,8 @@ def _same(one: Tensor, other: Tensor) -> bool:
     return one is other or (one.data_ptr() == other.data_ptr() and one.shape == other.shape)
 
 
-def check_unmet_requirement_fails_at_compose(case: Case) -> None:
-    """Require that a recipe without a required field is refused by name, and one with all runs."""
+def check_unmet_reads_fail_at_compose(case: Case) -> None:
+    """Require that a recipe without a field in `reads` is refused, and that one with all runs."""
     needed = required_fields(case)
     for missing in needed:
         refusal = _refusal(case, {name: spec for name, spec in needed.items() if name != missing})

@@ -177,7 +177,7 @@ def check_scheduled_options_are_read_anew(case: Case) -> None:
     """Require that a changed option in `scheduled` takes effect in the next call.
 
     The result must be that of a component built with the new value. The fields that a component
-    requires and provides must not depend on the option.
+    `reads` and `writes` must not depend on the option.
     """
     for option in sorted(case.component.scheduled):
         other = case.with_config(_with_another(case.config, option))
