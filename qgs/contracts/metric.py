@@ -17,7 +17,7 @@ from qgs.types import Gaussians, Views
 class Column:
     """Display of a value in tables.
 
-    digits: number of digits after the point; comparisons show one more.
+    digits: number of decimal places; tables that compare several results show one more.
     """
 
     heading: str

@@ -19,8 +19,8 @@ class Queries(ModelComponent):
 
     The state has features (B, N, D) and the fields in `writes`. Spatial fields are (B, N, ...)
     float32 in the world frame. Queries that read the memory list the parts that they read in
-    `reads`, such as `memory.features`. Scenes are independent. If scenes have different numbers of
-    queries, the state has a mask.
+    `reads`, such as `memory.features`. The state of a scene does not depend on other scenes of the
+    batch. If scenes have different numbers of queries, the state has a mask.
 
     reads_cameras: True if the component reads `views.cameras`. If False, it also accepts `Photos`.
     """
