@@ -147,7 +147,7 @@ def _blend_row(state, base, dx0, power_of, look, options):
 
     At horizontal distance dx from the splat, alpha is opacity * 2^power with
     power = (quadratic dx + linear) dx + constant. dx0: distance of the first lane. look: opacity,
-    r, g, b, depth.
+    r, g, b, depth. options: alpha_min, alpha_cap, transmittance_min.
     """
     (linear, quadratic, constant), (opacity, r, g, b, z) = power_of, look
     alpha_min, alpha_cap, transmittance_min = options
@@ -290,9 +290,8 @@ def _store_sums(state, sums, y0, x0, rows, columns):
 def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
     """Blend all splats (G, 9) of one image in the tile rows from tile_rows[0] up to tile_rows[1].
 
-    If `backward` is false, it fills sums (5, H, W). If true, it reads them, and adds the gradients
-    of the splats to out (G, 10). slopes: gradient of the loss with respect to `sums`, (5, H, W).
-    options: alpha_min, alpha_cap, transmittance_min.
+    If `backward` is false, it fills sums (5, H, W). If true, it reads them and adds the gradients
+    of the splats to out (G, 10). slopes: gradients of `sums`. options: see `_blend_row`.
     """
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)

@@ -40,19 +40,15 @@ def reconstruct(
     constant and the photos are not training data, `find_scale` searches the scale.
 
     photos: a folder of photos and cameras, or its URL. Or Views (1, V) with OpenCV cameras in any
-        world and images in [0, 1]; all of them are inputs unless `inputs` or `frames` is given.
+        world; all of them are inputs unless `inputs` or `frames` is given.
     inputs: number of input photos; None uses the recipe's number.
     frames: input photos, by number or file name; None chooses them, see `qgs.data.inputs`.
-    compare: photos with which the result is compared, or "none". None uses held-out photos near the
-        inputs; in a folder every eighth photo is held out.
-    size: (H, W) of images from a folder; for None see `chosen_scene`.
-    scene: name of the scene, for a folder of several scenes.
+    compare: photos to score, or "none". None scores held-out photos (every eighth) near the inputs.
+    size, scene: for a folder: (H, W) of images, see `chosen_scene`; name of one of its scenes.
     overrides: changes of the recipe's `views`, such as "views.scale=auto".
-    tune: part to fit to the inputs first, see `qgs.evaluate.tuning.tuning_settings`; None: no
-        tuning.
+    tune: part to fit to the inputs first, see `tuning_settings`; None fits nothing.
 
-    Raises ValueError if the model has no recipe, for Views of several scenes and for images out of
-    range, and the errors of reading the folder.
+    Raises ValueError without a recipe, for several scenes, for images outside of [0, 1].
     """
     recipe = _recipe(model, overrides, tune)
     seen: Sequence[int] | None = None
