@@ -7,8 +7,6 @@ rendering = model.render(prediction.gaussians, cameras)
 qgs.save(model, path); model = qgs.load(path)
 """
 
-from __future__ import annotations
-
 import os
 from importlib import import_module
 from pathlib import Path

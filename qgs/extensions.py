@@ -1,7 +1,5 @@
 """Loading of entry points, found in the metadata of installed distributions."""
 
-from __future__ import annotations
-
 import os
 import sys
 from functools import lru_cache

@@ -10,11 +10,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeAlias
 
 from rich.filesize import decimal
 
 from qgs.wording import listed
+
+AnyPath: TypeAlias = str | os.PathLike[str]
+"""A path, as text or object."""
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -22,8 +25,8 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path to write to; its file replaces `path` when the block ends well.
+def replacing(path: AnyPath) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, which it replaces when the block ends well.
 
     If the block raises, `path` stays unchanged. Missing parent folders are made. The new file gets
     the usual permissions, and is on the disk before it replaces the old one.
@@ -80,7 +83,7 @@ def _synchronise(path: Path) -> None:
 
 
 @contextmanager
-def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Path]:
+def replacing_entries(folder: AnyPath, mark: str) -> Iterator[Path]:
     """Yield a temporary folder whose entries move into `folder` when the block ends well.
 
     An entry replaces the file or folder of the same name; all other entries of `folder` stay. If
@@ -118,13 +121,13 @@ def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Pat
 
 
 def refuse_existing(target: Path) -> None:
-    """Raise FileExistsError if `target` exists, or is a link to a missing file."""
-    if target.exists() or target.is_symlink():
+    """Raise FileExistsError if `target` exists, a broken link included."""
+    if os.path.lexists(target):
         raise FileExistsError(f"{target} exists and is never overwritten; choose another name")
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write `text` as UTF-8 to `path`, completely or not at all."""
+def write_text(path: AnyPath, text: str) -> None:
+    """Write `text` as UTF-8 to `path`, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -66,15 +66,11 @@ def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> No
     Every call must write to its own memory, because their order is undefined. `unit` must not call
     `in_threads` itself: it could wait forever for threads that are in use.
     """
-    items = list(work)
-    if len(items) == 1:
-        unit(*items[0])
-    else:
-        futures = [_threads(torch.get_num_threads()).submit(unit, *item) for item in items]
-        # Waits for all even if one fails: no thread writes after this returns.
-        wait(futures)
-        for future in futures:
-            future.result()
+    futures = [_threads(torch.get_num_threads()).submit(unit, *item) for item in work]
+    # Waits for all even if one fails: no thread writes after this returns.
+    wait(futures)
+    for future in futures:
+        future.result()
 
 
 @lru_cache(maxsize=1)

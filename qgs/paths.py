@@ -1,7 +1,5 @@
 """Reading of files at local paths, at fsspec URLs, and inside zip archives."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -12,9 +12,6 @@ from qgs.containers import map_tensors, named_tensors
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-HALF = (torch.float16, torch.bfloat16)
-
-
 Precision: TypeAlias = Literal["float32", "bf16"]
 """Precisions for `training.precision` and `qgs bench`. Weights are float32 in both."""
 
@@ -30,7 +27,7 @@ def autocast(precision: Precision, device: str) -> torch.autocast:
 
 def at_least_float32(x: Tensor) -> Tensor:
     """Return `x` in float32 if it is in half precision; otherwise return `x` itself."""
-    return x.float() if x.dtype in HALF else x
+    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
 
 
 def full_precision(function: F) -> F:

@@ -14,12 +14,15 @@ Containers are frozen. A component returns a new container and never changes its
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import torch
 from torch import Tensor
 
 from qgs.containers import TensorContainer, check_shapes, concatenated, map_tensors
+
+Size: TypeAlias = tuple[int, int]
+"""Height and width in pixels."""
 
 
 def _check_unit_images(views: Any) -> None:
@@ -42,7 +45,7 @@ class Cameras(TensorContainer):
 
     c2w: Tensor
     intrinsics: Tensor
-    size: tuple[int, int]
+    size: Size
 
     def __post_init__(self) -> None:
         check_shapes(self, c2w="... 4 4", intrinsics="... 4")

@@ -15,6 +15,7 @@ from qgs.checkpoint.tensors import (
     SEAL,
     CheckpointError,
     TensorFile,
+    Weights,
     differing_tensors,
     differing_types,
     nonfinite,
@@ -23,6 +24,7 @@ from qgs.checkpoint.tensors import (
 )
 from qgs.contracts.schedule import END, follow, steps_followed
 from qgs.domain import KEY, Domain
+from qgs.files import AnyPath
 from qgs.machine import TooLargeError
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, RecipeError
@@ -52,7 +54,7 @@ class CheckpointFile(TensorFile):
     Raises FileNotFoundError, and CheckpointError for another kind of file or another format.
     """
 
-    def __init__(self, name: str | os.PathLike[str]) -> None:
+    def __init__(self, name: AnyPath) -> None:
         super().__init__(checkpoint_path(name))
         self.name = os.fspath(name)
         if _RECIPE not in self.metadata:
@@ -143,9 +145,7 @@ class CheckpointFile(TensorFile):
         return (model if device is None else model.to(device)).eval()
 
 
-def load(
-    name: str | os.PathLike[str], device: str | torch.device | None = None
-) -> QueryGaussianModel:
+def load(name: AnyPath, device: str | torch.device | None = None) -> QueryGaussianModel:
     """Load a checkpoint's model in evaluation mode; name, device and errors: `CheckpointFile`."""
     with CheckpointFile(name) as file:
         return file.model(device)
@@ -153,10 +153,10 @@ def load(
 
 def save(
     model: QueryGaussianModel,
-    path: str | os.PathLike[str],
+    path: AnyPath,
     *,
     extra: Mapping[str, str] | None = None,
-    weights: Mapping[str, Tensor] | None = None,
+    weights: Weights | None = None,
 ) -> None:
     """Write the weights of `model` and its resolved recipe to `path`, atomically.
 
@@ -179,8 +179,8 @@ def save(
 
 
 def write_checkpoint(
-    path: str | os.PathLike[str],
-    tensors: Mapping[str, Tensor],
+    path: AnyPath,
+    tensors: Weights,
     tree: Mapping[str, Any],
     releases: Mapping[str, tuple[str, str]],
     extra: Mapping[str, str],
@@ -209,7 +209,7 @@ def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
     return dict(first.values())
 
 
-def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: object) -> None:
+def load_weights(model: nn.Module, tensors: Weights, origin: object) -> None:
     """Copy `tensors`, read from `origin`, into `model`; nothing is copied where one does not fit.
 
     Raises CheckpointError that lists differences in names, shapes and types, and ValueError for NaN
@@ -223,14 +223,14 @@ def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: object
             tensor.copy_(tensors[name])
 
 
-def refuse_nonfinite(tensors: Mapping[str, Tensor], origin: object) -> None:
+def refuse_nonfinite(tensors: Weights, origin: object) -> None:
     """Raise ValueError for NaN and infinity in weights read from `origin`."""
     if broken := nonfinite(tensors):
         fix = "its training had diverged, or the file is damaged: take another"
         raise ValueError(f"{origin}: weights are not finite: {listed(broken)}; {fix}")
 
 
-def refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: object) -> None:
+def refuse_misfit(model: nn.Module, tensors: Weights, origin: object) -> None:
     """Raise CheckpointError with a list of differences between `tensors` and `model`."""
     own = unique_tensors(model)
     differences = differing_tensors(shapes_of(tensors), shapes_of(own))

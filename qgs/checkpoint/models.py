@@ -17,7 +17,7 @@ from urllib.request import Request, urlopen
 from rich.filesize import decimal
 from safetensors import SafetensorError, safe_open
 
-from qgs.files import replacing
+from qgs.files import AnyPath, replacing
 from qgs.paths import opened_path
 from qgs.recipe.registry import available_plugins, load_plugin
 from qgs.terminal import without_secrets
@@ -31,7 +31,7 @@ PATIENCE = 60.0
 """Seconds that a server may stay silent."""
 
 
-def checkpoint_path(name: str | os.PathLike[str]) -> Path:
+def checkpoint_path(name: AnyPath) -> Path:
     """Return the local file of `name`; what exists under that name comes first.
 
     name: a path, of a run folder for the checkpoint in it, PLUGIN/NAME of a model that an installed

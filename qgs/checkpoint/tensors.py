@@ -14,10 +14,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from qgs.files import replacing
+from qgs.files import AnyPath, replacing
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.wording import name_shown
 
+Weights: TypeAlias = Mapping[str, Tensor]
+"""Parameters and buffers of a model, by name."""
 Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
 """Name of a tensor to its shape."""
 SEAL = "qgs.seal"
@@ -37,7 +39,7 @@ class TensorFile:
     Raises OSError and MemoryError of the system, and CheckpointError for any but a whole file.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: AnyPath) -> None:
         self.path = Path(path)
         if not self.path.is_file():
             raise FileNotFoundError(f"no file at {self.path}")
@@ -116,9 +118,7 @@ class TensorFile:
             return resolve(tree)
 
 
-def write_tensors(
-    path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
-) -> None:
+def write_tensors(path: AnyPath, tensors: Weights, metadata: Mapping[str, str]) -> None:
     """Write `tensors`, contiguous and on the CPU, to `path`; see `replacing`. Raises OSError."""
     with replacing(path) as temporary:
         try:
@@ -136,7 +136,7 @@ def seal(metadata: Mapping[str, str]) -> str:
     return blake2b(json.dumps(entries).encode(), digest_size=16).hexdigest()
 
 
-def pickle_kind(path: str | os.PathLike[str]) -> str:
+def pickle_kind(path: AnyPath) -> str:
     """Return the kind of a file that can run code when it is read; "" for any other file."""
     with open(path, "rb") as file:
         start = file.read(9)
@@ -146,12 +146,12 @@ def pickle_kind(path: str | os.PathLike[str]) -> str:
     return next((kind for magic, kind in _PICKLES.items() if start.startswith(magic)), "")
 
 
-def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+def shapes_of(tensors: Weights) -> dict[str, tuple[int, ...]]:
     """Map names to shapes."""
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
-def nonfinite(tensors: Mapping[str, Tensor]) -> list[str]:
+def nonfinite(tensors: Weights) -> list[str]:
     """Return the names of the tensors, all on one device, that hold NaN or infinity."""
     finite = {name: tensor.isfinite().all() for name, tensor in tensors.items()}
     # One read for all: each read would make the host wait for the device.
@@ -170,7 +170,7 @@ def differing_tensors(file: Shapes, recipe: Shapes) -> list[str]:
     ]
 
 
-def differing_types(file: Mapping[str, Tensor], recipe: Mapping[str, Tensor]) -> list[str]:
+def differing_types(file: Weights, recipe: Weights) -> list[str]:
     """List differences in dtypes, one line each, of the tensors that both have.
 
     Half precision in the file fits float32 in the recipe.

@@ -110,11 +110,12 @@ def evaluate_into(
 
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("judging scenes", total=None)
-
-        def observe(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
-        evaluation = judge(model, recipe, step, observe)
+        evaluation = judge(
+            model,
+            recipe,
+            step,
+            lambda done, total: progress.update(task, completed=done, total=total),
+        )
     evaluation.write(folder)
     evaluation.show(console)
     console.print(f"written to {folder}", soft_wrap=True)

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 
 from qgs.cli.evaluate import evaluate_into
+from qgs.cli.inspect import RecipeFile
 from qgs.cli.options import Device, Overrides, Threads, use_threads
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def train(
-    recipe: Annotated[Path, typer.Argument(help="Recipe file.")],
+    recipe: RecipeFile,
     out: Annotated[Path, typer.Option(help="New folder for the run. Never overwrites.")],
     resume: Annotated[
         bool,

@@ -13,7 +13,15 @@ from qgs.contracts.component import (
     RecipeContext,
     without_effect,
 )
-from qgs.contracts.data import Frames, Scene, SceneSource, SceneSourceConfig, Split, ViewSampler
+from qgs.contracts.data import (
+    Frames,
+    Scene,
+    SceneSource,
+    SceneSourceConfig,
+    Split,
+    ViewSampler,
+    Window,
+)
 from qgs.contracts.decoder import (
     LAYER_SLOTS,
     SUBLAYER_SLOTS,
@@ -90,6 +98,7 @@ __all__ = [
     "TrainingConfig",
     "ViewSampler",
     "ViewsConfig",
+    "Window",
     "memory_fields",
     "without_effect",
 ]

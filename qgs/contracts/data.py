@@ -12,11 +12,13 @@ from upath import UPath
 from qgs.contracts.component import Component, ComponentConfig
 from qgs.contracts.schedule import at_step
 from qgs.contracts.settings import ViewsConfig
-from qgs.types import Cameras
+from qgs.types import Cameras, Size
 from qgs.wording import numbered
 
 Split = Literal["train", "test"]
 Frames: TypeAlias = tuple[int, ...]
+Window: TypeAlias = tuple[Frames, Frames]
+"""Input frames, and frames to compare with."""
 Side: TypeAlias = Annotated[int, Field(ge=1)]
 
 
@@ -60,7 +62,7 @@ class Scene(ABC):
         """Return the number and the name of a frame, as text for messages."""
         return numbered(frame, self.frame_name(frame))
 
-    def stored_size(self, frame: int) -> tuple[int, int] | None:
+    def stored_size(self, frame: int) -> Size | None:
         """Return (H, W) of the stored photo; None if images are generated at any size."""
         return None
 
@@ -125,7 +127,7 @@ class SceneSource(Component):
 
     @classmethod
     def config_for(
-        cls, path: str, image_size: tuple[int, int], trained: SceneSourceConfig | None
+        cls, path: str, image_size: Size, trained: SceneSourceConfig | None
     ) -> SceneSourceConfig:
         """Return options that open all frames at `path` for a model trained on other data.
 
@@ -167,9 +169,7 @@ class ViewSampler(Component):
     slot: ClassVar[str] = "view_sampler"
 
     @abstractmethod
-    def draw(
-        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
-    ) -> tuple[Frames, Frames]:
+    def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
         """Draw input frames, ascending, and target frames; raise ValueError for too few frames.
 
         There are at most `views.inputs` input frames, equally many in all samples of a step.
@@ -178,7 +178,7 @@ class ViewSampler(Component):
         evaluation.
         """
 
-    def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
+    def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
         """Return the input and target frames of each window that evaluation scores in a scene.
 
         The default is an empty list: evaluation then makes windows around held-out frames, or draws

@@ -1,14 +1,11 @@
 """Sections of a recipe that are not components: views, training, evaluation."""
 
-from typing import Literal, TypeAlias
+from typing import Literal
 
 from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
 from qgs.precision import Precision
-
-Tuned: TypeAlias = Literal["queries", "latents"]
-"""The parts of a model that test-time tuning can fit."""
 
 
 class ViewsConfig(ComponentConfig):
@@ -133,7 +130,7 @@ class EvaluationConfig(ComponentConfig):
     a file (null), views are drawn."""
     protocol: str | None = None
     """Name of these evaluation settings in tables. null uses the name of the index file."""
-    tuning: Tuned = "queries"
+    tuning: Literal["queries", "latents"] = "queries"
     """Part that tuning fits to a scene's input views: its queries, or the features of its image
     memory ("latents"). "latents" needs an encoder that recomputes keys and values from features."""
     tuning_steps: int = Field(default=0, ge=0)

@@ -18,6 +18,7 @@ from upath import UPath
 
 from qgs.machine import is_out_of_memory
 from qgs.paths import LARGEST, open_file
+from qgs.types import Size
 from qgs.wording import name_shown
 
 TURNED = "have an EXIF orientation, which is ignored: they are read as stored"
@@ -43,8 +44,8 @@ class CropResize:
     zoom: factor by which the crop is smaller than the largest possible one.
     """
 
-    source: tuple[int, int]
-    target: tuple[int, int]
+    source: Size
+    target: Size
     zoom: float = 1.0
 
     @property
@@ -91,7 +92,7 @@ def read_image(path: Path | UPath, decode: Callable[[IO[bytes]], Decoded]) -> De
         ) from error
 
 
-def image_size(file: IO[bytes]) -> tuple[int, int]:
+def image_size(file: IO[bytes]) -> Size:
     """Return (H, W) from the header of an image file; raises OSError if it is not an image."""
     with opened_image(file) as image:
         return image.height, image.width

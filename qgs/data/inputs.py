@@ -7,7 +7,6 @@ with planes parallel to each photo.
 
 import math
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -23,8 +22,6 @@ from qgs.geometry.rays import pixel_directions
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
 
-Window: TypeAlias = tuple[Frames, Frames]
-"""Input frames, and novel frames to compare with."""
 NOVEL = 6
 """Most views to compare with by default."""
 BASELINE = (0.06, 0.25)

@@ -8,6 +8,7 @@ from upath import UPath
 from qgs.contracts import Component, SceneSource, SceneSourceConfig
 from qgs.data.photos import with_cameras
 from qgs.paths import opened_path
+from qgs.types import Size
 from qgs.wording import one_line, warn_once
 
 
@@ -51,7 +52,7 @@ def is_training_data(path: str, trained: SceneSourceConfig | None) -> bool:
 
 def open_for(
     path: str,
-    image_size: tuple[int, int] | None,
+    image_size: Size | None,
     trained: SceneSourceConfig | None,
     sources: Mapping[str, type[Component]],
 ) -> tuple[SceneSource, bool]:

@@ -144,12 +144,12 @@ def views_in(
     wanted = list(frames)
     masks = scene.masks(wanted)
     surface = scene.depths(wanted) if depths else None
-    times = None if scene.times is None else from_0_to_1(scene.times[wanted])
+    times = None if scene.times is None else from_0_to_1(scene.times[wanted])[None].float()
     return Views(
         images=scene.images(wanted)[None],
         cameras=cameras_in(world, scene, frames),
         masks=None if masks is None else masks[None],
-        times=None if times is None else times[None].float(),
+        times=times,
         # Depths scale with the translations of cameras.
         depths=None if surface is None else (surface * world[1].float())[None],
     )
@@ -217,12 +217,11 @@ def mirrored_views(views: Views) -> Views:
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
     flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
-    images, masks, depths = map_tensors(_flipped, (views.images, views.masks, views.depths))
+    images, masks, depths = map_tensors(
+        lambda x: torch.from_numpy(np.ascontiguousarray(x.numpy()[..., ::-1])),
+        (views.images, views.masks, views.depths),
+    )
     return replace(views, images=images, cameras=flipped, masks=masks, depths=depths)
-
-
-def _flipped(images: Tensor) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(images.numpy()[..., ::-1]))
 
 
 def collate(samples: Sequence[Sample]) -> Batch:

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import InitVar, dataclass, replace
 from functools import cached_property, partial
-from itertools import count, islice
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -274,25 +274,3 @@ def _prepare_worker(number: int) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     # Python's normal exit aborts if the thread that sends batches is inside torch.
     atexit.register(os._exit, 0)
-
-
-@dataclass
-class Feed:
-    """Batches of the next optimiser step, or the error from fetching them.
-
-    `count` batches are fetched during a step, so that processes can agree on failures at its end.
-    """
-
-    stream: Iterator[Batch]
-    count: int
-    batches: Sequence[Batch] = ()
-    error: Exception | None = None
-
-    def fetch(self) -> None:
-        """Fetch the `count` batches of the next step; on failure store the error in `error`."""
-        try:
-            self.batches = list(islice(self.stream, self.count))
-        # The trainer raises it when all processes know of it.
-        except Exception as error:
-            self.batches = ()
-            self.error = error

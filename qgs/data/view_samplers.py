@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig
+from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig, Window
 from qgs.contracts.component import ComponentConfig
 from qgs.machine import refuse_more_than_memory
 from qgs.wording import warn_once
@@ -129,9 +129,7 @@ class Span(ViewSampler):
         if config.min_gap and config.max_gap and config.min_gap > config.max_gap:
             yield Problem("min_gap", "it is larger than `max_gap`", "raise `max_gap`")
 
-    def draw(
-        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
-    ) -> tuple[Frames, Frames]:
+    def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
         """See `ViewSampler`."""
         options = self.options(step)
         high = options.max_gap or views.gap[1]

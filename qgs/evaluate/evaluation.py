@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from qgs.contracts import Column, Frames, Metric, MetricInput, ViewSampler
+from qgs.contracts import Column, Metric, MetricInput, ViewSampler, Window
 from qgs.data.samples import Sample
 from qgs.domain import REMEDY, Domain, verdict
 from qgs.evaluate.plan import EvaluationPlan, ViewsOf
@@ -179,7 +179,7 @@ class _Scorer:
     def score(self, scene: str, samples: Iterable[Sample]) -> SceneScore:
         """Return the score of a scene; one failed sample fails it. ValueError for NaN."""
         found: list[dict[str, float]] = []
-        views: list[tuple[Frames, Frames]] = []
+        views: list[Window] = []
         names: dict[int, str] = {}
         for sample in samples:
             found.append(self._values(sample))

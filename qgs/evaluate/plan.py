@@ -1,13 +1,13 @@
 """Views that an evaluation compares: drawn by seed, or named by an index file."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, ViewsConfig
+from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, ViewsConfig, Window
 from qgs.contracts.schedule import END
 from qgs.data.samples import Frames, Sample, make_sample
 from qgs.data.view_samplers import evenly, gap_range, moments, spread
@@ -36,18 +36,6 @@ EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 
 ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
 """Function of a scene, input and target frames; it returns the settings of their sample."""
-
-GIVEN = "frames as context and as target"
-"""Words for `given_targets`.
-
-Their scores mean nothing: the nearest input view is the target itself.
-"""
-
-
-def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:
-    """Return the frames, in order, that are input and target."""
-    return tuple(sorted(set(inputs) & set(targets)))
-
 
 _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
 
@@ -125,7 +113,7 @@ class EvaluationPlan:
             for part in [targets] if scene.times is None else moments(scene, targets):
                 yield make_sample(scene, inputs, part, views, False, noise, self.depths)
 
-    def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
+    def _choices(self, scene: Scene, place: int) -> Iterator[Window]:
         """Yield input and target frames of each sample."""
         sampler = self.sampler
         # What somebody chose comes first: an index, then windows of the sampler's own. Held-out
@@ -145,7 +133,7 @@ class EvaluationPlan:
                 yield inputs, tuple(sorted({*every} - {*inputs} or {*drawn}))
 
 
-def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
+def held_out_windows(scene: Scene, views: ViewsConfig) -> list[Window]:
     """Return input and target frames such that every held-out frame is a target once.
 
     A window of the largest gap (in training frames, or times) is centred on the first such frame
@@ -155,7 +143,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Fra
     gap = gap_range(len(usable), views, scene)[1]
     when = np.arange(len(scene)) if scene.times is None else scene.times.numpy()
     starts = when[[frames[0] for frames in usable]]
-    windows: list[tuple[Frames, Frames]] = []
+    windows: list[Window] = []
     covered: set[int] = set()
     for frame in sorted(scene.held_out, key=lambda frame: (when[frame], frame)):
         if frame in covered:
@@ -173,7 +161,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Fra
     return windows
 
 
-def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
+def _named(scene: Scene, index: EvaluationIndex) -> Window:
     """Return the frames of `scene` that `index` names. Raises ValueError if one is missing."""
     entry = index[scene.name]
     assert entry is not None

@@ -12,9 +12,7 @@ from typing import Any
 from rich.box import MARKDOWN
 from rich.console import Console
 
-from qgs.contracts import Column
-from qgs.data.samples import Frames
-from qgs.evaluate.plan import GIVEN, given_targets
+from qgs.contracts import Column, Window
 from qgs.evaluate.protocol import Protocol
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
@@ -34,14 +32,17 @@ class SceneScore:
     """
 
     scene: str
-    views: Sequence[tuple[Frames, Frames]]
+    views: Sequence[Window]
     values: Mapping[str, float]
     names: Mapping[int, str]
 
     @property
     def given(self) -> list[int]:
-        """Frames that one of the samples has as input and as target."""
-        both = [given_targets(*frames) for frames in self.views]
+        """Frames that one of the samples has as input and as target.
+
+        Their scores mean nothing: the nearest input view is the target itself.
+        """
+        both = [{*inputs}.intersection(targets) for inputs, targets in self.views]
         return sorted(set().union(*both))
 
 
@@ -90,7 +91,16 @@ class Evaluation:
             "columns": {name: asdict(column) for name, column in self.columns.items()},
             **{method: self.means(method) for method in METHODS},
             "incomplete": self.incomplete,
-            "over_scenes": {name: _spread(found) for name, found in values.items() if found},
+            "over_scenes": {
+                name: {
+                    "mean": fmean(found),
+                    "variance": pvariance(found),
+                    "median": median(found),
+                    "scenes": len(found),
+                }
+                for name, found in values.items()
+                if found
+            },
             "gaussians": self.gaussians,
             "gaussians_used": {"opacity_above": OPACITY_USED, "mean": self.mean("gaussians_used")},
             "tuning": self.protocol.content["tuning"],
@@ -181,8 +191,8 @@ class Evaluation:
         yield from (f"missing {scene}: {why}" for scene, why in [*self.missing.items()][:10])
         if given := [score.scene for score in self.scores if score.given]:
             yield (
-                f"{counted(len(given), 'scene')} with {GIVEN}, on which the nearest input view is "
-                f"perfect: {listed(given)}"
+                f"{counted(len(given), 'scene')} with frames as context and as target, on "
+                f"which the nearest input view is perfect: {listed(given)}"
             )
         for name, why in self.incomplete.items():
             yield f"{self.columns[name].heading} is not complete: {why}"
@@ -196,15 +206,6 @@ class Evaluation:
                 tuning
             )
         yield from self.remarks
-
-
-def _spread(values: Sequence[float]) -> dict[str, float]:
-    return {
-        "mean": fmean(values),
-        "variance": pvariance(values),
-        "median": median(values),
-        "scenes": len(values),
-    }
 
 
 def as_json(value: Mapping[str, Any]) -> str:

@@ -5,11 +5,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.precision import full_precision
-from qgs.types import Cameras
+from qgs.types import Cameras, Size
 
 
 @full_precision
-def pixel_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+def pixel_directions(intrinsics: Tensor, size: Size) -> Tensor:
     """Return camera-frame directions with z = 1 through the pixel centres.
 
     intrinsics (..., 4) -> (..., H, W, 3). The centre of the first pixel is (0.5, 0.5).

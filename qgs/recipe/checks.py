@@ -3,7 +3,7 @@
 Fields are followed from writer to reader in the order of a forward pass.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -224,13 +224,13 @@ def _offered(component: type[Component], config: ComponentConfig | None) -> Fiel
     return {}
 
 
-def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
+def keys_are_read(parts: Parts) -> bool:
     """Return whether any component reads keys or values of the image memory."""
     wanted = {"memory.keys", "memory.values"}
     return any(wanted & part.component.fields_read(part.config).keys() for part in parts.values())
 
 
-def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
+def idle_fields(parts: Parts) -> Iterator[str]:
     """Yield a sentence for each learnable field of the queries that only refinements read."""
     read = set[str]()
     for path, part in parts.items():
@@ -246,7 +246,7 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
             )
 
 
-def unfinished(parts: Mapping[KeyPath, Chosen], steps: int) -> Iterator[str]:
+def unfinished(parts: Parts, steps: int) -> Iterator[str]:
     """Yield a sentence for each schedule that goes on after `steps` steps."""
     # Once for the template of a decoder, not for each layer.
     for part in {part.source: part for part in parts.values()}.values():

@@ -16,7 +16,7 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe.build import build, build_model, load_pretrained, rate_factors
 from qgs.recipe.causes import at_their_causes
 from qgs.recipe.checks import check, idle_fields, unfinished
-from qgs.recipe.decode import Chosen
+from qgs.recipe.decode import Chosen, Parts
 from qgs.recipe.errors import Origin, Problems, RecipeError
 from qgs.recipe.files import apply_overrides, read_recipe
 from qgs.recipe.sections import SETTINGS, Draft, draft_of
@@ -37,7 +37,7 @@ class Recipe:
 
     tree: Mapping[str, Any]
     provenance: Mapping[str, str]
-    parts: Mapping[KeyPath, Chosen]
+    parts: Parts
     dims: contracts.ModelDims
     layer_scale: float
     seed: int
@@ -176,7 +176,7 @@ _Spelled: TypeAlias = Iterator[tuple[KeyPath, Any, Origin | str]]
 """Path, value and origin of each value."""
 
 
-def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> _Spelled:
+def spell_out(draft: Draft, parts: Parts) -> _Spelled:
     """Yield all values of a draft, in the order of a recipe, with only the plugins in use."""
     shown = _shown_parts(parts)
     top, model, decoder, *sections = SETTINGS
@@ -223,7 +223,7 @@ def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
     return ("plugins",), kept, ", ".join(dict.fromkeys(lines)) or origin
 
 
-def _shown_parts(parts: Mapping[KeyPath, Chosen]) -> dict[KeyPath, Chosen]:
+def _shown_parts(parts: Parts) -> dict[KeyPath, Chosen]:
     """Return parts in the form of a recipe: the decoder's template, and layers that differ.
 
     If all layers have the same component, it becomes the template.

@@ -84,7 +84,7 @@ class ListNode(list[Any]):
     def __init__(self, items: Iterable[tuple[Any, Origin]]) -> None:
         entries = [*items]
         super().__init__(value for value, _ in entries)
-        self.origins = {index: origin for index, (_, origin) in enumerate(entries)}
+        self.origins = dict(enumerate(origin for _, origin in entries))
 
 
 Node: TypeAlias = MapNode | ListNode | str | int | float | None

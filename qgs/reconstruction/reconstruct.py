@@ -2,29 +2,30 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from os import PathLike, fspath
+from os import fspath
 
 from torch import Tensor
 
-from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.inputs import NOVEL, Frusta, Window, ranked_windows
+from qgs.contracts import Frames, Scene, ViewsConfig, Window
+from qgs.data.inputs import NOVEL, Frusta, ranked_windows
 from qgs.data.samples import Sample, make_sample
 from qgs.data.view_samplers import evenly, moments, spread
 from qgs.domain import Domain, verdict
 from qgs.evaluate.tuning import tune as tuned_on
 from qgs.evaluate.tuning import tuning_settings
+from qgs.files import AnyPath
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
 from qgs.reconstruction.scale import constant_scale, find_scale, photo_settings
-from qgs.reconstruction.scenes import FrameNames, GivenScene, Size, chosen_scene, frame_list
-from qgs.types import Views
+from qgs.reconstruction.scenes import FrameNames, GivenScene, chosen_scene, frame_list
+from qgs.types import Size, Views
 from qgs.wording import counted, listed
 
 
 def reconstruct(
     model: QueryGaussianModel,
-    photos: str | PathLike[str] | Views,
+    photos: AnyPath | Views,
     *,
     inputs: int | None = None,
     frames: FrameNames | None = None,

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import torch
 from qgs.containers import concatenated
 from qgs.data.samples import Sample
 from qgs.domain import REMEDY
+from qgs.files import AnyPath
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
@@ -83,8 +83,8 @@ class Reconstruction:
             seen = self.model.render(self.gaussians, own)
         return replace(seen, depth=seen.depth / float(scale))
 
-    def save(self, out: str | PathLike[str]) -> list[Path]:
-        """Write the same files as `qgs reconstruct` to the folder `out`; return their paths."""
+    def save(self, out: AnyPath) -> list[Path]:
+        """Write the files of `qgs reconstruct` and return their paths."""
         # Matplotlib is slow to import.
         from qgs.reconstruction.saving import write_reconstruction
 

@@ -1,7 +1,7 @@
 """One scene from photos of a user: from a folder, from its URL or from Views."""
 
 from collections.abc import Sequence
-from os import PathLike, fspath
+from os import fspath
 from typing import TypeAlias
 
 import torch
@@ -11,19 +11,19 @@ from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceCon
 from qgs.data.recognition import open_for
 from qgs.data.samples import views_in
 from qgs.data.view_samplers import training_frames
+from qgs.files import AnyPath
 from qgs.recipe import Recipe
 from qgs.recipe.registry import load_usable_plugins
-from qgs.types import Cameras, Views
+from qgs.types import Cameras, Size, Views
 from qgs.wording import listed, warn_once
 
 HOLDOUT = 8
 """Every HOLDOUT-th photo of a user's scene is held out to score the result (Mip-NeRF 360)."""
 FrameNames: TypeAlias = str | Sequence[int | str]
-Size: TypeAlias = tuple[int, int]
 
 
 def read_photos(
-    folder: str | PathLike[str],
+    folder: AnyPath,
     *,
     size: Size | None = None,
     frames: FrameNames | None = None,
@@ -38,9 +38,8 @@ def read_photos(
     """
     found = photo_scene(fspath(folder), size, scene)
     wanted = range(len(found)) if frames is None else frame_list(frames, "frames", found)
-    origin = torch.eye(4, dtype=torch.float64)
-    unit = torch.ones((), dtype=torch.float64)
-    return views_in((origin, unit), found, tuple(wanted))
+    own = (torch.eye(4).double(), torch.ones(()).double())
+    return views_in(own, found, tuple(wanted))
 
 
 def photo_scene(path: str, size: Size | None, name: str | None) -> Scene:

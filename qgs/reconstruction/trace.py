@@ -19,8 +19,6 @@ from qgs.contracts import AttentionWeights
 from qgs.model import QueryGaussianModel
 from qgs.types import ImageMemory, QueryState
 
-ATTENTIONS = ("cross_attention", "self_attention")
-
 
 @dataclass
 class LayerTrace(TensorContainer):
@@ -55,7 +53,6 @@ class Trace:
     def _start(self, module: nn.Module, args: Any) -> None:
         """Delete the record of the previous pass when the model starts."""
         self.layers.clear()
-        self.grid = None
         self._current = 0
 
     def _enter(self, module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
@@ -107,7 +104,7 @@ def trace(
     handles = [model.register_forward_pre_hook(recorded._start)]
     for layer in model.decoder:
         handles.append(layer.register_forward_pre_hook(recorded._enter))
-        for part in ATTENTIONS:
+        for part in ("cross_attention", "self_attention"):
             if hasattr(layer, part):
                 hook = partial(recorded._explain, part)
                 handles.append(getattr(layer, part).register_forward_pre_hook(hook))

@@ -13,7 +13,7 @@ from qgs.contracts import Renderer, RendererConfig
 from qgs.contracts.renderer import background_of, channels_of, check_inputs, raise_precision
 from qgs.machine import in_threads
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
-from qgs.types import Cameras, Gaussians, Rendering
+from qgs.types import Cameras, Gaussians, Rendering, Size
 
 _TILE = 16
 # Gaussians per unit of the projection.
@@ -161,8 +161,8 @@ class _Splat(torch.autograd.Function):
         return *of_inputs, F.pad(pose, (0, 0, 0, 1)), lens, None, None
 
 
-def _limits(config: RendererConfig, size: tuple[int, int]) -> list[tuple[Any, ...]]:
-    """Return the options of the projection kernel and those of the blending kernel."""
+def _limits(config: RendererConfig, size: Size) -> list[tuple[Any, ...]]:
+    """Return the kernels' options for the projection and for the blending."""
     projection = (config.near, config.far, config.dilation, config.alpha_min, CLAMP_MARGIN, *size)
     blending = (config.alpha_min, config.alpha_cap, config.transmittance_min)
     return [tuple(map(np.float32, options)) for options in (projection, blending)]
@@ -172,11 +172,8 @@ def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
     return tuple(tensor.detach().numpy() for tensor in tensors)
 
 
-def _parts(splats: Any, size: tuple[int, int]) -> tuple[list[_Part], list[_Part]]:
-    """Return units of work: numbered ranges of Gaussians, and numbered ranges of tile rows.
-
-    An image is divided into several ranges of rows if there are few images.
-    """
+def _parts(splats: Any, size: Size) -> tuple[list[_Part], list[_Part]]:
+    """Return numbered ranges of Gaussians, and of tile rows (several if images are few)."""
     batch, views, count, _ = splats.shape
     chunks = pairwise([*range(0, count, _CHUNK), count])
     rows = -(-size[0] // _TILE)

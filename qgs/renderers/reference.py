@@ -13,7 +13,7 @@ from qgs.contracts import Renderer, RendererConfig
 from qgs.contracts.renderer import background_of, channels_of, check_inputs, raise_precision
 from qgs.geometry.constants import constant
 from qgs.geometry.transforms import quat_to_matrix, to_camera, to_pixels
-from qgs.types import Cameras, Gaussians, Rendering
+from qgs.types import Cameras, Gaussians, Rendering, Size
 
 # Fraction of the image's width or height; farther outside, the Jacobian is constant.
 CLAMP_MARGIN = 0.15
@@ -141,7 +141,7 @@ def _weights(
     means: Tensor,
     conics: Tensor,
     opacities: Tensor,
-    size: tuple[int, int],
+    size: Size,
     config: RendererConfig,
 ) -> Tensor:
     """Return the blending weights (G, H, W) of splats at all pixels of an image.

@@ -55,7 +55,6 @@ class OneCycleAdamW(Optimizer):
         self.peak = config.learning_rate
         self.first = config.learning_rate / config.initial_divisor
         self.last = self.first / config.final_divisor
-        self.budget = self.training.seconds or math.inf
         self._descent_starts: float | None = None
 
     def check(self) -> None:
@@ -80,7 +79,7 @@ class OneCycleAdamW(Optimizer):
             return super().learning_rate(step, seconds)
         # steps - 1: the last step has the last rate, as in torch's OneCycleLR.
         of_steps = step / max(self.training.steps - 1, 1)
-        of_seconds = seconds / self.budget
+        of_seconds = seconds / (self.training.seconds or math.inf)
         used = min(max(of_steps, of_seconds), 1.0)
         if self._descent_starts is None:
             top = self.options.warmup - 1

@@ -1,7 +1,5 @@
 """Devices and processes of a run; requests to stop."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
@@ -26,8 +24,6 @@ TIMEOUT = timedelta(hours=24)
 NCCL's default of 10 minutes would end such runs. If a process dies, the launcher ends the others.
 """
 
-_PARALLEL = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
-
 
 def make_accelerator(device: str, unread: bool) -> Accelerator:
     """Return an Accelerator for the processes that a launcher started (DDP), or for this one alone.
@@ -41,7 +37,11 @@ def make_accelerator(device: str, unread: bool) -> Accelerator:
     accelerator = Accelerator(
         cpu=device == "cpu", mixed_precision="no", kwargs_handlers=[group, parallel]
     )
-    if accelerator.distributed_type not in _PARALLEL:
+    if accelerator.distributed_type not in (
+        DistributedType.NO,
+        DistributedType.MULTI_CPU,
+        DistributedType.MULTI_GPU,
+    ):
         kind = accelerator.distributed_type.value
         raise ValueError(f"training supports one process or DDP only: launch it without {kind}")
     return accelerator

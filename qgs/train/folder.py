@@ -11,11 +11,10 @@ import torch
 from accelerate import PartialState
 from accelerate.utils import wait_for_everyone
 from filelock import FileLock, Timeout
-from torch import Tensor
 
 from qgs.checkpoint.model_file import load_weights, save, unique_tensors
 from qgs.checkpoint.models import CHECKPOINT
-from qgs.checkpoint.tensors import CheckpointError, TensorFile, write_tensors
+from qgs.checkpoint.tensors import CheckpointError, TensorFile, Weights, write_tensors
 from qgs.containers import map_tensors, named_tensors
 from qgs.domain import KEY, Domain
 from qgs.files import is_leftover, naming_full_disk, read_records, write_text
@@ -163,7 +162,7 @@ class Saver:
     model: QueryGaussianModel
     stateful: dict[str, Any] = field(default_factory=dict)
 
-    def save(self, step: int, good: tuple[int, Mapping[str, Tensor]] | None = None) -> None:
+    def save(self, step: int, good: tuple[int, Weights] | None = None) -> None:
         """Save the run after `step` optimiser steps.
 
         good: steps and weights to save as the checkpoint instead of the present ones. The
@@ -183,7 +182,7 @@ class Saver:
             self._write_state(states)
         wait_for_everyone()
 
-    def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
+    def save_checkpoint(self, step: int, weights: Weights) -> None:
         """Save a checkpoint with the given weights instead of the present ones."""
         if PartialState().is_main_process:
             self._write_checkpoint(self.folder.checkpoint, step, weights)
@@ -203,7 +202,7 @@ class Saver:
                     f"part `{name}` cannot be restored ({type(error).__name__}: {error})"
                 ) from error
 
-    def _write_checkpoint(self, path: Path, step: int, weights: Mapping[str, Tensor]) -> None:
+    def _write_checkpoint(self, path: Path, step: int, weights: Weights) -> None:
         domain = self.model.trained_on or Domain()
         save(self.model, path, extra={"step": str(step), KEY: domain.text}, weights=weights)
 

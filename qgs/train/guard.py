@@ -10,10 +10,10 @@ from typing import Any, NoReturn
 
 from accelerate import PartialState
 from accelerate.utils import gather_object
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.checkpoint.model_file import unique_tensors
-from qgs.checkpoint.tensors import nonfinite
+from qgs.checkpoint.tensors import Weights, nonfinite
 from qgs.containers import named_tensors
 from qgs.contracts import TrainingConfig
 from qgs.data.samples import Batch
@@ -251,11 +251,11 @@ class GoodWeights:
     best: float | None = None
 
     def __post_init__(self) -> None:
-        self.copies: list[tuple[int, Mapping[str, Tensor]]] = []
+        self.copies: list[tuple[int, Weights]] = []
         self.refresh(0)
 
     @property
-    def last(self) -> tuple[int, Mapping[str, Tensor]]:
+    def last(self) -> tuple[int, Weights]:
         """Number of optimiser steps and the weights after them, from the older copy."""
         return self.copies[0]
 
@@ -308,57 +308,52 @@ def first_bad_tensor(
     Torch's anomaly mode would name an operation instead of a module. It also misses infinities, and
     raises in the middle of a step while other processes wait.
     """
-    watch = _Watch(batches)
+    found: list[str] = []
+    coming = iter(batches)
+    batch = batches[0]
+
+    def see(name: str, value: Any) -> None:
+        """Check `value`: a tensor, or nested mappings, sequences and containers of tensors."""
+        for path, tensor in named_tensors(value, name):
+            bad = tensor[~tensor.isfinite()]
+            if bad.numel() and not found:
+                values = f"{bad.numel()} of {tensor.numel()} values, the first {bad[0].item()}"
+                found.append(f"the first bad tensor is {path} ({values}), with {_samples(batch)}")
+
+    def see_batch(module: nn.Module, arguments: Sequence[Any]) -> None:
+        nonlocal batch
+        batch = next(coming)
+        inputs, targets = arguments
+        see("inputs", inputs)
+        see("targets", targets)
+
+    def see_output(name: str, module: nn.Module, arguments: Any, output: Any) -> None:
+        see(f"output of {name}", output)
+        for path, tensor in named_tensors(output, f"gradient of the output of {name}"):
+            # Gradients arrive in reverse order: the first bad one is nearest to the loss.
+            if tensor.requires_grad:
+                tensor.register_hook(partial(see, path))
+
     for name, tensor in unique_tensors(training_pass).items():
-        watch.see(f"weight {name}", tensor)
-    handles = [training_pass.register_forward_pre_hook(watch.see_batch)]
+        see(f"weight {name}", tensor)
+    handles = [training_pass.register_forward_pre_hook(see_batch)]
     for name, module in training_pass.named_modules():
         if name:
-            handles.append(module.register_forward_hook(partial(watch.see_output, name)))
+            handles.append(module.register_forward_hook(partial(see_output, name)))
     for name, parameter in training_pass.named_parameters():
         if parameter.requires_grad:
-            handles.append(parameter.register_hook(partial(watch.see, f"gradient of {name}")))
+            handles.append(parameter.register_hook(partial(see, f"gradient of {name}")))
     try:
         repeat()
     finally:
         for handle in handles:
             handle.remove()
-    return watch.found
+    return "".join(found)
 
 
-class _Watch:
-    """Search for the first tensor that is not finite, in the order of computation."""
-
-    def __init__(self, batches: Sequence[Batch]) -> None:
-        self.found = ""
-        self._batch = batches[0]
-        self._coming = iter(batches)
-
-    def see(self, name: str, value: Any) -> None:
-        """Check `value`: a tensor, or nested mappings, sequences and containers of tensors."""
-        for path, tensor in named_tensors(value, name):
-            bad = tensor[~tensor.isfinite()]
-            if bad.numel() and not self.found:
-                values = f"{bad.numel()} of {tensor.numel()} values, the first {bad[0].item()}"
-                self.found = f"the first bad tensor is {path} ({values}), with {self._samples()}"
-
-    def _samples(self) -> str:
-        batch = self._batch
-        drawn = zip(batch.scenes, batch.input_frames, batch.target_frames, strict=True)
-        return ", ".join(
-            f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
-            for scene, inputs, targets in drawn
-        )
-
-    def see_batch(self, module: nn.Module, arguments: Sequence[Any]) -> None:
-        self._batch = next(self._coming)
-        inputs, targets = arguments
-        self.see("inputs", inputs)
-        self.see("targets", targets)
-
-    def see_output(self, name: str, module: nn.Module, arguments: Any, output: Any) -> None:
-        self.see(f"output of {name}", output)
-        for path, tensor in named_tensors(output, f"gradient of the output of {name}"):
-            # Gradients arrive in reverse order: the first bad one is nearest to the loss.
-            if tensor.requires_grad:
-                tensor.register_hook(partial(self.see, path))
+def _samples(batch: Batch) -> str:
+    drawn = zip(batch.scenes, batch.input_frames, batch.target_frames, strict=True)
+    return ", ".join(
+        f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
+        for scene, inputs, targets in drawn
+    )

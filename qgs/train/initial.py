@@ -1,12 +1,16 @@
 """Option `init_from`: training that starts from the weights of another training."""
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, load_weights, unique_tensors
-from qgs.checkpoint.tensors import CheckpointError, Shapes, differing_tensors, shapes_of
+from qgs.checkpoint.tensors import (
+    CheckpointError,
+    Shapes,
+    Weights,
+    differing_tensors,
+    shapes_of,
+)
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.recipe.recipe import differing_predictions
@@ -66,12 +70,12 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     return [f"weights start from {path}", *changes, *(f"learned with {o}" for o in options)]
 
 
-def _part(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _part(prefix: str, weights: Weights) -> dict[str, Tensor]:
     """Return the weights of one part of the model, by their names inside that part."""
     return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 
-def _comparable(tensors: Mapping[str, Tensor], count: int | None) -> Shapes:
+def _comparable(tensors: Weights, count: int | None) -> Shapes:
     """Return shapes by name, with -1 for the number of queries `count`, which may differ."""
     return {
         name: (-1, *shape[1:]) if name.startswith(_QUERIES) and shape[:1] == (count,) else shape

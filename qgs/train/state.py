@@ -29,7 +29,12 @@ def make_optimizer(
     Raises ValueError if all parameters are frozen.
     """
     groups: defaultdict[tuple[bool, float], list[nn.Parameter]] = defaultdict(list)
-    components = {name: m for name, m in module.named_modules() if isinstance(m, ModelComponent)}
+    decays: dict[nn.Parameter, bool] = {}
+    # Modules come before those inside them, so the innermost component has the last word.
+    for component in module.modules():
+        if isinstance(component, ModelComponent):
+            inside = component.named_parameters()
+            decays |= {parameter: component.decays(name, parameter) for name, parameter in inside}
     for name, parameter in module.named_parameters():
         factor = factors[name]
         # Freezing, unlike a rate of 0, also avoids gradients, moments and weight decay.
@@ -38,13 +43,8 @@ def make_optimizer(
         if not parameter.requires_grad:
             continue
         # Biases and gains of norms are 1-d; decay would make them worse.
-        decays = parameter.ndim != 1
-        # Modules come before those inside them, so the innermost component has the last word.
-        for outer, component in components.items():
-            if not outer or name.startswith(f"{outer}."):
-                inner = name.removeprefix(outer).removeprefix(".")
-                decays = component.decays(inner, parameter)
-        groups[not decays, factor].append(parameter)
+        stays = not decays.get(parameter, parameter.ndim != 1)
+        groups[stays, factor].append(parameter)
     if not groups:
         raise ValueError("optimizer.parts freezes every parameter: leave at least one to train")
     # Sorted, so that the groups are the same in every process and after a resume.

@@ -7,7 +7,7 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from qgs.contracts import SceneSource
 from qgs.contracts.schedule import follow
 from qgs.data.samples import Batch
 from qgs.data.stream import (
-    Feed,
     SampleError,
     scenes_fingerprint,
     trained_domain,
@@ -146,10 +145,10 @@ class Trainer:
                 self.saver.restore(saved)
             self.resumed_at = self.counters.step if saved else None
             self._follow_schedules()
-            batches = self._open_data(source)
-            resources.callback(batches.close)
-            self.feed = Feed(batches, self.config.accumulate)
-            self.feed.fetch()
+            self._stream = self._open_data(source)
+            resources.callback(self._stream.close)
+            self._no_batches: Exception | None = None
+            self._fetch()
             self._resources = resources.pop_all()
 
     def close(self) -> None:
@@ -226,6 +225,17 @@ class Trainer:
             depths=self.training_pass.reads_depths,
         )
 
+    def _fetch(self) -> None:
+        """Fetch the batches of the next step, or store the error.
+
+        It runs during a step, so that processes can agree on failures at its end.
+        """
+        try:
+            self._batches = list(islice(self._stream, self.config.accumulate))
+        # Raised when all processes know of it.
+        except Exception as error:
+            self._no_batches = error
+
     def _follow_schedules(self) -> None:
         scheduled = (*self.training_pass.modules(), self.training_pass.objective, self.optimizer)
         follow(scheduled, self.counters.step)
@@ -255,7 +265,7 @@ class Trainer:
     def _one_step(self, progress: TrainingProgress, stop: StopRequest) -> None:
         """Run one optimiser step, record it, and save and evaluate if due."""
         counters = self.counters
-        batches = self.feed.batches
+        batches = self._batches
         numbers = self._compute(batches, stop)
         symptom = not_finite(numbers)
         if not symptom:
@@ -299,7 +309,7 @@ class Trainer:
             measured = self._gradients(batches)
         # Before the numbers are read, so that a GPU computes gradients at the same time.
         if not stop and step + 1 < self.config.steps:
-            self.feed.fetch()
+            self._fetch()
         return {"lr": rate, **self.counters.read(measured)}
 
     def _open_folder(self) -> None:
@@ -349,7 +359,7 @@ class Trainer:
 
     def _refuse_missing_batches(self) -> None:
         """Save the run and raise in all processes if one process has no next batches."""
-        own = self.feed.error
+        own = self._no_batches
         if not any(gather_object([own is not None])):
             return
         error = own or SampleError(ELSEWHERE)

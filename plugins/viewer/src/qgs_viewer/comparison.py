@@ -13,8 +13,8 @@ import yaml
 
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.models import about, checkpoint_path
-from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.inputs import Frusta, Window, ranked_windows
+from qgs.contracts import Frames, Scene, ViewsConfig, Window
+from qgs.data.inputs import Frusta, ranked_windows
 from qgs.data.recognition import is_training_data, open_for
 from qgs.data.view_samplers import Span
 from qgs.domain import Domain
