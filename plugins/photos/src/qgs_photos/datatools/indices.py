@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from upath import UPath
 
-from qgs.evaluate.plan import GIVEN, IndexEntry, given_targets, read_index
+from qgs.evaluate.plan import IndexEntry, read_index
 from qgs.paths import read_json
 from qgs_photos.datatools.findings import Finding, SceneReport, spans
 
@@ -53,7 +53,7 @@ def _entry_findings(
         reason = f"{index} has frames {spans(outside)}, but the scene's are 0 to {frames - 1}"
         fix = "correct the index, or add the missing frames to the scene"
         yield Finding(name, reason, fix)
-    if given := given_targets(entry.context, entry.target):
-        reason = f"{index} has {GIVEN}: {spans(given)}"
+    if given := sorted({*entry.context}.intersection(entry.target)):
+        reason = f"{index} has frames as context and as target: {spans(given)}"
         fix = "judge models on frames that they are not given"
         yield Finding(name, reason, fix, severity="warning")
