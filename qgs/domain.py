@@ -104,6 +104,17 @@ class Domain:
             domain.values[name] = ends
         return domain
 
+    def differences(self, found: Domain) -> dict[str, str]:
+        """Describe, by name, each range in which `found` leaves the trained range."""
+        phrases: dict[str, str] = {}
+        seen = found.ranges
+        for name, trained in self.ranges.items():
+            low, high = seen.get(name, trained)
+            if low * TOLERANCE < trained[0] or high > trained[1] * TOLERANCE:
+                words = WORDS[name].format(_shown((low, high)))
+                phrases[name] = f"{words} (trained: {_shown(trained)})"
+        return phrases
+
 
 def verdict(trained: Domain, found: Domain) -> str:
     """Return a sentence on whether cameras lie in the trained range, with advice if they do not.
@@ -112,16 +123,9 @@ def verdict(trained: Domain, found: Domain) -> str:
     """
     if not trained.values:
         return "the checkpoint does not record the views on which this model was trained"
-    seen = found.ranges
-    outside: list[str] = []
-    for name, ends in trained.ranges.items():
-        low, high = seen.get(name, ends)
-        if low * TOLERANCE < ends[0] or high > ends[1] * TOLERANCE:
-            words = WORDS[name].format(_shown((low, high)))
-            outside.append(f"{words} (trained: {_shown(ends)})")
-    if outside:
+    if outside := trained.differences(found):
         return (
-            f"the views lie outside the range of the training: {', '.join(outside)}. "
+            f"the views lie outside the range of the training: {', '.join(outside.values())}. "
             f"Expect a worse result; {REMEDY}"
         )
     return (
