@@ -63,6 +63,11 @@ class LearnedQueries(Queries):
 
     reads_cameras = False
 
+    @property
+    def count(self) -> int:
+        """Number N of queries: the option `count`."""
+        return getattr(self.config, "count")  # noqa: B009 (an option of subclasses)
+
     @abstractmethod
     def start(self, batch_size: int) -> QueryState:
         """Return the initial state for `batch_size` scenes, the same in each."""
