@@ -79,10 +79,7 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Write gradients of the numbers of queries to `out`.
-
-    gradient: of the bias. If g is the gradient of e = m - mu x d, then that of mu is g x d.
-    """
+    """Write gradients of the numbers of queries to `out`; `gradient` is the one of the bias."""
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]
@@ -122,6 +119,7 @@ def gradients(queries, tokens, gradient, out):
             e0 = a0 * c[0] + a1 * c[3] + a2 * c[6]
             e1 = a0 * c[1] + a1 * c[4] + a2 * c[7]
             e2 = a0 * c[2] + a1 * c[5] + a2 * c[8]
+            # If g is the gradient of e = m - mu x d, then that of mu is g x d.
             of_x += e1 * tokens[5, j] - e2 * tokens[4, j]
             of_y += e2 * tokens[3, j] - e0 * tokens[5, j]
             of_z += e0 * tokens[4, j] - e1 * tokens[3, j]
@@ -139,5 +137,4 @@ def gradients(queries, tokens, gradient, out):
             w8 += b2 * t
         _store(of, (of_x, of_y, of_z, c0, c1, c2, c3, c4, c5, c6, c7, c8))
         _store(of[12:], (w0, w1, w2, w3, w4, w5, w6, w7, w8))
-        of[21] = of_factor
-        of[22] = of_lower
+        _store(of[21:], (of_factor, of_lower))
