@@ -1,15 +1,15 @@
-"""The composer: from a recipe to a checked, reproducible model.
+"""The composer: it turns a recipe into a checked, reproducible model.
 
-`compose` makes the model. `resolve` merges and checks a recipe without allocating a tensor. A
-recipe passes through these steps, each in a file of its own:
+`compose` builds the model. `resolve` merges and checks a recipe without allocating a tensor. A
+recipe passes through these steps, each in its own file:
 
 | step | file |
 |---|---|
-| read it and the recipes that it extends, apply overrides | `files.py`, `yaml_text.py` |
-| decode its sections and settings, make a draft | `sections.py` |
-| find the component at each place: defaults, layers, swaps | `places.py`, `slots.py` |
-| choose components and decode their options | `registry.py`, `decode.py` |
-| check them together, follow fields from writer to reader | `checks.py` |
+| read the recipe and those that it extends, apply overrides | `files.py`, `yaml_text.py` |
+| decode sections and settings | `sections.py` |
+| find the node of each component: defaults, layers, swaps | `places.py`, `slots.py` |
+| find the class of each component and decode its options | `registry.py`, `decode.py` |
+| check all components together, follow fields from writer to reader | `checks.py` |
 | find the line that caused a problem | `causes.py` |
 | write out every default | `recipe.py` |
 | build the model | `build.py` |
@@ -37,8 +37,9 @@ def compose(
 ) -> QueryGaussianModel:
     """Build the model that a recipe describes, with its initial parameters.
 
-    recipe, overrides: see `resolve`. device: device of the model; "meta" allocates nothing.
+    recipe, overrides: see `resolve`. device: device of the model; None means the CPU, and "meta"
+    allocates no memory.
     The same recipe gives the same parameters. The global random state does not change.
-    Raises RecipeError, a ValueError, with every problem of the recipe.
+    Raises RecipeError (a ValueError) that lists all problems of the recipe.
     """
     return resolve(recipe, overrides).build_model(device)

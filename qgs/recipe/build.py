@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def build_model(recipe: Recipe, device: torch.device | str | None) -> QueryGaussianModel:
-    """Build the model of a checked recipe; on "meta" nothing is allocated.
+    """Build the model of a checked recipe; the device "meta" allocates no memory.
 
     Parameters are drawn on the CPU from the recipe's seed, for every device. The global random
     state does not change.
@@ -97,9 +97,9 @@ def _assemble(recipe: Recipe) -> QueryGaussianModel:
 
 
 class OnMeta(TorchFunctionMode):
-    """The meta device, changed for constructors of components.
+    """Mode that makes the meta device faster for constructors of components.
 
-    `linspace` returns numbers, because DINO's constructor reads them. Weights are not drawn.
+    `linspace` returns numbers, because DINO's constructor reads them. No weights are drawn.
     `randn` and arithmetic on float32 tensors compute shapes only; otherwise torch would import its
     compiler, which takes 1 to 3 s.
     """
@@ -133,10 +133,10 @@ class OnMeta(TorchFunctionMode):
 
 
 def build(chosen: Chosen, *arguments: Any) -> Any:
-    """Build the component. arguments: the constructor's arguments after the Config.
+    """Build a component. arguments: the constructor's arguments after the Config.
 
-    Raises RecipeError, with the plugin's distribution, if a plugin's constructor fails. Errors for
-    mistakes of the user pass unchanged: missing packages or data, training too short for the
+    Raises RecipeError that names the plugin's distribution if a plugin's constructor fails. Errors
+    that a user can mend pass unchanged: missing packages or data, training too short for the
     optimiser.
     """
     component: Any = chosen.component
@@ -159,7 +159,10 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 
 
 def load_pretrained(*parts: nn.Module) -> None:
-    """Call `load_pretrained` of every component; a MissingExtraError gets the component's name."""
+    """Call `load_pretrained` of every component in `parts`, except on the meta device.
+
+    Raises MissingExtraError that names the component which needs a missing package.
+    """
     for component in nn.ModuleList(parts).modules():
         if isinstance(component, Component) and not any(x.is_meta for x in component.parameters()):
             try:
@@ -172,8 +175,9 @@ def load_pretrained(*parts: nn.Module) -> None:
 def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
     """Return the learning-rate factor of every parameter of `module`, by name (default 1).
 
-    module: a model, or a module that holds the model and the losses. For a model alone, patterns
-    for `losses` are not checked. A shared parameter has its first name. Raises RecipeError.
+    module: a model, or a module that holds the model and the losses. A shared parameter has its
+    first name. Raises RecipeError for a pattern in `optimizer.parts` that matches no parameter. For
+    a model alone, patterns for `losses` are not checked.
     """
     config = optimizer.config
     model = next(m for m in module.modules() if isinstance(m, QueryGaussianModel))
@@ -197,7 +201,7 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
 
 
 def _paths(name: str, model: QueryGaussianModel) -> list[KeyPath]:
-    """Return the paths of a parameter: its own, and those of its component in a recipe."""
+    """Return all paths by which `optimizer.parts` may name the parameter `name` of `model`."""
     path = tuple(name.split("."))
     if path[0] == "decoder":
         return [path, ("decoder", "layers", *path[1:]), ("decoder", *path[2:])]

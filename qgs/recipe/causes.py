@@ -1,7 +1,7 @@
 """Search for the line that caused a problem of a recipe.
 
-A file or an override may replace a component or a setting that lower layers rely on. Then the
-problem is reported at the replacing line, not at the lines that were correct before.
+A file or an override may replace a component or an option on which other lines of the recipe
+rely. The problem is then reported at the replacing line, since the other lines were correct before.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,10 @@ from qgs.recipe.yaml_text import KeyPath, MapNode, brief, find
 def at_their_causes(
     written: MapNode, found: Sequence[RecipeProblem], plugins: Sequence[Plugin]
 ) -> Iterator[RecipeProblem]:
-    """Yield the problems `found` in `written` at their causes; merge those with the same cause."""
+    """Yield the problems `found` in the recipe `written`, moved to the lines that caused them.
+
+    Problems with the same cause become one problem.
+    """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     left = found
     # Only a refused recipe is read again for each layer.
@@ -52,10 +55,11 @@ def at_their_causes(
 def _blames(
     found: Sequence[RecipeProblem], before: Draft, written: MapNode, plugins: Sequence[Plugin]
 ) -> dict[RecipeProblem, RecipeProblem]:
-    """Map each of `found` to a problem at the line of the last layer that caused it.
+    """Map problems to a problem at the line of `written.over` that caused them.
 
-    The options of that layer are applied one by one. The one after which a problem appears caused
-    it. before: the draft of `written` without the last layer.
+    The options of `written.over`, the last file or override, are applied one by one. An option
+    causes the problems that first appear after it. found: problems that the recipe has only with
+    `written.over`. before: draft of `written.under`, the recipe without `written.over`.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     base: Any = written.under
@@ -75,7 +79,10 @@ def _blames(
 
 
 def _options(over: MapNode, above: KeyPath = ()) -> Iterator[tuple[KeyPath, Any, Origin]]:
-    """Yield path, value and origin of each option of `over`; options that decide others first."""
+    """Yield path, value and origin of each option of `over`.
+
+    Options such as `type`, which decide which other options are valid, come first.
+    """
     first = ("plugins", "type", *KINDS)
     for key, value, origin in sorted(over.entries(), key=lambda entry: entry[0] not in first):
         path = (*above, key)
@@ -94,7 +101,7 @@ def _told(draft: Draft) -> set[RecipeProblem]:
 
 
 def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
-    """Return a problem at the line that replaced a component; None if none was replaced."""
+    """Return a problem at the line that replaced a component; None if no component was replaced."""
     for path, new in after.parts.items():
         old = before.parts.get(path, new)
         if new.type != old.type:
@@ -106,7 +113,7 @@ def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
 
 
 def _changing(path: KeyPath, value: Any, origin: Origin, before: Draft) -> RecipeProblem | None:
-    """Return a problem at the line that changed an option; None for a `type`."""
+    """Return a problem at the line that changed the option `path`; None if it is a `type`."""
     if path[-1] == "type":
         return None
     taken, place, old = find(before.tree, path)

@@ -1,6 +1,7 @@
-"""Checks of a whole recipe: components against each other and against the settings.
+"""Checks of a whole recipe: do its components fit each other and the settings?
 
-Fields are followed from writer to reader in the order of a forward pass.
+Each field of the model's state must be written before a component reads it, in the order of a
+forward pass.
 """
 
 from collections.abc import Iterator
@@ -27,7 +28,10 @@ from qgs.recipe.yaml_text import KeyPath, find, inline
 
 
 def check(draft: Draft, problems: Problems) -> Parts:
-    """Check a draft and return its parts without idle sublayers; raise RecipeError for problems."""
+    """Check a draft; return its components without sublayers that no layer uses.
+
+    Raises RecipeError with all problems.
+    """
     parts = _without_idle_sublayers(draft, problems)
     context = _context(draft)
     sound = [_check_options(part, context, problems) for part in parts.values()]
@@ -50,7 +54,7 @@ def _context(draft: Draft) -> RecipeContext:
 
 
 def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
-    """Report problems of a component's options; return False if its declarations fail."""
+    """Report problems of a component's options; return False if methods of the component raise."""
     component = chosen.component
     config = chosen.config
     called = "fields_read"
@@ -80,9 +84,10 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
 
 
 def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
-    """Return the parts without components for slots that no layer has; report written ones.
+    """Return the components of a draft without those in slots that no decoder layer uses.
 
-    A template that any layer uses is not reported.
+    Reports each such component that the recipe names. The decoder's template may have components
+    that only some layers use.
     """
     kept = dict(draft.parts)
     layers: dict[KeyPath, Any] = {}
@@ -100,7 +105,7 @@ def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
         if not any((*place, name) in kept for place in layers):
             template = kept.pop((*DECODER, name))
             if not layers:
-                reason = "a decoder of depth 0 has no layers, so nothing reads it"
+                reason = "a decoder of depth 0 has no layers, so nothing uses this component"
                 _report_idle(template, reason, problems)
     return kept
 
@@ -108,7 +113,7 @@ def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
 def _report_idle(idle: Chosen, reason: str, problems: Problems) -> None:
     # A default is not a mistake of the user.
     if idle.node:
-        fix = f"remove it, or write `{idle.slot}: null` to drop an inherited one"
+        fix = f"remove `{idle.slot}`, or write `{idle.slot}: null` if a base recipe sets it"
         problems.add(idle.origin, idle.source, reason, fix)
 
 
@@ -125,35 +130,35 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
         yield ("evaluation", "tuning"), reason, fix
     if settings.training.judge_inputs:
         path = ("training", "judge_inputs")
-        fix = "set it to false; evaluations do not read it"
+        fix = "set training.judge_inputs to false; evaluations do not read it"
         # A loss would compare renderings from moved cameras with photos from true ones.
         if settings.views.pose_noise:
             reason = "input views must have exact cameras, but views.pose_noise moves them"
             yield path, reason, fix
         objective: Any = parts["objective",]
         if not objective.component.judges_inputs:
-            reason = f"`{objective.type}` reconstructs one moment, but input views show others"
+            reason = f"`{objective.type}` predicts one moment, but input views show other moments"
             yield path, reason, fix
     if ("data",) in parts and not any(path[0] == "losses" for path in parts):
         reason = "a recipe with data needs at least one loss to train"
-        yield ("losses",), reason, "add one under `losses`, or drop the data with `data: null`"
+        yield ("losses",), reason, "add one under `losses`, or remove the data with `data: null`"
     # Resolved recipes contain the default, which must stay valid.
     default = DecoderSettings().layer_scale
     layers: list[Any] = [parts[layer_place(index, "layer")] for index in range(draft.dims.depth)]
     read = any(layer.component.reads_layer_scale for layer in layers)
     if not read and settings.model.decoder.layer_scale != default:
         names = " and ".join(sorted({f"`{layer.type}`" for layer in layers}))
-        reason = f"it has no effect: {names or 'a decoder of depth 0'} does not read it"
-        fix = f"remove it, or write the default, `{inline(default)}`, to drop an inherited one"
+        reason = f"{names or 'a decoder of depth 0'} does not read layer_scale, so it has no effect"
+        fix = f"remove layer_scale, or write `{inline(default)}` (the default) if a base sets it"
         yield (*DECODER, "layer_scale"), reason, fix
 
 
 _FLOW = ("encoder", "queries", *LAYER_SLOTS, *AFTER_LAYERS, "losses", "objective")
-"""Slots that read or write fields, in the order in which a layer's prediction is made."""
+"""Slots that read or write fields, in the order of their computation."""
 
 
 def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems) -> None:
-    """Report fields that are read before they are written, or with another specification."""
+    """Report fields that are read before they are written, or as another type than written."""
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     for turns, decodes in _execution_order(parts, depth):
         # The next layer does not see fields that are decoded from this one.
@@ -171,7 +176,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
                         f"`{chosen.type}` reads {name} as {needed[name]}, but `{writer.type}` at "
                         f"{writer.shown_path} ({writer.chosen_at}) writes it as {written}"
                     )
-                    fix = f"change options of `{chosen.type}` or `{writer.type}` until both agree"
+                    fix = f"change options of `{chosen.type}` or `{writer.type}` until they agree"
                     problems.add(chosen.origin, chosen.source, reason, fix)
             provided = chosen.component.fields_written(chosen.config)
             # A component that changes an unwritten field does not provide it.
@@ -179,7 +184,10 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
 
 
 def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], bool]]:
-    """Yield components in the order of a training step; True if they decode and judge a layer."""
+    """Yield groups of components in the order of a training step.
+
+    The flag is True for the components that decode a layer and compute its losses.
+    """
     supervision: Any = parts["model", "supervision"]
     # A supervised layer is decoded and judged right after it.
     decoded = {depth, *supervision.component(supervision.config).weights()}
@@ -195,9 +203,9 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], b
 
 
 def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) -> tuple[str, str]:
-    """Return reason and fix for fields that `reader` needs and no component before it provides."""
+    """Return reason and fix for fields that `reader` reads but no earlier component writes."""
     named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
-    reason = f"`{reader.type}` needs {named}, which no component before it provides"
+    reason = f"`{reader.type}` needs {named}, which no earlier component provides"
     for name in missing:
         late = [part for part in parts.values() if name in _offered(part.component, part.config)]
         if late:
@@ -231,7 +239,7 @@ def keys_are_read(parts: Parts) -> bool:
 
 
 def idle_fields(parts: Parts) -> Iterator[str]:
-    """Yield a sentence for each learnable field of the queries that only refinements read."""
+    """Yield a warning for each learnable field of the queries that only refinements read."""
     read = set[str]()
     for path, part in parts.items():
         # A refinement reads the fields that it updates; that alone does not use them.
@@ -247,7 +255,7 @@ def idle_fields(parts: Parts) -> Iterator[str]:
 
 
 def unfinished(parts: Parts, steps: int) -> Iterator[str]:
-    """Yield a sentence for each schedule that goes on after `steps` steps."""
+    """Yield a warning for each schedule that still changes after `steps`, the end of training."""
     # Once for the template of a decoder, not for each layer.
     for part in {part.source: part for part in parts.values()}.values():
         for option, schedule in part.schedules.items():

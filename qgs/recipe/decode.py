@@ -1,4 +1,4 @@
-"""Decoding of the node at a place into a component class and its Config."""
+"""Decoding of a recipe's node into the class of a component and its Config."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 
 @dataclass(frozen=True)
 class Chosen(Place):
-    """The component at a place: its `type`, class, options, and origin.
+    """A component at a place of a recipe: its `type`, class, options, and the plugin that has it.
 
-    schedules: the schedules of options that change during training. `config` has their first
-        values, `later` the values at their other extremes.
+    schedules: schedules of the options that change during training, by option.
+    config: the options, with the first values of schedules.
+    later: the options at each later step at which a schedule may have an extreme value.
     """
 
     node: MapNode
@@ -43,7 +44,7 @@ class Chosen(Place):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Options in the form of a recipe."""
+        """Options as a recipe writes them, schedules as mappings."""
         written = {name: s.model_dump(mode="json") for name, s in self.schedules.items()}
         return self.config.model_dump(mode="json") | written
 
@@ -53,21 +54,21 @@ class Chosen(Place):
 
     @property
     def shown_path(self) -> str:
-        """Dotted path at which a user finds it."""
+        """Dotted path at which the recipe sets this component."""
         return ".".join(self.source)
 
     @property
     def chosen_at(self) -> str:
-        """File and line of its `type`."""
+        """File and line that set `type`; "default of the slot" if no line does."""
         return str(self.node.origins.get("type", "default of the slot"))
 
 
 Parts: TypeAlias = Mapping[KeyPath, Chosen]
-"""Components by place."""
+"""Components by their paths in a recipe."""
 
 
 def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen | None:
-    """Return the component of a place; None, with a problem, if there is none."""
+    """Return the component at `place`; add a problem and return None if it is invalid."""
     node = place.node
     if not isinstance(node, MapNode):
         reason = f"a component must be a mapping, got {brief(node)}"
@@ -96,7 +97,7 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
 def report_failure(
     place: Place, called: str, error: Exception, installed: InstalledPlugin, problems: Problems
 ) -> None:
-    """Report that `called` of the component at `place` raised `error`; name the distribution."""
+    """Report that code of a plugin raised `error`. called: name of that code, for the message."""
     release = installed.released_as
     origin = f"the plugin `{installed.plugin.name}`{f' of {release}' if release else ''}"
     reason = f"{origin} fails: {called} raises {type(error).__name__}: {error}"
@@ -107,7 +108,10 @@ def report_failure(
 def _decode_options(
     component: type[Component], node: MapNode, path: KeyPath, problems: Problems
 ) -> tuple[list[ComponentConfig], dict[str, Schedule]] | None:
-    """Return the options at each extreme of the schedules, by ascending step, and the schedules."""
+    """Return the options at step 0 and at each corner of a schedule, and the schedules by option.
+
+    Returns None, with problems, for invalid options.
+    """
     schedules: dict[str, Schedule] = {}
     steps = {0}
     for option, value, origin in node.entries():
@@ -115,7 +119,7 @@ def _decode_options(
             kind = str(value.get("schedule", ""))
             below = (*path, option)
             if kind not in SCHEDULES:
-                reason = "a mapping here is a schedule, so `schedule` must name a known kind"
+                reason = "a mapping is a schedule here, so `schedule` must name a known kind"
                 fix = did_you_mean(kind, SCHEDULES, "schedules")
                 at = value.origins.get("schedule", origin)
                 return problems.add(at, (*below, "schedule"), reason, fix)
@@ -164,7 +168,7 @@ def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str,
 def decode_config(
     config: type[ConfigT], node: MapNode, path: KeyPath, problems: Problems
 ) -> ConfigT | None:
-    """Decode the options in `node` at `path`; return None, with problems, if they are invalid."""
+    """Decode the options in `node` at `path`; add problems and return None if any is invalid."""
     options, faults = validated(config, node)
     for fault in faults:
         report(fault, config, node, path, problems)
@@ -174,7 +178,7 @@ def decode_config(
 def validated(
     config: type[ConfigT], node: MapNode
 ) -> tuple[ConfigT | None, Sequence[ErrorDetails]]:
-    """Return the options in `node`, or pydantic's errors."""
+    """Return the options in `node` and no errors, or None and pydantic's errors."""
     try:
         # JSON is pydantic's only strict mode for text: a list may be read as a tuple and a string
         # as a path, but no string as a number.
@@ -186,7 +190,7 @@ def validated(
 def report(
     fault: ErrorDetails, config: type[BaseModel], node: MapNode, path: KeyPath, problems: Problems
 ) -> None:
-    """Add the problem for pydantic's `fault` in the options in `node` at `path`."""
+    """Add a problem for pydantic's error `fault` in the options `node`, which are at `path`."""
     steps, origin, given = find(node, fault["loc"])
     options = dict(options_in(config))
     # Layers have numbers, and one option of each name for all of them.
@@ -211,7 +215,7 @@ def report(
 
 
 def options_in(annotation: Any, above: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield dotted path and declaration of every option that a value of this type can hold."""
+    """Yield dotted path and declaration of every option in the type `annotation`, nested or not."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for name, field in annotation.model_fields.items():
             yield above + name, field
@@ -221,7 +225,7 @@ def options_in(annotation: Any, above: str = "") -> Iterator[tuple[str, FieldInf
 
 
 def _explain(error: ErrorDetails, given: Any) -> tuple[str, str]:
-    """Return reason and fix: pydantic's message, or a clearer one where we have one."""
+    """Return reason and fix for an error of pydantic. given: the invalid value in the recipe."""
     kind = error["type"]
     context = error.get("ctx", {})
     cause = context.get("error")

@@ -1,4 +1,4 @@
-"""Problems of a recipe, each with a place, a reason and a fix."""
+"""Problems of a recipe: where each one is, why, and how to fix it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from qgs.wording import counted
 
 @dataclass(frozen=True)
 class Origin:
-    """File and line of a value; line 0 if there is no line."""
+    """File and line in which a value of a recipe is written; line 0 if the line is unknown."""
 
     file: str
     line: int = 0
@@ -27,7 +27,7 @@ class RecipeProblem(Problem):
     file: the file as the user named it, "--set #n" for the n-th override, "<mapping>" for a Python
         mapping.
     line: 1-based, 0 if there is none.
-    cause: the exception of a plugin's code, if that is the reason.
+    cause: the exception that a plugin's code raised; None for other mistakes.
     """
 
     file: str
@@ -39,7 +39,7 @@ class RecipeProblem(Problem):
 
     @property
     def place(self) -> str:
-        """File, line and option."""
+        """File, line and option of the mistake, for messages."""
         return f"{Origin(self.file, self.line)}: {self.option or 'recipe'}"
 
 
@@ -58,7 +58,7 @@ class RecipeError(ValueError):
 
 
 class Problems:
-    """Collection of problems while a recipe is read, to report all of them at once.
+    """Collector of a recipe's problems, so that one error can report all of them.
 
     what: the kind of file, for the message. found: the problems, in the order of discovery.
     """
@@ -68,7 +68,7 @@ class Problems:
         self.found: list[RecipeProblem] = []
 
     def stop(self, origin: Origin, path: str | Iterable[str], reason: str, fix: str) -> NoReturn:
-        """Raise RecipeError for a mistake after which checks cannot go on, and all earlier ones."""
+        """Add a mistake after which checks cannot go on; raise RecipeError with all problems."""
         # Checks of the rest would mislead.
         self.add(origin, path, reason, fix)
         raise RecipeError(self.found, self.what)
@@ -81,12 +81,12 @@ class Problems:
         fix: str,
         cause: Exception | None = None,
     ) -> None:
-        """Note a mistake and go on. path: path of the option, dotted or in parts."""
+        """Add a mistake without raising. path: path of the option, dotted or as a list of keys."""
         option = path if isinstance(path, str) else ".".join(path)
         self.found.append(RecipeProblem(option, reason, fix, origin.file, origin.line, cause))
 
     def raise_any(self) -> None:
-        """Raise RecipeError if there are problems, chained to the exceptions of plugins."""
+        """Raise RecipeError if there are problems, with exceptions of plugins as its cause."""
         if self.found:
             error = RecipeError(self.found, self.what)
             causes = [problem.cause for problem in error.problems if problem.cause]

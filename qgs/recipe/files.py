@@ -1,4 +1,4 @@
-"""Reading of a recipe file, the files that it extends, and `--set` overrides."""
+"""Reading of recipe files, the files that they extend, and `--set` overrides."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -22,18 +22,17 @@ from qgs.recipe.yaml_text import (
 from qgs.wording import nearest
 
 KINDS = ("kind", "schedule")
-"""Options that decide which other options a mapping without a type has."""
+"""Options that decide which other options a mapping without `type` has."""
 _Trees: TypeAlias = dict[Path, MapNode | None]
-"""Merged trees by resolved path; None while a file is being read."""
+"""Merged recipe of each file, by resolved path; None while the file is being read."""
 
 
 def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
-    """Merge `over` into `base`, both at `path`; `over` wins.
+    """Merge the mapping `over` into `base`, both at `path` of a recipe. Values of `over` win.
 
-    A component of another `type`, or a mapping of another `kind` or `schedule`, replaces the old
-    one completely. `plugins` are united, other lists replaced. `null` replaces the value below it:
-    for an option it is a value, for a component or a section it restores the default, for a swap
-    it removes the swap.
+    A component of another `type`, or a mapping of another `kind` or `schedule`, replaces the whole
+    mapping in `base`. The list `plugins` gets the items of both; any other list is replaced. `null`
+    is a value for an option, restores the default of a component or section, and removes a swap.
     """
     # Options of another component would be refused, or worse, mean something else.
     if _replaces(base, over, path):
@@ -58,7 +57,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
 
 
 def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
-    """Return whether `over` replaces `base` completely."""
+    """Return whether the mapping `over` replaces `base` completely, both at `path`."""
     if path[:1] == ("swap",) and len(path) == 2:
         return True
     if "type" in over and type_at(base, path) not in (None, type_at(over, path)):
@@ -68,16 +67,16 @@ def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
 
 
 def recipe_folder() -> Path:
-    """Return the folder of the recipes that come with qgs, in its wheel or its repository."""
+    """Return the folder of qgs's own recipes, in the installed package or in the repository."""
     package = Path(__file__).parents[1]
     inside = package / "recipes"
     return inside if inside.is_dir() else package.parent / "recipes"
 
 
 def found_recipe(file: Path, name: str | Path) -> Path:
-    """Return `file` if it exists, else the recipe `name` in `recipe_folder`, else `file`.
+    """Return `file` if it exists, else the recipe `name` that comes with qgs, else `file`.
 
-    name: such as tiny/locus.yaml, or recipes/tiny/locus.yaml.
+    name: for example tiny/locus.yaml or recipes/tiny/locus.yaml.
     """
     # A wheel has no repository around it.
     home = recipe_folder()
@@ -89,7 +88,7 @@ def found_recipe(file: Path, name: str | Path) -> Path:
 
 
 def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> MapNode:
-    """Return the merged tree of `recipe`, without `extends`."""
+    """Read a recipe and merge it over the files that it extends."""
     if not isinstance(recipe, Mapping):
         return _read(found_recipe(Path(recipe), recipe), {}, problems)
     origin = Origin("<mapping>")
@@ -104,14 +103,17 @@ def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> M
 
 
 def files_of(recipe: Path) -> list[Path]:
-    """Return a recipe file and all files that it extends, links resolved; raise RecipeError."""
+    """Return paths of a recipe file and all files that it extends, without symbolic links.
+
+    Raises RecipeError if a file cannot be read.
+    """
     trees: _Trees = {}
     _read(recipe, trees, Problems())
     return [*trees]
 
 
 def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = None) -> MapNode:
-    """Return the merged tree of `file`. at: the line that extends it."""
+    """Read `file` merged over its bases. trees: files read so far. at: line that extends `file`."""
     # Two files may extend the same third one, by links as well.
     place = Path(os.path.realpath(file))
     if known := trees.get(place):
@@ -140,7 +142,7 @@ def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = Non
 
 
 def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) -> MapNode:
-    """Merge `node` over the files that it extends; later files win over earlier ones."""
+    """Merge the recipe `node` over the files that it extends. The last file wins."""
     layers: list[MapNode] = []
     for name, origin in items_of(node.get("extends"), node.origin_of("extends")):
         if not isinstance(name, str):
@@ -153,13 +155,13 @@ def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) 
         if place in (above := [path for path, tree in trees.items() if tree is None]):
             circle = [*above[above.index(place) :], place]
             reason = f"recipes extend each other: {' -> '.join(path.name for path in circle)}"
-            problems.stop(origin, "extends", reason, "remove one `extends` of the circle")
+            problems.stop(origin, "extends", reason, "remove the `extends` of one of these files")
         layers.append(_read(file, trees, problems, origin))
     return reduce(merge, [*layers, node.without("extends")])
 
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:
-    """Apply all overrides to `tree` in order; the n-th has the origin `--set #n`."""
+    """Apply overrides to a recipe in order. Messages call the nth override `--set #n`."""
     for number, text in enumerate(overrides, start=1):
         # One by one: an override may set an option of a component that the one before chose.
         tree = merge(tree, _read_override(text, Origin(f"--set #{number}"), problems))

@@ -1,4 +1,4 @@
-"""Places for components in a recipe: defaults, decoder layers, swaps."""
+"""Places of components in a recipe, after defaults, decoder layers and swaps are applied."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,11 +16,11 @@ DECODER: KeyPath = ("model", "decoder")
 
 @dataclass(frozen=True)
 class Place:
-    """A place and the node written there.
+    """Place of a component, such as `model.encoder`, and what a recipe writes there.
 
-    path: the place, with decoder layers numbered.
-    source: the path at which a user finds it: the template, a layer's override, or a swap.
-    node: the value; an empty mapping if nothing is written.
+    path: path of the component; a decoder layer has its number: `model.decoder.layers.0.layer`.
+    source: path at which the recipe sets the component: `path`, the decoder's template, or a swap.
+    node: value at `source`; an empty mapping if the recipe writes nothing there.
     """
 
     path: KeyPath
@@ -30,19 +30,22 @@ class Place:
 
     @property
     def slot(self) -> str:
-        """Name of the slot."""
+        """Name of the slot at `path`."""
         slot = slot_at(self.path)
         assert slot is not None
         return slot.name
 
 
 def layer_place(index: int, slot: str) -> KeyPath:
-    """Return the path of a slot of a decoder layer."""
+    """Return the path of a slot in a recipe. index: number of the decoder layer."""
     return (*DECODER, "layers", str(index), slot)
 
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
-    """Return all places of `tree`, in the order of a recipe."""
+    """Return the places of all components, by path, in the order of a recipe's sections.
+
+    tree: the merged recipe. depth: number of decoder layers. Reports layers beyond it.
+    """
     # A layer with an index beyond the depth often comes from a deeper base recipe.
     layers = tree.child(*DECODER, "layers").without(*map(str, range(depth)))
     for key, _, origin in layers.entries():
@@ -63,7 +66,7 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
 
 
 def _place(tree: MapNode, path: KeyPath) -> Place:
-    """Return the place at `path`; in a layer, its node is merged over the decoder's template."""
+    """Return the place at `path`; a decoder layer's node is merged over the decoder's template."""
     *above, name = path
     parent = tree.child(*above)
     node = parent.get(name)
@@ -81,11 +84,11 @@ def _place(tree: MapNode, path: KeyPath) -> Place:
 def apply_swaps(
     swaps: MapNode, places: Mapping[KeyPath, Place], problems: Problems
 ) -> dict[KeyPath, Place]:
-    """Return `places` after all swaps. swaps: maps patterns to components.
+    """Replace the components at places that match the patterns in a recipe's section `swap`.
 
-    A pattern is the path of a place, with or without the leading `model.`. `*`, `?` and `[...]`
-    match within one segment. Decoder layers have the paths `decoder.layers.INDEX.SLOT`. `null` in
-    place of a component drops an inherited swap.
+    swaps: maps each pattern to the new component, or to null to drop a swap of a base recipe.
+    A pattern is the dotted path of a component, with or without `model.` in front. `*`, `?` and
+    `[...]` match within one key. Decoder layers have the paths `decoder.layers.INDEX.SLOT`.
     """
     result = dict(places)
     # Swaps of the decoder's template would be lost under the layers made from it.
@@ -96,15 +99,17 @@ def apply_swaps(
         set_before = [x for x in hits.values() if x.source[0] == "swap" or "layers" in x.source]
         if not isinstance(node, MapNode) or node.get("type") is None:
             reason = f"a swap must be a component with a `type`, got {brief(node)}"
-            fix = "write `PATTERN: {type: PLUGIN/NAME, ...}`, or null to drop an inherited swap"
+            fix = (
+                "write `PATTERN: {type: PLUGIN/NAME, ...}`, or null to drop a swap of a base recipe"
+            )
         elif not hits:
-            reason = f"the pattern `{pattern}` matches no place"
+            reason = f"the pattern `{pattern}` matches no component of the recipe"
             known = [".".join(path).removeprefix("model.") for path in swappable]
             fix = did_you_mean(pattern, known, "places")
         elif set_before:
             place = set_before[0]
             reason = f"`{'.'.join(place.path)}` is already set at {place.origin}"
-            fix = "narrow one of the two, or remove one (null removes an inherited swap)"
+            fix = "narrow or remove one of the two (null removes a swap of a base recipe)"
         else:
             for path, place in hits.items():
                 result[path] = replace(place, source=source, node=node, origin=origin)
@@ -114,7 +119,7 @@ def apply_swaps(
 
 
 def matches(pattern: str, path: KeyPath, *, below: bool = False) -> bool:
-    """Return whether `pattern` matches `path` or, if `below`, a path above it."""
+    """Return whether `pattern` matches `path`, or with `below` the first keys of `path`."""
     # `model.` is optional, so `*.renderer` matches no place of the model.
     wanted = pattern.removeprefix("model.").split(".")
     shown = path[1:] if path[0] == "model" else path

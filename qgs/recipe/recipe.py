@@ -1,4 +1,4 @@
-"""Resolution of a recipe: read, merge, check, write out defaults. It allocates no tensor."""
+"""Resolution of a recipe, without tensors: read, merge, check and write out every default."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,8 +31,9 @@ class Recipe:
     tree: plain mapping with all defaults written out; resolving it again gives the same tree.
     provenance: the origin of each value of `tree` by dotted path: `FILE:LINE`, `--set #n`, or a
         default.
-    parts: the component at each place, by path, with decoder layers numbered.
-    releases: (distribution, version) of every plugin in use, by name, including `qgs`.
+    parts: components by path; each decoder layer has its own, such as
+        `model.decoder.layers.0.layer`.
+    releases: (distribution, version) of every plugin in use, by name of the plugin; also of `qgs`.
     """
 
     tree: Mapping[str, Any]
@@ -49,7 +50,7 @@ class Recipe:
 
     @property
     def data_config(self) -> contracts.SceneSourceConfig | None:
-        """Options of its data source; None without data, or if the source has other options."""
+        """Options of the data source; None without data, or if they are no SceneSourceConfig."""
         config = self.parts["data",].config if ("data",) in self.parts else None
         return config if isinstance(config, contracts.SceneSourceConfig) else None
 
@@ -63,7 +64,7 @@ class Recipe:
     ) -> QueryGaussianModel:
         """Build the model with its initial parameters; on "meta" it takes no memory.
 
-        pretrained: read the weights that options name. Use False if a checkpoint follows.
+        pretrained: read pretrained weights, such as DINO's. Use False before loading a checkpoint.
         Raises TooLargeError, before it allocates weights, if they do not fit into memory.
         """
         if device is None or torch.device(device).type != "meta":
@@ -80,7 +81,10 @@ class Recipe:
         return model
 
     def build_losses(self, pretrained: bool = True) -> dict[str, contracts.Loss]:
-        """Build the losses, by their names in the recipe; none only for a recipe without data."""
+        """Build the losses, by their names in the recipe.
+
+        pretrained: read pretrained weights, such as those of a perceptual loss.
+        """
         losses = self._named("losses")
         if pretrained:
             load_pretrained(*losses.values())
@@ -105,13 +109,13 @@ class Recipe:
         return build(self.parts["objective",])
 
     def build_optimizer(self) -> contracts.Optimizer:
-        """Build the optimiser; raise ValueError if `training` is too short for it."""
+        """Build the optimiser; raise ValueError if `training` is too short for its schedule."""
         optimizer = build(self.parts["optimizer",], self.training)
         optimizer.check()
         return optimizer
 
     def rate_factors(self, module: nn.Module) -> dict[str, float]:
-        """Return the learning-rate factor of every parameter of a model or objective, by name."""
+        """Return the learning-rate factor of every parameter of `module`, by parameter name."""
         return rate_factors(module, self.parts["optimizer",])
 
     def build_view_sampler(self) -> contracts.ViewSampler:
@@ -173,11 +177,11 @@ def resolve(
 
 _DEFAULT = "default"
 _Spelled: TypeAlias = Iterator[tuple[KeyPath, Any, Origin | str]]
-"""Path, value and origin of each value."""
+"""Path, value and origin of each value of a recipe."""
 
 
 def spell_out(draft: Draft, parts: Parts) -> _Spelled:
-    """Yield all values of a draft, in the order of a recipe, with only the plugins in use."""
+    """Yield all values of a draft, defaults included, and of its plugins only those in use."""
     shown = _shown_parts(parts)
     top, model, decoder, *sections = SETTINGS
     encoder, queries, *others = shown
@@ -205,7 +209,7 @@ def spell_out(draft: Draft, parts: Parts) -> _Spelled:
 def _spelled(
     path: KeyPath, values: Mapping[str, Any], written: MapNode, default: Origin | str
 ) -> _Spelled:
-    """Yield `values` at `path`; values that are not written have `default` as their origin."""
+    """Yield `values` at `path`; values that are missing in `written` have the origin `default`."""
     for name, value in values.items():
         origin = written.origins.get(name, default)
         if isinstance(value, dict) and value:
@@ -216,7 +220,7 @@ def _spelled(
 
 
 def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
-    """Return the path `plugins`, those of a draft that are `used`, and the lines naming them."""
+    """Return the path `plugins`, the names of plugins in `used`, and the lines that name them."""
     kept = [name for name in draft.registry.plugins if name != "qgs" and name in used]
     origin = draft.tree.origins.get("plugins", Origin(_DEFAULT))
     lines = [str(at) for name, at in items_of(draft.tree.get("plugins"), origin) if name in kept]
@@ -224,9 +228,9 @@ def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
 
 
 def _shown_parts(parts: Parts) -> dict[KeyPath, Chosen]:
-    """Return parts in the form of a recipe: the decoder's template, and layers that differ.
+    """Return components in a recipe's short form: one decoder template, and layers that differ.
 
-    If all layers have the same component, it becomes the template.
+    If all layers have the same component, that component becomes the template.
     """
     shown = {path: part for path, part in parts.items() if "layers" not in path}
     layers = {path: part for path, part in parts.items() if "layers" in path}
@@ -240,7 +244,7 @@ def _shown_parts(parts: Parts) -> dict[KeyPath, Chosen]:
 
 
 def flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Flatten nested mappings to one from dotted path to value."""
+    """Flatten nested mappings to one mapping from dotted path to value."""
     found: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:
@@ -271,7 +275,8 @@ _NO_EFFECT_ONCE_TRAINED = re.compile(
 def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
     """Return the `differing_options` that change the predictions of a trained model.
 
-    Initial values, supervision and the renderer do not change them. "none" replaces None.
+    Options of initial values, supervision and renderer do not. "none" stands for an option that a
+    recipe does not have.
     """
     return {
         path: (ours or "none", theirs or "none")
@@ -281,7 +286,7 @@ def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[st
 
 
 def annotated(recipe: Recipe) -> str:
-    """Write the resolved recipe as YAML; aligned comments name the file and line of each value."""
+    """Write the resolved recipe as YAML with comments that name file and line of each value."""
 
     def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():

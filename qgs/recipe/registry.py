@@ -1,4 +1,4 @@
-"""Installed components, found by metadata and imported when a recipe or command needs them."""
+"""Components of installed plugins, which are imported when a recipe or command needs them."""
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,9 +27,9 @@ class PluginError(OptionError):
 
 @dataclass(frozen=True)
 class InstalledPlugin:
-    """A plugin and its distribution ("" for none).
+    """A plugin, and the distribution that installed it ("" if it is not installed).
 
-    folder: folder of the module that holds the Plugin.
+    folder: folder of the module that defines the Plugin.
     """
 
     plugin: Plugin
@@ -39,12 +39,12 @@ class InstalledPlugin:
 
     @property
     def released_as(self) -> str:
-        """Name and version of the distribution, for messages; "" for none."""
+        """Name and version of the distribution, for messages; "" without a distribution."""
         return f"{self.distribution} {self.version}" if self.distribution else ""
 
     @property
     def models(self) -> dict[str, Path]:
-        """Files of the models that it ships, by `PLUGIN/NAME`; a file may be missing."""
+        """Paths of the plugin's trained models, by `PLUGIN/NAME`; a file may be missing."""
         plugin = self.plugin
         return {f"{plugin.name}/{name}": self.folder / at for name, at in plugin.models.items()}
 
@@ -68,7 +68,7 @@ BUILTIN = InstalledPlugin(
     "query-gaussians",
     __version__,
 )
-"""The plugin `qgs`."""
+"""The plugin `qgs`, with all components of the core."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Registry:
 
 
 def available_plugins() -> dict[str, list[EntryPoint]]:
-    """Return the entry points of all installed plugins, by name, from metadata alone."""
+    """Return the entry points of all installed plugins, by plugin name, without importing them."""
     found: dict[str, list[EntryPoint]] = {}
     for entry in extensions.installed(ENTRY_POINT_GROUP):
         found.setdefault(entry.name, []).append(entry)
@@ -107,9 +107,9 @@ def load_registry(names: Iterable[str]) -> Registry:
 def load_plugins(
     names: Sequence[str], tree: MapNode, problems: Problems, given: Sequence[Plugin]
 ) -> Registry:
-    """Load the plugins `names` of a recipe; add a problem for each unusable one.
+    """Load the plugins `names`; add a problem for each plugin that cannot be used.
 
-    given: plugins that need not be installed.
+    tree: the merged recipe, for the lines of problems. given: plugins that need not be installed.
     """
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
     plugins = {"qgs": BUILTIN}
@@ -124,7 +124,7 @@ def load_plugins(
 
 
 def load_usable_plugins() -> tuple[Registry, list[str]]:
-    """Load all installed plugins; return the usable ones, and the faults of the others."""
+    """Load all installed plugins; return the usable ones, and a message for each unusable one."""
     plugins = {"qgs": BUILTIN}
     broken = []
     # A plug-in of the framework's own name hides nothing.
@@ -137,7 +137,7 @@ def load_usable_plugins() -> tuple[Registry, list[str]]:
 
 
 def load_plugin(name: str) -> InstalledPlugin:
-    """Import and check the plugin `name`; raise PluginError."""
+    """Import and check the plugin `name`; raise PluginError if it cannot be used."""
     if name == "qgs":
         return BUILTIN
     available = available_plugins()
@@ -171,7 +171,7 @@ def _release(entry: EntryPoint) -> str:
 
 
 def _plugin_fault(plugin: object, name: str) -> str:
-    """Return the fault of the plugin at entry point `name`, as an end of a sentence; "" if none."""
+    """Return what is wrong with the plugin of the entry point `name`, as a predicate, or ""."""
     if not isinstance(plugin, Plugin):
         return f"is not a qgs.Plugin: its entry point leads to an object of type {type(plugin)}"
     if plugin.contract_version != CONTRACT_VERSION:
@@ -182,12 +182,12 @@ def _plugin_fault(plugin: object, name: str) -> str:
         return f"calls itself `{plugin.name}`; the two names must be equal"
     for component in plugin.components:
         if not (isinstance(component, type) and getattr(component, "slot", None) in SLOTS):
-            return f"lists {component!r}, which implements no slot's contract"
+            return f"lists {component!r}, which is not a component of any slot"
     return ""
 
 
 def default_config(component: type[Component]) -> ComponentConfig | None:
-    """Return default options; None if one has no default, or if a plugin's validator fails."""
+    """Return default options; None if an option has no default or a plugin's validator fails."""
     try:
         return component.Config()
     except (Exception, SystemExit):

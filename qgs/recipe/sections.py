@@ -1,4 +1,4 @@
-"""Sections of a recipe, and drafts: components are chosen, but not yet checked together."""
+"""Sections of a recipe, and drafts: recipes whose components are not yet checked together."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -46,12 +46,12 @@ class ModelSettings(ComponentConfig):
 
 
 class DecoderSettings(ComponentConfig):
-    """Settings of the decoder, except for the components of its layers."""
+    """Settings of the decoder besides the components of its layers."""
 
     depth: int = Field(default=12, ge=0, le=256)
-    """Number of layers (L in the papers). 0 decodes the initial queries."""
+    """Number of layers (L in the papers). With 0, the head decodes the initial queries."""
     layer_scale: float = Field(default=5e-5, gt=0)
-    """Initial LayerScale of every sublayer (TokenGS release)."""
+    """Initial LayerScale, the learned factor on each sublayer's output (TokenGS release)."""
 
 
 class RecipeSettings(ComponentConfig):
@@ -79,7 +79,7 @@ SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
 
 
 def _parts(*slots: str) -> dict[str, Any]:
-    """Return fields for the components of `slots`, of any form; `decode_place` checks options."""
+    """Return pydantic fields for the components of `slots`; `decode_place` checks their options."""
     fields: dict[str, Any] = {}
     for name in slots:
         about = summary_of(SLOTS[name].contract)
@@ -92,7 +92,7 @@ def _parts(*slots: str) -> dict[str, Any]:
 
 
 def _section(settings: type[ComponentConfig], **places: Any) -> Any:
-    """Return a field of a section that has settings, and maybe components."""
+    """Return a pydantic field for a section of `settings`, with the components `places` if any."""
     kind: Any = settings
     if places:
         named = settings.__name__
@@ -104,7 +104,7 @@ _LAYER = _parts(*LAYER_SLOTS)
 _LAYERS: Any = dict[str, create_model("Layer", __base__=ComponentConfig, **_LAYER)]
 _BY_INDEX: Any = Field(
     default_factory=dict,
-    description="Overrides of single layers, by their index from 0.",
+    description="Changes of single decoder layers, by the index of the layer from 0.",
     json_schema_extra={"propertyNames": {"pattern": "^[0-9]+$"}},
 )
 Layout: Any = create_model(
@@ -123,11 +123,14 @@ Layout: Any = create_model(
     training=_section(TrainingConfig),
     evaluation=_section(EvaluationConfig),
 )
-"""Model of a whole recipe: its settings, and the places of components."""
+"""Pydantic model of a whole recipe: its settings, and fields for its components."""
 
 
 def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
-    """Return `tree` without invalid values and null sections, and its Layout; add problems."""
+    """Return `tree` without invalid values and null sections, and the Layout of that.
+
+    Adds a problem for each invalid value.
+    """
     settings, faults = validated(Layout, tree)
     for fault in faults:
         # A null section means the default one.
@@ -153,11 +156,11 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
 
 @dataclass(frozen=True)
 class Draft:
-    """A recipe that was read but not yet checked as a whole.
+    """A recipe whose components are known, but not yet checked together.
 
     tree: all files and overrides merged, with the default losses and metrics.
-    settings: a Layout.
-    parts: the component at each place, with decoder layers numbered.
+    settings: a `Layout` with all settings.
+    parts: components by path; each decoder layer has its own.
     """
 
     tree: MapNode

@@ -11,14 +11,13 @@ from qgs.recipe.yaml_text import KeyPath, MapNode
 
 @dataclass(frozen=True)
 class Slot:
-    """One kind of place for components.
+    """One kind of component that a recipe chooses, such as the encoder.
 
-    default: the `type` of a place that names none; None if a place must name one.
-    The other fields are for slots that are top-level sections.
-    named: True if the section maps names to components. Otherwise the section is one component; it
-        always exists if there is a `default`.
+    default: `type` of the component if the recipe names none; None if it must name one.
+    The remaining fields matter only for slots that are top-level sections.
+    named: True if the section maps names to components; False if the section is one component.
     defaults: types of the components, by name, in a recipe without the section.
-    defaults_stay: True if the defaults are added to the written components; `NAME: null` drops one.
+    defaults_stay: True if a recipe's components are added to `defaults`; `NAME: null` drops one.
     """
 
     contract: type[contracts.Component]
@@ -29,7 +28,7 @@ class Slot:
 
     @property
     def name(self) -> str:
-        """Name of the slot, as in `Component.slot`."""
+        """Name of the slot, equal to `Component.slot`."""
         return self.contract.slot
 
 
@@ -76,7 +75,7 @@ SECTIONS = {
 
 
 def slot_at(path: KeyPath) -> Slot | None:
-    """Return the slot at a place of a recipe; None for a place without a component."""
+    """Return the slot at `path` of a recipe; None if no component belongs there."""
     # A section's slot is the first key, the slot of a part of the model the last.
     return next((SLOTS[key] for key in (*path[:1], *path[-1:]) if key in SLOTS), None)
 
@@ -87,9 +86,9 @@ def summary_of(described: object) -> str:
 
 
 def type_at(node: Any, path: KeyPath) -> Any:
-    """Return the `type` of the component in `node` at `path`: its own, or the slot's default.
+    """Return the `type` that `node` at `path` of a recipe sets, or else the slot's default type.
 
-    `type: null` means the default, like `null` in place of a component.
+    `type: null`, or a null `node`, means the default.
     """
     if isinstance(node, MapNode) and node.get("type") is not None:
         return node["type"]

@@ -1,4 +1,4 @@
-"""Recipes as YAML 1.2 text, and as nodes that store the line of each key."""
+"""YAML 1.2 text of recipes, and the nodes read from it, which know the line of each key."""
 
 import json
 import os
@@ -27,7 +27,7 @@ _SCALARS = {
     "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
     r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
 }
-"""Patterns of unquoted YAML 1.2 scalars that are not strings, by kind."""
+"""Pattern of unquoted YAML 1.2 scalars of each kind but strings."""
 _RESOLVERS: dict[str | None, list[tuple[str, re.Pattern[str]]]] = {
     None: [(_STANDARD + kind, re.compile(rf"({text})\Z")) for kind, text in _SCALARS.items()]
 }
@@ -35,10 +35,10 @@ _TAGS = {_STANDARD + kind for kind in (*_SCALARS, "str", "map", "seq")}
 
 
 class MapNode(dict[str, Any]):
-    """A mapping with origins.
+    """A mapping that knows in which file and line it was written.
 
-    origin: start of the mapping. origins: origin of each key.
-    under, over: the two mappings that were merged into it, if any; `over` wins.
+    origin: file and line of its start. origins: file and line of each key.
+    under, over: the two mappings that were merged into this one, if any. Values of `over` won.
     """
 
     under: "MapNode | None" = None
@@ -52,7 +52,7 @@ class MapNode(dict[str, Any]):
             self.put(key, value, written)
 
     def put(self, key: str, value: Any, origin: Origin) -> None:
-        """Set `key`, with its origin."""
+        """Set `key` to `value`, written at `origin`."""
         self[key] = value
         self.origins[key] = origin
 
@@ -61,11 +61,11 @@ class MapNode(dict[str, Any]):
         return [(key, value, self.origins[key]) for key, value in self.items()]
 
     def without(self, *names: str) -> "MapNode":
-        """Return a copy without `names`."""
+        """Return a copy without the keys `names`."""
         return MapNode(self.origin, (entry for entry in self.entries() if entry[0] not in names))
 
     def child(self, *path: str) -> "MapNode":
-        """Return the mapping at `path`, or an empty one."""
+        """Return the mapping at `path`; an empty one if no mapping is there."""
         found = self
         for key in path:
             empty = MapNode(found.origin_of(key))
@@ -79,7 +79,7 @@ class MapNode(dict[str, Any]):
 
 
 class ListNode(list[Any]):
-    """A list. origins: origin of each item, by index."""
+    """A list. origins: file and line of each item, by index."""
 
     def __init__(self, items: Iterable[tuple[Any, Origin]]) -> None:
         entries = [*items]
@@ -91,9 +91,9 @@ Node: TypeAlias = MapNode | ListNode | str | int | float | None
 
 
 def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:
-    """Return the items of a list, with their origins.
+    """Return the items of a list, with file and line of each.
 
-    A single value, written at `origin`, counts as a list of one item, null as an empty list.
+    A single value, written at `origin`, counts as a list of one item; null as an empty list.
     """
     if isinstance(value, ListNode):
         return [*zip(value, value.origins.values(), strict=True)]
@@ -101,7 +101,7 @@ def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:
 
 
 def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
-    """Return a tree of nodes for plain Python values.
+    """Convert plain Python values to nodes, all written at `origin`.
 
     Raises ValueError or TypeError for values that YAML cannot hold.
     """
@@ -118,9 +118,9 @@ def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
 
 
 def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Origin, Node]:
-    """Follow `path` into `tree`, skipping steps that are not written there.
+    """Follow `path` into `tree`, skipping keys that `tree` does not have.
 
-    Returns the steps taken, where the last one was written, and the value found.
+    Returns the keys that were found, file and line of the last one, and its value.
     """
     taken = list[str | int]()
     origin = tree.origin
@@ -142,7 +142,7 @@ def brief(value: Any) -> str:
 
 
 class Yaml12Loader(yaml.SafeLoader):
-    """Loader that composes nodes with YAML 1.2 tags; `_scalar` reads their values."""
+    """Loader that tags unquoted scalars by YAML 1.2; `_scalar` converts them."""
 
     yaml_implicit_resolvers = _RESOLVERS
 
@@ -154,12 +154,12 @@ class Yaml12Dumper(yaml.SafeDumper):
 
     # Anchors would be hard to read in a resolved recipe.
     def ignore_aliases(self, data: Any) -> bool:
-        """Return True: write repeated values in full."""
+        """Return True, so that repeated values are written in full."""
         return True
 
 
 def dump(value: Any, *, flow: bool | None = False) -> str:
-    """Write `value` as YAML 1.2, with keys in their order."""
+    """Write `value` as YAML 1.2, without sorting keys."""
     # A width that long breaks no line: each option of a recipe stays on its own.
     style: Any = {"default_flow_style": flow, "sort_keys": False, "width": 10_000}
     return yaml.dump(value, Dumper=Yaml12Dumper, **style)
@@ -171,7 +171,7 @@ def inline(value: Any) -> str:
 
 
 def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
-    """Read the mapping in `text`; raise RecipeError for anything else."""
+    """Read YAML `text` of `file`; raise RecipeError if it is invalid or no mapping."""
     node = load_text(text, file, problems)
     if isinstance(node, MapNode):
         return node
@@ -182,9 +182,10 @@ def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
 def load_text(
     text: str, file: str, problems: Problems, line: int | None = None, path: KeyPath = ()
 ) -> Node:
-    """Read the value in `text`; raise RecipeError for invalid YAML.
+    """Read YAML `text` of `file`; raise RecipeError if it is invalid.
 
-    line: line for all nodes, in place of their own. path: place of the text in the recipe.
+    line: line to store for all nodes; None stores their lines in `text`. path: path of the value
+    in the recipe, for messages.
     """
 
     def origin(mark: yaml.Mark | None) -> Origin:
@@ -208,7 +209,7 @@ _composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))
 def _read(
     node: yaml.Node, origin: Callable[[yaml.Mark], Origin], counter: Iterator[int], depth: int = 0
 ) -> Node:
-    """Convert PyYAML's node to ours; raise YAMLError for values that a recipe must not hold."""
+    """Convert PyYAML's node to a Node; raise YAMLError for values that a recipe must not hold."""
     if depth > MAX_DEPTH or next(counter) > MAX_NODES:
         what = f"more than {MAX_DEPTH} levels or {MAX_NODES:,} values after expanding aliases"
         raise _fault(what, node)
@@ -238,7 +239,7 @@ def _fault(reason: str, node: yaml.Node) -> yaml.YAMLError:
 
 
 def _scalar(kind: str, text: str) -> Any:
-    """Return the value of a scalar; raise ValueError for text of another kind."""
+    """Return the value of a scalar; raise ValueError if `text` is not of that kind."""
     if kind == "null":
         return None
     if kind == "bool":
