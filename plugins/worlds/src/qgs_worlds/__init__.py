@@ -1,1 +1,1 @@
-"""Procedural scenes for qgs with true depth: rooms and worlds, rendered by one ray caster."""
+"""Procedural scenes for qgs with exact depth maps: furnished rooms and abstract worlds."""

@@ -1,4 +1,4 @@
-"""Random scenes from a seed, with images that are rendered on demand and cached."""
+"""Base of procedural scenes, whose images are rendered on demand and cached."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -18,31 +18,31 @@ if TYPE_CHECKING:
     from qgs_worlds.caster.tables import Room, World
 
 ImageCache = dict[tuple[str, int], np.ndarray]
-"""Images (H, W, 3) uint8 by scene and frame. A full cache keeps its content."""
+"""Images (H, W, 3) uint8 by scene name and frame. A full cache takes no new images."""
 
 
 class DrawnConfig(SceneSource.Config):
-    """Options of all sources of procedural scenes."""
+    """Options that all sources of procedural scenes share."""
 
     scenes: int = Field(default=2000, ge=1)
     """Number of scenes in the training split."""
     test_scenes: int = Field(default=32, ge=1)
-    """Number of scenes in the test split, which shares none with the training split."""
+    """Number of scenes in the test split. Test scenes differ from training scenes."""
     views_per_scene: int = Field(default=8, ge=2)
     """Number of cameras in each scene."""
     samples: int = Field(default=2, ge=1, le=8)
-    """Number of rays per pixel along each axis."""
+    """Rays per pixel along each axis; 2 casts 2 x 2 rays per pixel."""
     seed: int = Field(default=0, ge=0)
-    """Random seed of all scenes, 0 or more."""
+    """Random seed that determines all scenes, 0 or more."""
     cache_mb: int = Field(default=512, ge=0)
-    """Megabytes of images to keep in memory. 0: keep none."""
+    """Memory for rendered images, in MiB. 0 means that images are not kept."""
 
 
 class DrawnScene(Scene):
-    """Scene `index` of a split, with `views_per_scene` cameras. config: options of its source.
+    """Procedural scene with `views_per_scene` cameras. Its key (seed, split, index) determines it.
 
-    key: seed, split and index, which determine the scene. c2w: OpenCV (F, 4, 4), in the metres of
-    `tables`. lens: fx, fy, cx, cy in pixels. scale: factor of all lengths.
+    c2w: poses (F, 4, 4) with OpenCV axes, in the units of `tables`. lens: fx, fy, cx, cy in pixels.
+    scale: factor from the units of `tables` to metres of the scene.
     """
 
     c2w: np.ndarray
@@ -64,7 +64,7 @@ class DrawnScene(Scene):
     @property
     @abstractmethod
     def tables(self) -> "World | Room":
-        """Content of the scene for the ray caster."""
+        """Shapes, textures and lights of the scene, as tables for the ray caster."""
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -75,7 +75,7 @@ class DrawnScene(Scene):
         return Cameras(c2w, intrinsics, self._config.image_size)
 
     def depths(self, frames: Sequence[int]) -> Tensor:
-        """Return z along the ray through each pixel centre; depth of the sky is unknown."""
+        """Return depth (z) at pixel centres, (F, 1, H, W) in metres; 0 marks sky without depth."""
         from qgs_worlds.caster.casting import cast
 
         depths = cast(self.tables, self.c2w[list(frames)], self.lens, self._config.image_size)
@@ -83,7 +83,7 @@ class DrawnScene(Scene):
 
     @abstractmethod
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
-        """Return an image (H, W, 3) uint8 for each frame."""
+        """Render one image (H, W, 3) uint8 for each frame."""
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`."""
@@ -105,11 +105,11 @@ class DrawnScene(Scene):
 
 
 class DrawnSource(LazySource):
-    """Source of endless scenes; scene i of a split depends only on (seed, split, i)."""
+    """Source of procedural scenes. Seed, split and index determine a scene."""
 
     Config = DrawnConfig
     scene: ClassVar[Callable[..., DrawnScene]]
-    """Constructor of a scene from its name, index, config, split and cache."""
+    """Function that makes a scene from its name, index, config, split and cache."""
     not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
     split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 

@@ -1,1 +1,1 @@
-"""The ray caster for rooms and worlds, and the tables that describe scenes to it."""
+"""Ray caster for rooms and worlds, and the tables that describe scenes to it."""

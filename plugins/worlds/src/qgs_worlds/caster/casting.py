@@ -1,4 +1,4 @@
-"""Images and depth maps of scenes, computed by threads in bands of rows."""
+"""Images and depth maps of scenes, rendered by threads in bands of rows."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +14,7 @@ from qgs_worlds.caster.tables import Room, World
 _BAND = 64
 
 Size = tuple[int, int]
-"""Height and width in pixels."""
+"""Image height and width in pixels."""
 
 
 def cast(
@@ -26,10 +26,11 @@ def cast(
     paint: Callable[..., None] | None = None,
     images: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return depths (F, samples H, samples W) float32, the z of each ray, inf in the sky.
+    """Return the depths (F, samples * H, samples * W) float32 of all rays; inf in the sky.
 
-    c2w: OpenCV. intrinsics: in pixels. paint: kernel that colours a band of `images` (F, H, W, 3)
-    with the means of samples^2 rays.
+    Depth is z in the camera frame. c2w: poses (F, 4, 4) with OpenCV axes. intrinsics: fx, fy,
+    cx, cy in pixels. samples: rays per pixel along each axis. paint: kernel that colours `images`
+    (F, H, W, 3) band by band; a pixel is the mean of its rays.
     """
     height, width = size
     depths = np.empty((len(c2w), samples * height, samples * width), np.float32)

@@ -1,4 +1,4 @@
-"""Colours of surfaces in furnished rooms: even light, a lamp, a window and soft shadows."""
+"""Colours of surfaces in furnished rooms, lit by ambient light, a lamp and a window."""
 
 import math
 
@@ -24,7 +24,11 @@ _FLAT = 0.03
 
 @inner
 def _range(low, high, lamp, reach, extent, cells):
-    """Return the range of the floor map's cells, on one axis, that a shape or its shadow covers."""
+    """Return the range of floor cells, on one axis, that a shape and its shadow cover.
+
+    low, high: limits of the shape. reach: length of the shadow relative to the shape's distance
+    from the lamp. extent: size of the room.
+    """
     start = min(low, lamp + (low - lamp) * reach)
     end = max(high, lamp + (high - lamp) * reach)
     first = math.floor((start / extent + 0.5) * (cells - 1))
@@ -34,7 +38,7 @@ def _range(low, high, lamp, reach, extent, cells):
 
 @inner
 def _darken(darkness, body, size, lamp):
-    """Add a shape's shadow from the lamp and the dimness directly below it."""
+    """Add to the floor map `darkness` (C, C) a shape's lamp shadow and the dark area below it."""
     cells = darkness.shape[0]
     x, y, z = triple(body.center)
     bottom = z - body.extent[2]
@@ -65,7 +69,7 @@ def _darken(darkness, body, size, lamp):
 
 @kernel
 def _blurred(values):
-    """Return the mean over 3 x 3 cells."""
+    """Return a map (C, C) whose cells are means of 3 x 3 neighbours."""
     last = values.shape[0] - 1
     result = np.empty(values.shape)
     for i in range(values.shape[0]):
@@ -80,7 +84,7 @@ def _blurred(values):
 
 @kernel
 def floor_shadows(shapes, size, lamp):
-    """Return the factor (C, C) of the light on the floor, indexed by x, then y."""
+    """Return factors (C, C) of the light on the floor, 1 without shadow, indexed by x, then y."""
     darkness = np.zeros((_SHADOW_CELLS, _SHADOW_CELLS))
     # the first shape is the room
     for i in range(1, shapes.shape[0]):
@@ -91,7 +95,10 @@ def floor_shadows(shapes, size, lamp):
 
 @inner
 def _on_round(body, part, p):
-    """Return `_surface` of a ball or a cylinder, in its own frame; part 1 is a cap."""
+    """Return normal and both kinds of coordinates of `_surface` for a ball or a cylinder.
+
+    p: point in the shape's frame. part: 1 for a cap, 0 for the side.
+    """
     x, y, z = p
     radius = float(body.extent[0])
     if part == 1:
@@ -103,9 +110,9 @@ def _on_round(body, part, p):
 
 @inner
 def _surface(shape, part, place):
-    """Return the texture index, world normal and texture coordinates of a point.
+    """Return texture index, world normal and four coordinates of a point on a shape.
 
-    Coordinates are given in metres, then in [-1, 1] across the surface.
+    The first two coordinates are in metres, the last two in [-1, 1] across the surface.
     """
     body = shape.body
     inside = body.kind == s.INTERIOR
@@ -133,7 +140,7 @@ def _edge(distance):
 
 @inner
 def _wall_shadow(place, size, face):
-    """Return how much darker walls are towards the edges of the room."""
+    """Return a light factor that falls towards the edges of the room, where two walls meet."""
     x, y, z = place
     a = 1.0 if face < 2 else _edge(0.5 * size[0] - abs(x))
     b = 1.0 if face == 2 or face == 3 else _edge(0.5 * size[1] - abs(y))
@@ -143,7 +150,7 @@ def _wall_shadow(place, size, face):
 
 @inner
 def _floor_shadow(floor, place, size):
-    """Interpolate the floor's map of shadows."""
+    """Interpolate the light factors of the floor at a point."""
     last = floor.shape[0] - 1
     a = min(max((place[0] / size[0] + 0.5) * last, 0.0), last - 1e-6)
     b = min(max((place[1] / size[1] + 0.5) * last, 0.0), last - 1e-6)
@@ -168,7 +175,7 @@ def _shadow(room, code, place, normal):
 
 @inner
 def _light(room, code, place, normal):
-    """Return the RGB light at a point: a bright ceiling above, and Lambert light of the lamps."""
+    """Return the RGB light at a point: ambient light, and diffuse light of lamp and window."""
     # more light on surfaces that face down; otherwise ceilings would be dark
     even = 0.56 - 0.12 * normal[2]
     total = (even, even, even)
@@ -184,7 +191,10 @@ def _light(room, code, place, normal):
 
 @inner
 def _gather(t, code, i, j, own, samples, top, o, rays, points):
-    """Write where rays of pixel (i, j) hit surface `own`, the mean in row 0; return the count."""
+    """Write the hits of a pixel's rays on face `own` to `points`; return their number n.
+
+    Row 0 of `points` is the mean of the hits, rows 1 to n are the hits.
+    """
     n = 0
     step = 1.0 / samples
     total = (0.0, 0.0, 0.0)
@@ -205,7 +215,10 @@ def _gather(t, code, i, j, own, samples, top, o, rays, points):
 
 @inner
 def _albedo(texture, shape, part, points, n, footprint):
-    """Return the mean RGB of a texture at rows 1 to n of `points`, or at row 0 if it is smooth."""
+    """Return the mean RGB of a texture over the hits of a pixel, rows 1 to n of `points`.
+
+    A texture without sharp edges is evaluated once, at row 0, the mean of the hits.
+    """
     first = 0 if smooth(texture.pattern) else 1
     last = 1 if smooth(texture.pattern) else n + 1
     # edges need all samples of a pixel, gradients do not
@@ -222,7 +235,7 @@ def _albedo(texture, shape, part, points, n, footprint):
 
 @inner
 def _shade(room, code, points, n, footprint):
-    """Return the RGB in [0, 1] of a surface seen at rows 1 to n of `points`."""
+    """Return the RGB in [0, 1] of a face at the hits of a pixel, rows 1 to n of `points`."""
     shape = room.shapes[code >> 3]
     place = triple(points[0])
     row, normal, _, _, _, _ = _surface(shape, code & 7, place)
@@ -235,9 +248,10 @@ def _shade(room, code, points, n, footprint):
 
 @kernel
 def paint_room(image, t, code, top, samples, room, c2w, rays):
-    """Write a band of the image (rows, W, 3) uint8 from row `top`; this overwrites `code`.
+    """Write a band of an image, (rows, W, 3) uint8; this overwrites `code`.
 
-    Rays of a pixel on the same surface share their light, and their texture if it is smooth.
+    t, code, rays: results of `trace`. top: image row of the band's first row. Rays of a pixel that
+    hit the same face share their light; a texture without sharp edges is evaluated once for them.
     """
     eye = triple(c2w[:, 3])
     points = np.empty((samples * samples + 1, 3))

@@ -1,8 +1,7 @@
-"""Intervals of a ray o + t d inside a primitive: entry and exit, and the faces of both.
+"""Intersections of a ray o + t d with primitives, in the frame of the primitive.
 
-All numbers, constants too, are float32, because a wider one would widen the loops that LLVM
-vectorises. They are in the primitive's own frame. A ray that misses enters at inf and leaves at
--inf.
+An interval is (entry t, exit t, entry face, exit face). A ray that misses has entry inf and exit
+-inf. All numbers and constants are float32, because one float64 would slow the vectorised loops.
 """
 
 import math
@@ -40,7 +39,7 @@ def reciprocal(x):
 
 @inner
 def slab(o, inverse, h):
-    """Return the interval of a ray between -h and h on one axis; inverse is 1 / d."""
+    """Return entry and exit t of a ray between -h and h on one axis. inverse: 1 / d."""
     a = (-h - o) * inverse
     b = (h - o) * inverse
     return min(a, b), max(a, b)
@@ -48,14 +47,14 @@ def slab(o, inverse, h):
 
 @inner
 def nearest(o, d):
-    """Return the point of a ray nearest to the origin, and its t."""
+    """Return the point of a ray that is nearest to the origin, and the t of this point."""
     t = -dot(o, d) / dot(d, d)
     return along(o, t, d), t
 
 
 @inner
 def ellipsoid(o, d):
-    """Return the interval in the unit sphere. o: see `nearest`."""
+    """Return the interval in the unit sphere. o: point of the ray nearest to the origin."""
     inside = ONE - dot(o, o)
     root = math.sqrt(max(inside, ZERO) / dot(d, d))
     met = inside > ZERO
@@ -64,7 +63,7 @@ def ellipsoid(o, d):
 
 @inner
 def ball(o, d, radius):
-    """Return the entry into a sphere around the origin; balls have no cuts and need no exit."""
+    """Return an interval with the entry into a sphere around the origin, and inf as exit."""
     inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
     x, y, z = along(o, middle, d)
@@ -76,7 +75,7 @@ def ball(o, d, radius):
 
 @inner
 def _last_and_first(x, y, z):
-    """Return the overlap of three intervals, and which of them it starts and ends with."""
+    """Return the overlap of three (entry, exit) pairs; its faces are the indices of the limits."""
     near = max(x[0], y[0], z[0])
     far = min(x[1], y[1], z[1])
     entry = ZERO if near == x[0] else (ONE if near == y[0] else _TWO)
@@ -86,7 +85,7 @@ def _last_and_first(x, y, z):
 
 @inner
 def box(o, d):
-    """Return the interval in the cube; faces are numbered by axis."""
+    """Return the interval in the cube [-1, 1]^3. Faces are numbered by axis, 0 to 2."""
     x = slab(o[0], reciprocal(d[0]), ONE)
     y = slab(o[1], reciprocal(d[1]), ONE)
     z = slab(o[2], reciprocal(d[2]), ONE)
@@ -95,7 +94,7 @@ def box(o, d):
 
 @inner
 def block(o, d, h):
-    """Return the interval in a box of half sizes h, like `box`."""
+    """Return the interval in a box with half sizes h. Faces are numbered by axis, 0 to 2."""
     x = slab(o[0], reciprocal(d[0]), h[0])
     y = slab(o[1], reciprocal(d[1]), h[1])
     z = slab(o[2], reciprocal(d[2]), h[2])
@@ -104,10 +103,10 @@ def block(o, d, h):
 
 @inner
 def interior(o, d, h):
-    """Return where a ray from inside leaves a room that stands on z = 0.
+    """Return an interval from the t at which a ray from inside a room hits its walls, to inf.
 
-    The far side of the room hides everything behind it. Faces -x, +x, -y, +y, floor and ceiling are
-    0 to 5. h: half size in x and y, full size in z.
+    Faces 0 to 5 are -x, +x, -y, +y, floor and ceiling; the floor is at z = 0. h: half size in x and
+    y, full size in z.
     """
     tx = (math.copysign(h[0], d[0]) - o[0]) / d[0]
     ty = (math.copysign(h[1], d[1]) - o[1]) / d[1]
@@ -122,7 +121,7 @@ def interior(o, d, h):
 
 @inner
 def _shaft(o, d, radius, half):
-    """Return the interval in an upright cylinder, and the interval between its caps."""
+    """Return entry and exit t of an upright cylinder, then those of the slab between its caps."""
     low, high = slab(o[2], reciprocal(d[2]), half)
     inverse = reciprocal(d[0] * d[0] + d[1] * d[1])
     middle = -(o[0] * d[0] + o[1] * d[1]) * inverse
@@ -138,14 +137,14 @@ def _shaft(o, d, radius, half):
 
 @inner
 def cylinder(o, d, h):
-    """Return the interval in a cylinder of radius h[0] and half height h[2]. Face 1 is a cap."""
+    """Return the interval in a cylinder of radius h[0] and half height h[2]. Face 1: a cap."""
     near, far, low, high = _shaft(o, d, h[0], h[2])
     return near, far, (ONE if near == low else ZERO), (ONE if far == high else ZERO)
 
 
 @inner
 def capsule(o, d, half):
-    """Return the interval within 1 of the segment from z = -half to half."""
+    """Return the interval in a capsule of radius 1 around the z axis from -half to half."""
     near, far, _, _ = _shaft(o, d, ONE, half)
     # the ends are whole spheres, because their inner halves are inside the shaft
     for end in (-half, half):
@@ -158,7 +157,10 @@ def capsule(o, d, half):
 
 @inner
 def frustum(o, d, top):
-    """Return the interval in a cone of radius 1 at z = -1, `top` <= 1 at z = 1. Face 1 is a cap."""
+    """Return the interval in a truncated cone from z = -1 to 1. Face 1 is a cap.
+
+    Its radius is 1 at z = -1 and `top` <= 1 at z = 1.
+    """
     # caps come first, because they cut off the side
     low, high = slab(o[2], reciprocal(d[2]), ONE)
     slope = _HALF * (top - ONE)
@@ -190,9 +192,10 @@ def frustum(o, d, top):
 
 @inner
 def torus(o, d, thickness, start):
-    """Return the entry into a ring of outer radius 1 about z, from t `start` on, as exit too.
+    """Return an interval with the first hit of a torus, from t = `start` on, as entry and exit.
 
-    It uses sphere tracing, because roots of the quartic lose thin rings in float32.
+    The torus lies in the xy plane, with outer radius 1. The search uses sphere tracing, because the
+    roots of the quartic equation miss thin rings in float32.
     """
     step = ONE / math.sqrt(dot(d, d))
     t, end, _, _ = ellipsoid(o, d)
@@ -214,7 +217,7 @@ def torus(o, d, thickness, start):
 
 @inner
 def height_at(heights, x, y):
-    """Return the bilinear height at x, y in [-1, 1]."""
+    """Return the bilinear height of a map `heights` (G, G) at x, y in [-1, 1]."""
     last = heights.shape[0] - 1
     a = min(max((x + ONE) * _HALF, ZERO), _INSIDE) * np.float32(last)
     b = min(max((y + ONE) * _HALF, ZERO), _INSIDE) * np.float32(last)
@@ -235,7 +238,7 @@ def _above(heights, o, d, t):
 
 @inner
 def _next_line(o, d, t, cells):
-    """Return the t at which a ray crosses the next cell border on one axis."""
+    """Return the t at which a ray crosses the next border of a height map's cells, on one axis."""
     if abs(d) < TINY:
         return NONE
     place = (o + t * d + ONE) * _HALF * cells
@@ -245,7 +248,10 @@ def _next_line(o, d, t, cells):
 
 @inner
 def _surface_between(heights, o, d, t, above, line, below):
-    """Return the t of a hit on the map: the ray is `above` it at t and `below` it at `line`."""
+    """Return the t of a hit on a height map, between t and `line`.
+
+    above, below: height of the ray over the map at t (positive) and at `line` (negative).
+    """
     # regula falsi, because heights along a ray in one cell are a parabola
     for _ in range(3):
         middle = t + (line - t) * above / (above - below)
@@ -261,7 +267,10 @@ def _surface_between(heights, o, d, t, above, line, below):
 
 @inner
 def relief(o, d, heights, start):
-    """Return the entry into the cube below a height map, like `torus`. Face 0 is top, 1 a side."""
+    """Return an interval with the first hit of a height map's solid, as entry and exit.
+
+    The solid is the part of the cube [-1, 1]^3 below the map. Face 0 is the top, face 1 a side.
+    """
     t, end, _, _ = box(o, d)
     t = max(t, start)
     if t > end:
@@ -284,7 +293,7 @@ def relief(o, d, heights, start):
 
 @inner
 def less(near, far, entry, cut_near, cut_far, cut_leave):
-    """Return the entry into an interval minus a cut, and its face, plus 3 on the cut's wall."""
+    """Return the entry t and face of a shape minus a cut; faces of the cut's wall are 3 higher."""
     outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
     # a ray that starts in the cut, or enters through it, hits the wall of the cut
     inner = (cut_far > NEAR) & (cut_far > near) & (cut_far < far) & (cut_near <= cut_far)
@@ -294,26 +303,26 @@ def less(near, far, entry, cut_near, cut_far, cut_leave):
 
 @inner
 def local(primitive, v):
-    """Return a direction in the frame of a primitive."""
+    """Return the world direction v in the frame of a primitive."""
     axes = primitive.axes
     return dot(axes[0], v), dot(axes[1], v), dot(axes[2], v)
 
 
 @inner
 def local_point(primitive, p):
-    """Return a point in the frame of a primitive."""
+    """Return the world point p in the frame of a primitive."""
     return local(primitive, minus(p, primitive.center))
 
 
 @inner
 def hollow(shape):
-    """Return True for a bent or cut shape, which may shade itself and fills little of its box."""
+    """Return True for a torus, a height map or a cut shape, which may cast shadows on itself."""
     return shape.body.kind >= s.TORUS or shape.cut.kind != s.NOTHING
 
 
 @inner
 def upright(body, v):
-    """Return `local` faster, for a shape in metres that is turned about z."""
+    """Return the same as `local`, faster, for shapes that are turned only about z."""
     cos = body.axes[0, 0]
     sin = body.axes[0, 1]
     return cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]
@@ -321,7 +330,7 @@ def upright(body, v):
 
 @kernel
 def hit(body, o, d):
-    """Return the t at which a ray enters a BLOCK, a BALL or a CYLINDER, or inf."""
+    """Return the t at which a ray enters a BLOCK, BALL or CYLINDER; inf if the ray misses."""
     p = upright(body, minus(o, body.center))
     way = upright(body, d)
     if body.kind == s.BLOCK:
@@ -335,13 +344,13 @@ def hit(body, o, d):
 
 @kernel
 def height_of(heights, x, y):
-    """Return `height_at` for calls from Python."""
+    """Call `height_at` from Python, which cannot call it directly."""
     return height_at(heights, x, y)
 
 
 @kernel
 def clearances(shapes, points):
-    """Return distances (F, S) in metres from points (F, 3) to the boxes of shapes, 0 inside."""
+    """Return distances (F, S) in metres from points (F, 3) to the boxes of shapes; 0 in a box."""
     distances = np.empty((points.shape[0], shapes.shape[0]))
     for f in range(points.shape[0]):
         for i in range(shapes.shape[0]):

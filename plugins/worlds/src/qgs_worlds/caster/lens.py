@@ -1,4 +1,4 @@
-"""Lenses and poses of cameras."""
+"""Intrinsics and poses of cameras."""
 
 import math
 
@@ -6,16 +6,20 @@ import numpy as np
 
 
 def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
-    """Return fx, fy, cx, cy in pixels for a horizontal field of view in degrees and (H, W)."""
+    """Return intrinsics fx, fy, cx, cy in pixels for images of `size` (H, W).
+
+    fov: horizontal field of view in degrees.
+    """
     height, width = size
     focal = width / 2 / math.tan(math.radians(fov) / 2)
     return np.array([focal, focal, width / 2, height / 2])
 
 
 def look_along(eyes: np.ndarray, forward: np.ndarray, roll: np.ndarray | None = None) -> np.ndarray:
-    """Return OpenCV c2w (F, 4, 4) of cameras at `eyes` that look `forward`, both (F, 3).
+    """Return poses c2w (F, 4, 4) with OpenCV axes; z is up in the world.
 
-    roll: (F,) radians about the viewing axis; None keeps cameras level.
+    eyes: camera centres (F, 3). forward: viewing directions (F, 3). roll: angles (F,) in radians
+    about the viewing direction; None keeps cameras level.
     """
     forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, (0.0, 0.0, 1.0))

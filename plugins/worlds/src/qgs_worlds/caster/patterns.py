@@ -11,7 +11,7 @@ from qgs_worlds.caster.vectors import inner
 
 @inner
 def _hash(i, j, seed):
-    """Return a number in [0, 1) for each lattice point."""
+    """Return a pseudo-random number in [0, 1) for the lattice point (i, j)."""
     # primes of xxHash, which spread neighbours over all bits
     h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
@@ -20,7 +20,7 @@ def _hash(i, j, seed):
 
 @inner
 def _noise(x, y, seed):
-    """Return value noise in [0, 1] with unit period."""
+    """Return value noise in [0, 1] at (x, y), with lattice points at distance 1."""
     i = math.floor(x)
     j = math.floor(y)
     a = eased(x - i)
@@ -38,14 +38,14 @@ def _part(x):
 
 @inner
 def _seam(x, width):
-    """Return 1 within `width` of an integer, 0 elsewhere."""
+    """Return 1 if x is within `width` of an integer, else 0."""
     f = _part(x)
     return 1.0 if f < width or f > 1 - width else 0.0
 
 
 @inner
 def _grid(x, y, shift, seed, softness):
-    """Draw tiles of unit size with a tone for each, and the joints between them."""
+    """Return tone and joint at (x, y) of unit tiles. shift: offset of every second row."""
     row = math.floor(y)
     x = x + shift * (row & 1)
     # no two tiles are quite alike
@@ -65,7 +65,7 @@ def _planks(x, y, seed, fade):
 
 @inner
 def _picture(p, q, seed):
-    """Draw a landscape: hills under a sky with a sun."""
+    """Return the weights of `mixture` for a landscape: hills under a sky with a sun."""
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
     # hills farther off are higher and paler
     far = hill + 0.35 * _noise(1.2 * p + 40, 8.5, seed) + 0.1
@@ -82,7 +82,7 @@ def _picture(p, q, seed):
 
 @inner
 def _rug(p, q, x, y, seed):
-    """Draw two borders, a ring in the middle, and diamonds."""
+    """Return the weights of `mixture` for a rug: two borders, a central ring, and diamonds."""
     edge = min(1 - abs(p), 1 - abs(q))
     ring = abs(p) + abs(q)
     if edge < 0.06 or 0.14 < edge < 0.18:
@@ -99,7 +99,7 @@ def _rug(p, q, x, y, seed):
 
 @inner
 def _window(p, q, seed):
-    """Draw a frame with a cross, trees and a sky."""
+    """Return the weights of `mixture` for a window: frame, glazing bars, trees and sky."""
     if abs(p) < 0.03 or abs(q - 0.25) < 0.025 or abs(p) > 0.94 or abs(q) > 0.95:
         return 0.0, 1.0
     trees = -0.5 + 0.5 * _noise(3 * p, 0.5, seed) + 0.15 * _noise(11 * p, 3.5, seed)
@@ -110,22 +110,22 @@ def _window(p, q, seed):
 
 @inner
 def _spines(x, seed):
-    """Draw books of several widths, some with a band."""
+    """Return the weights of `mixture` for spines of books, some with a band."""
     i = math.floor(x + 0.3 * _noise(x, 0.5, seed))
     return _hash(i, 1, seed), (0.9 * _hash(i, 2, seed) if _hash(i, 3, seed) > 0.5 else 0.0)
 
 
 @inner
 def smooth(kind):
-    """Return True if a texture has no edges inside."""
+    """Return True if the pattern `kind` has no sharp edges."""
     return kind in (PLAIN, CLOUDS, GRADIENT)
 
 
 @inner
 def mixture(texture, u, v, p, q, footprint):
-    """Return weights (m, n) for the colour lerp(lerp(a, b, m), c, n).
+    """Return weights (m, n) of a texture's colours a, b, c: its RGB is lerp(lerp(a, b, m), c, n).
 
-    u, v: position on the surface in metres. p, q: the same in [-1, 1] across the surface.
+    u, v: position on the surface in metres. p, q: position in [-1, 1] across the surface.
     footprint: distance between neighbouring samples in metres; finer details fade away.
     """
     kind = texture.pattern

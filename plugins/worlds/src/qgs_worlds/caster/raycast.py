@@ -1,7 +1,7 @@
-"""First hits of the rays of an image, shape by shape over the rows and columns that each covers.
+"""First hits of the rays of an image. Each shape is tested in the rows and columns it covers.
 
-A ray is o + t d with d = B (1, u, v) for a pixel (u, v). It has z = 1 in the camera frame, so t is
-the depth.
+The ray of pixel (u, v) is o + t d, with camera centre o and d = B (1, u, v) for a 3 x 3 matrix B.
+The z of d is 1 in the camera frame, so t is the depth.
 """
 
 import numpy as np
@@ -38,7 +38,7 @@ _PLANE = 0.02
 
 @inner
 def _corners(body, c2w, corners):
-    """Write the camera-frame positions (8, 3) of the corners of the box around a primitive."""
+    """Write to `corners` (8, 3) the camera-frame corners of the box around a primitive."""
     middle = minus(body.center, c2w[:, 3])
     for a in range(3):
         toward = c2w[:, a]
@@ -54,7 +54,10 @@ def _corners(body, c2w, corners):
 
 @inner
 def _clipped(corners, points):
-    """Write the corners before the camera and where edges cross its plane; return the number."""
+    """Clip a box at the camera plane; write the corners of its visible part to `points`.
+
+    Returns their number.
+    """
     n = 0
     for k in range(8):
         z = corners[k, 2]
@@ -74,9 +77,9 @@ def _clipped(corners, points):
 
 @inner
 def _covered(corners, points, intrinsics):
-    """Return the pixel range u0, u1, v0, v1 of a box from its corners; u0 > u1 behind the camera.
+    """Return the range u0, u1, v0, v1 of pixels that a box covers; u0 > u1 behind the camera.
 
-    points: (20, 3), working memory.
+    corners: see `_corners`. points: working memory (20, 3).
     """
     u0 = v0 = np.inf
     u1 = v1 = -np.inf
@@ -93,7 +96,10 @@ def _covered(corners, points, intrinsics):
 
 @inner
 def _span(low, high, samples, first, count):
-    """Return the range of samples between two coordinates, among `count` from pixel `first` on."""
+    """Return the first and the end index of samples between two pixel coordinates.
+
+    first: pixel of sample 0. count: number of samples.
+    """
     # half a sample more on both sides, because bounds and rays round differently
     low = (low - first) * samples - 0.5
     high = (high - first) * samples + 0.5
@@ -102,7 +108,7 @@ def _span(low, high, samples, first, count):
 
 @inner
 def ray_basis(c2w, intrinsics):
-    """Return the columns of B (3, 3), with d = B (1, u, v) in the world frame."""
+    """Return the columns of the matrix B: pixel (u, v) has world direction d = B (1, u, v)."""
     right = over(c2w[:, 0], intrinsics[0])
     down = over(c2w[:, 1], intrinsics[1])
     corner = along(along(c2w[:, 2], -intrinsics[2], right), -intrinsics[3], down)
@@ -111,15 +117,15 @@ def ray_basis(c2w, intrinsics):
 
 @inner
 def _row_base(rays, v):
-    """Return the direction of the ray at u = 0 of row v."""
+    """Return the direction of the ray of pixel (0, v)."""
     return narrow(along(rays[0], v, rays[2]))
 
 
 @inner
 def _ray(o, base, step, u):
-    """Return a ray of a row: its point nearest to the origin, its direction, and t at that point.
+    """Return for a ray its point nearest to the origin, its direction, and the t of this point.
 
-    Without this point, differences of large numbers would lose thin things far away.
+    Intersections start at this point, because float32 would lose thin shapes far from the camera.
     """
     d = along(base, u, step)
     p, t = nearest(o, d)
@@ -137,9 +143,9 @@ def _store(spans, k, found, t):
 
 @inner
 def _inside_row(kind, extra, heights, steps, o, base, step, spans):
-    """Write `spans` (4, R): entries, exits and their faces, for the rays of a row.
+    """Write to `spans` (4, R) entry t, exit t, entry face and exit face for the rays of a row.
 
-    Each kind has its own loop, because LLVM vectorises loops without branches.
+    Each kind of primitive has its own loop, because LLVM vectorises loops without branches.
     """
     count = steps.shape[0]
     if kind == s.ELLIPSOID:
@@ -169,7 +175,10 @@ def _inside_row(kind, extra, heights, steps, o, base, step, spans):
 
 @inner
 def _closest(t, code, own, first, second):
-    """Keep the nearer hit: that of a shape with intervals (4, R), or the earlier one."""
+    """Update t and code of a row where a shape is nearer than all earlier shapes.
+
+    own: code of the shape. first, second: intervals (4, R) of its body and of its cut.
+    """
     for k in range(t.shape[0]):
         near, face = less(
             first[0, k], first[1, k], first[2, k], second[0, k], second[1, k], second[3, k]
@@ -189,9 +198,9 @@ def _keep(t, code, k, own, found):
 
 @inner
 def _cover_row(t, code, own, kind, extent, steps, o, base, step):
-    """Keep the nearer hits along a row, like `_closest`, for a shape in metres without a cut.
+    """Do the work of `_closest` for shapes of furnished rooms, which have no cut.
 
-    It stores no intervals and takes a third of the time.
+    Storing no intervals takes a third of the time.
     """
     if kind == s.BLOCK:
         for k in range(t.shape[0]):
@@ -218,7 +227,7 @@ def _trace_primitive(primitive, heights, o, base, step, steps, spans):
 
 @inner
 def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
-    """Do the same as `_trace_shape` for a shape in metres."""
+    """Do the work of `_trace_shape` for shapes of furnished rooms, which are in metres."""
     above, below, first, last = area
     kind = body.kind
     extent = triple(body.extent)
@@ -234,7 +243,7 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
 
 @inner
 def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch):
-    """Let a shape cover everything behind it in an area of the samples."""
+    """Update t and code in an area of samples where a shape is nearer than all earlier shapes."""
     above, below, first, last = area
     step = narrow(rays[1])
     along_row = steps[first:last]
@@ -253,9 +262,10 @@ def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, are
 
 @kernel
 def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
-    """Return t and code (R, C) float32 of rays from pixel row `top` on, and the basis of the rays.
+    """Return depth t and face code, both (R, C) float32, of a band of an image, and the ray basis.
 
-    Rays go through sub-centres of pixels. Without a hit, t is inf and the code is SKY.
+    The band has `rows` pixel rows from `top` on, with samples x samples rays per pixel. A ray
+    without a hit has t = inf and code SKY. The ray basis is the result of `ray_basis`.
     """
     t = np.full((rows * samples, columns * samples), NONE, np.float32)
     code = np.full((rows * samples, columns * samples), np.float32(SKY), np.float32)

@@ -32,7 +32,10 @@ _LIFT = 2e-3
 
 @inner
 def on_axis(axis, p, unit):
-    """Return the normal of a box face across an axis, the position on it and its number."""
+    """Return normal, texture coordinates u and v, and number of the box face at point p.
+
+    axis: axis of the face's normal. unit: metres per unit of the box's frame.
+    """
     x, y, z = p
     if axis == 0:
         return (math.copysign(1.0, x), 0.0, 0.0), y * unit[1], z * unit[2], (1 if x > 0 else 0)
@@ -53,7 +56,7 @@ def _on_relief(field, p, unit):
 
 @inner
 def _on_primitive(primitive, heights, face, p):
-    """Return the result of `on_axis` for any primitive, at a point of one of its faces."""
+    """Return the same as `on_axis` for any primitive, at point p on one of its faces."""
     kind = primitive.kind
     extra = primitive.extra
     unit = triple(primitive.unit)
@@ -85,14 +88,17 @@ def _on_primitive(primitive, heights, face, p):
 
 @inner
 def to_world(primitive, n):
-    """Return a normal of a primitive's frame in the world frame, with any length."""
+    """Turn a normal from a primitive's frame into the world frame; its length is not 1."""
     axes = primitive.axes
     return dot(axes[:, 0], n), dot(axes[:, 1], n), dot(axes[:, 2], n)
 
 
 @inner
 def surface(shape, heights, part, place):
-    """Return the texture index, world normal and texture coordinates of a point."""
+    """Return texture index, world normal and texture coordinates u, v of a point on a shape.
+
+    part: number of the face; faces of a cut are 3 higher.
+    """
     cut = part >= 3
     primitive = shape.cut if cut else shape.body
     face = part - 3 if cut else part
@@ -106,7 +112,7 @@ def surface(shape, heights, part, place):
 
 @inner
 def _clouds(air, x, y, z):
-    """Return how white the sky is in a direction, from noise on a plane above."""
+    """Return the share of cloud, in [0, 1], in direction (x, y, z), from noise on a high plane."""
     if air.clouds <= 0 or z <= 0.02:
         return 0.0
     # the summand limits how fine the clouds are at the horizon
@@ -124,7 +130,7 @@ def _clouds(air, x, y, z):
 
 @inner
 def _glow(lights, view):
-    """Return the glow around the sun: a cosine to the eighth, by squares because `**` is slow."""
+    """Return the brightness of the glow around the sun: a cosine to the 16th, times a half."""
     if lights.shape[0] == 0 or lights[0].lamp > 0:
         return 0.0
     near = max(dot(view, lights[0].place), 0.0) ** 2
@@ -135,7 +141,7 @@ def _glow(lights, view):
 
 @inner
 def _sky(air, lights, view):
-    """Return RGB of the sky in a direction: a gradient, clouds and a glow around the sun."""
+    """Return the RGB of the sky in direction `view`: a gradient, clouds and a glow near the sun."""
     x, y, z = view
     cloud = _clouds(air, x, y, z)
     glow = _glow(lights, view)
@@ -148,7 +154,7 @@ def _sky(air, lights, view):
 
 @inner
 def _light(light, shadows, own, place, normal, view, open_, shine):
-    """Return how much of a light a point reflects: diffusely, and as a highlight."""
+    """Return the strengths of diffuse reflection and of highlight of one light at a point."""
     toward = minus(light.place, times(light.lamp, place))
     square = dot(toward, toward)
     near = 1.0 / math.sqrt(square)
@@ -170,7 +176,7 @@ def _light(light, shadows, own, place, normal, view, open_, shine):
 
 @inner
 def _shade(world, around, code, place, view, footprint, distance):
-    """Return RGB of a surface seen at a point from direction `view`."""
+    """Return the RGB, in linear light, of a surface at point `place` seen in direction `view`."""
     i = code >> 3
     shape = world.shapes[i]
     air = world.air[0]
@@ -199,9 +205,10 @@ def _shade(world, around, code, place, view, footprint, distance):
 
 @inner
 def _gather(t, code, i, j, own, samples):
-    """Return number and means of the rays of pixel (i, j) that hit `own`, and mark them as used.
+    """Average the rays of a pixel that hit the same face, and mark them as used.
 
-    The means are of t, and of columns and rows within the pixel with weights t.
+    own: code of the face. Returns the number of these rays, their mean t, and the means of their
+    columns and rows within the pixel, weighted by t.
     """
     n = 0
     t_sum = u_sum = v_sum = ZERO
@@ -220,9 +227,10 @@ def _gather(t, code, i, j, own, samples):
 
 @kernel
 def paint(image, t, code, top, samples, world, c2w, rays):
-    """Write a band of the image (rows, W, 3) float32 from row `top`; this overwrites `code`.
+    """Write a band of an image, (rows, W, 3) float32 linear light; this overwrites `code`.
 
-    Values are linear light. Rays of a pixel on the same surface are shaded at their mean.
+    t, code, rays: results of `trace`. top: image row of the band's first row. Rays of a pixel that
+    hit the same face are shaded once, at their mean.
     """
     # kept over the band, because neighbouring points have the same boxes nearby
     around = surroundings(world.shapes)

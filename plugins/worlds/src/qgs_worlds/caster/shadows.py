@@ -1,6 +1,6 @@
-"""Shadow maps, cast once per scene by the kernels that cast its photos, and ambient occlusion.
+"""Shadow maps, rendered once per scene by the ray caster, and ambient occlusion.
 
-Ambient occlusion estimates how much of the sky or walls a point sees, from boxes around shapes.
+Ambient occlusion darkens points near other shapes. It is estimated from boxes around shapes.
 """
 
 import math
@@ -32,9 +32,9 @@ for _face in range(6):
 def shadow_maps(
     shapes: np.ndarray, heights: np.ndarray, lights: np.ndarray, middle: np.ndarray, radius: float
 ) -> tuple[np.ndarray, s.Shadows]:
-    """Return the lights, with the number of their first map plus 1, and the maps.
+    """Return a copy of `lights` whose field `shadows` points to its maps, and all shadow maps.
 
-    middle, radius: ball with the sun's shadows; lamps cast shadows everywhere.
+    middle, radius: ball in which the sun casts shadows. Lamps cast shadows everywhere.
     """
     lights = lights.copy()
     maps = []
@@ -59,7 +59,7 @@ def shadow_maps(
 def _views(
     light: np.ndarray, middle: np.ndarray, radius: float
 ) -> list[tuple[np.ndarray, int, float]]:
-    """Return c2w, side and focal length of the maps of a light."""
+    """Return pose c2w, side and focal length in pixels for each shadow map of a light."""
     place = light["place"]
     c2w = np.tile(np.eye(4), (6, 1, 1))
     if light["lamp"]:
@@ -73,7 +73,7 @@ def _views(
 
 @inner
 def _seen(shadows, k, own, p):
-    """Return the share of a light that reaches a point, from map k; 1 outside the map."""
+    """Return the share of light that reaches point p by shadow map k; 1 outside the map."""
     view = shadows.maps[k]
     side = view.side
     place = minus(p, view.c2w[:, 3])
@@ -104,7 +104,10 @@ def _seen(shadows, k, own, p):
 
 @inner
 def lit(shadows, light, own, p):
-    """Return the share of a light that reaches a point. own: its shape if that cannot shade it."""
+    """Return the share of a light that reaches point p, in [0, 1].
+
+    own: index of the shape of p if this shape cannot cast a shadow on itself, otherwise -1.
+    """
     k = light.shadows - 1
     if light.lamp > 0:
         away = minus(p, light.place)
@@ -115,10 +118,10 @@ def lit(shadows, light, own, p):
 
 @kernel
 def surroundings(shapes):
-    """Return the memory that `visible` keeps for successive points: all boxes, and the near ones.
+    """Return the cache that `visible` keeps between points: all boxes, near boxes, and their place.
 
-    Boxes are (19, S), one field per row, so that loops over them are vectorised. Then come the
-    place, the number of boxes near it, and the square of the distance up to which they are enough.
+    Boxes are (19, S), one field per row, so that loops over shapes are vectorised. The place (5,)
+    is a point, the number of boxes near it, and the squared distance up to which they are valid.
     """
     boxes = np.empty((_FIELDS, shapes.shape[0]), np.float32)
     for i in range(shapes.shape[0]):
@@ -136,7 +139,7 @@ def surroundings(shapes):
 
 @inner
 def _find(shapes, around, p, reach, slack):
-    """Keep the boxes near a place, except those of hollow shapes, which do not fill their boxes."""
+    """Copy the boxes near point p to the cache, except those of hollow shapes."""
     boxes, near, place = around
     place[:3] = p
     place[4] = slack * slack
@@ -154,10 +157,12 @@ def _find(shapes, around, p, reach, slack):
 
 @reducing
 def visible(shapes, around, own, point, normal, strength, reach, footprint):
-    """Return the ambient light at a point, from a distance field at two heights above it.
+    """Return the share of ambient light at a point, 1 without occlusion.
 
-    The method is that of Evans 2006, "Fast approximations for global illumination on dynamic
-    scenes". own: shape of the point. footprint: distance between pixels there, in metres.
+    It compares distances to shapes at two heights above the point, after Evans 2006, "Fast
+    approximations for global illumination on dynamic scenes". around: see `surroundings`. own:
+    index of the point's shape. footprint: distance between neighbouring pixels at the point, in
+    metres.
     """
     x, y, z = narrow(point)
     nx, ny, nz = narrow(normal)

@@ -1,4 +1,4 @@
-"""Primitives, shapes of one or two primitives, and their rows in tables."""
+"""Primitives and shapes, and their conversion to tables for the ray caster."""
 
 import math
 from collections.abc import Sequence
@@ -12,13 +12,17 @@ from qgs_worlds.caster import tables as s
 
 Point = tuple[float, ...]
 Turn = tuple[float, ...]
-"""A rotation, row by row."""
+"""Rotation matrix as nine numbers, row by row."""
 UPRIGHT: Turn = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 ROUND = (s.ELLIPSOID, s.CAPSULE, s.TORUS)
 
 
 class Primitive(NamedTuple):
-    """Primitive. extra: see `rows`. turn: rotation to the world, row by row."""
+    """Solid of a given kind, such as a box or a torus.
+
+    half: half sizes in metres. turn: rotation to the world frame. extra: see `PRIMITIVE` in
+    `tables.py`.
+    """
 
     kind: int
     center: Point
@@ -27,7 +31,7 @@ class Primitive(NamedTuple):
     extra: float = 0.0
 
     def moved(self, to: Point, turn: Turn, size: float) -> "Primitive":
-        """Return the primitive scaled about the origin, turned, then moved."""
+        """Return the primitive scaled by `size` about the origin, turned, then moved by `to`."""
         x, y, z = rotated(turn, self.center)
         center = (to[0] + size * x, to[1] + size * y, to[2] + size * z)
         a, b, c = self.half
@@ -35,7 +39,7 @@ class Primitive(NamedTuple):
         return Primitive(self.kind, center, half, product(turn, self.turn), self.extra)
 
     def reach(self) -> float:
-        """Return the largest extent up or down from its centre, in metres."""
+        """Return the vertical distance from the centre to the highest point, in metres."""
         size = self.half[2]
         up = abs(self.turn[8])
         if self.kind == s.CAPSULE:
@@ -49,7 +53,11 @@ class Primitive(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Primitive minus an optional second one. faces: number of textures, from `texture` on."""
+    """Primitive `body`, from which the primitive `cut` may be removed.
+
+    texture: index of the first texture. faces: number of textures, one for each face. cut_texture:
+    texture of the cut's wall. scale: metres per unit of a texture.
+    """
 
     body: Primitive
     cut: Primitive | None = None
@@ -59,34 +67,34 @@ class Shape(NamedTuple):
     scale: float = 1.0
 
     def moved(self, to: Point, turn: Turn, size: float = 1.0) -> "Shape":
-        """See `Primitive.moved`."""
+        """Return the shape scaled by `size` about the origin, turned, then moved by `to`."""
         cut = self.cut and self.cut.moved(to, turn, size)
         body = self.body.moved(to, turn, size)
         return self._replace(body=body, cut=cut, scale=self.scale * size)
 
 
 def rotated(turn: Turn, p: Point) -> Point:
-    """Return a rotated point."""
+    """Rotate the point p by `turn`."""
     a, b, c, d, e, f, g, h, i = turn
     x, y, z = p
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
 def product(a: Turn, b: Turn) -> Turn:
-    """Return the rotation by b, then by a."""
+    """Return the matrix product a b: the rotation by b, then by a."""
     columns = [rotated(a, b[axis::3]) for axis in range(3)]
     return tuple(chain(*zip(*columns, strict=True)))
 
 
 def about_z(angle: float) -> Turn:
-    """Return a rotation about the vertical."""
+    """Return a rotation by `angle` radians about the z axis."""
     cos = math.cos(angle)
     sin = math.sin(angle)
     return cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0
 
 
 def any_turn(rng: Random) -> Turn:
-    """Draw a uniform random rotation (a random unit quaternion)."""
+    """Return a uniform random rotation."""
     # normal distributions prefer no direction
     w, x, y, z = (rng.gauss(0, 1) for _ in range(4))
     f = 2 / (w * w + x * x + y * y + z * z)
@@ -115,7 +123,7 @@ def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primit
 
 
 def packed(shapes: Sequence[Shape]) -> np.ndarray:
-    """Return the ray caster's table of SHAPE."""
+    """Return a table of SHAPE for the ray caster, one row for each shape."""
     table = np.zeros(len(shapes), s.SHAPE)
     body = _primitives([shape.body for shape in shapes])
     table["body"] = body
@@ -132,7 +140,7 @@ def packed(shapes: Sequence[Shape]) -> np.ndarray:
 
 
 def _primitives(primitives: Sequence[Primitive]) -> np.ndarray:
-    """Return a table of PRIMITIVE."""
+    """Return a table of PRIMITIVE, one row for each primitive."""
     kind, center, half, turn, extra = map(np.array, zip(*primitives, strict=True))
     metric = (kind >= s.BLOCK)[:, None]
     unit = np.where(metric, 1.0, half)

@@ -1,7 +1,7 @@
-"""Tables of numbers that describe shapes, textures, lights and air to the ray caster.
+"""NumPy record types that describe shapes, textures, lights and air to the ray caster.
 
-The world frame is in metres, z up. A shape is a primitive in its own frame, minus an optional
-second convex primitive.
+The world frame is in metres, z up. A shape is a primitive, from which a second, convex primitive
+may be cut.
 """
 
 from typing import NamedTuple
@@ -73,7 +73,7 @@ MAP = np.dtype([("begin", "i8"), ("side", "i8"), ("focal", "f8"), ("c2w", "f8", 
 
 
 class Shadows(NamedTuple):
-    """Shadow maps: a table of MAP, and concatenated depths and codes of all their pixels."""
+    """Shadow maps: a table of MAP, and the depths and face codes of the pixels of all maps."""
 
     maps: np.ndarray
     depths: np.ndarray
@@ -81,9 +81,9 @@ class Shadows(NamedTuple):
 
 
 class World(NamedTuple):
-    """Scene for the ray caster: tables of SHAPE, TEXTURE, LIGHT and one row of AIR.
+    """Abstract scene for the ray caster: tables of SHAPE, TEXTURE, LIGHT and one row of AIR.
 
-    heights: (K, G, G) float32 in [-1, 1].
+    heights: height maps (K, G, G) float32 in [-1, 1].
     """
 
     shapes: np.ndarray
@@ -95,10 +95,11 @@ class World(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Furnished room for the ray caster: tables of SHAPE, with the room first, and of TEXTURE.
+    """Furnished room for the ray caster.
 
-    heights: see `World`. size: x, y, z extent in metres. lights: a table of LIGHT. floor: (C, C)
-    factor of the light on the floor, indexed by x, then y.
+    shapes: table of SHAPE; row 0 is the room itself. heights: see `World`. textures: table of
+    TEXTURE. size: x, y, z extent in metres. lights: table of LIGHT. floor: factors (C, C) of the
+    light on the floor, indexed by x, then y.
     """
 
     shapes: np.ndarray

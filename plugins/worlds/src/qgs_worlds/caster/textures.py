@@ -16,13 +16,16 @@ _TABLE = np.random.default_rng(7).random((_SIDE, _SIDE)).astype(np.float32)
 
 @inner
 def chance(i, j, seed):
-    """Return a number in [0, 1) for each lattice point."""
+    """Return a pseudo-random number in [0, 1) for the lattice point (i, j)."""
     return float(_TABLE[(i + seed) & (_SIDE - 1), (j + (seed >> 6)) & (_SIDE - 1)])
 
 
 @inner
 def _corner(basis, i, j, seed, x, y):
-    """Return the height at (x, y) of a plane through the lattice point, level or sloped."""
+    """Return what lattice point (i, j) adds to noise at offset (x, y).
+
+    VALUE noise takes a random number, GRADIENT noise a random slope times the offset.
+    """
     if basis == s.VALUE:
         return chance(i, j, seed) - 0.5
     return (2 * chance(i, j, seed) - 1.0) * x + (2 * chance(j, i, seed + 1371) - 1.0) * y
@@ -30,7 +33,7 @@ def _corner(basis, i, j, seed, x, y):
 
 @inner
 def _cells(x, y, i, j, seed):
-    """Return the distance to the nearest of random points, one per cell, minus its mean."""
+    """Return the distance to the nearest of random points, one per cell, scaled to a mean of 0."""
     least = 4.0
     for a in range(-1, 2):
         for b in range(-1, 2):
@@ -42,13 +45,16 @@ def _cells(x, y, i, j, seed):
 
 @inner
 def eased(x):
-    """Return x in [0, 1], eased to zero slope at both ends."""
+    """Return the smoothstep of x in [0, 1], which has slope 0 at both ends."""
     return x * x * (3 - 2 * x)
 
 
 @inner
 def noise(basis, x, y, seed):
-    """Return noise of unit period and a mean of about 0, mostly within -0.5 and 0.5."""
+    """Return noise at (x, y) with a mean of about 0, mostly between -0.5 and 0.5.
+
+    basis: VALUE, GRADIENT or CELLS. Lattice points are at distance 1.
+    """
     i = math.floor(x)
     j = math.floor(y)
     if basis == s.CELLS:
@@ -67,13 +73,13 @@ def noise(basis, x, y, seed):
 
 @inner
 def _seen(footprint, period):
-    """Return the visibility of details with a period, 0 if it is below two footprints."""
+    """Return the visibility in [0, 1] of details with a period; 0 below two pixel footprints."""
     return min(max(2.0 - 4.0 * footprint / period, 0.0), 1.0)
 
 
 @inner
 def _octaves(texture, x, y, footprint):
-    """Return noise in octaves around 0.5; x, y and footprint are in periods."""
+    """Return the sum of a texture's noise octaves, around 0.5. x, y, footprint: in periods."""
     total = 0.0
     weight = texture.contrast
     for octave in range(texture.octaves):
@@ -91,19 +97,19 @@ def _octaves(texture, x, y, footprint):
 
 @inner
 def _step(x, blur):
-    """Return a blurred step at 0."""
+    """Return a step from 0 to 1 at x = 0, blurred over a width `blur`."""
     return min(max(0.5 + x / blur, 0.0), 1.0)
 
 
 @inner
 def _bar(x, width, blur):
-    """Return 1 within `width` around an integer, 0 elsewhere."""
+    """Return 1 in a bar of `width` centred on each integer, else 0; edges are blurred."""
     return _step(0.5 * width - abs(x - math.floor(x + 0.5)), blur)
 
 
 @inner
 def _glyphs(x, y, seed):
-    """Draw lines of letters from 4 x 6 random dots, with spaces and lines of random length."""
+    """Return 1 where (x, y) is inked in lines of random letters of 4 x 6 dots, else 0."""
     line = math.floor(y)
     place = math.floor(x)
     if chance(place // 3, line, seed + 5) < 0.25 or chance(place, line, seed) < 0.15:
@@ -117,7 +123,7 @@ def _glyphs(x, y, seed):
 
 @inner
 def _mean(kind, width):
-    """Return the mean share of the fourth colour in a pattern."""
+    """Return the mean share of the pattern's colour over a whole pattern."""
     if kind == s.CHECKER:
         return 0.5
     if kind == s.TILES:
@@ -129,7 +135,7 @@ def _mean(kind, width):
 
 @inner
 def _pattern(kind, x, y, width, seed, blur):
-    """Return the share of the fourth colour, and the tone of the cell in [0, 1]."""
+    """Return the share of the pattern's colour at (x, y), and a random tone in [0, 1]."""
     if kind == s.STRIPES or kind == s.RINGS:
         place = x if kind == s.STRIPES else math.sqrt(x * x + y * y)
         return _bar(place, width, blur), chance(math.floor(place + 0.5), 0, seed)
@@ -153,7 +159,10 @@ def _pattern(kind, x, y, width, seed, blur):
 
 @inner
 def _marked(texture, rgb, u, v, warped, footprint):
-    """Put the pattern of a texture over a colour. warped: u after the warp of the noise."""
+    """Blend the pattern of a texture over the colour `rgb`.
+
+    warped: u in periods of the noise, after the noise's warp.
+    """
     period = texture.pattern_period
     blur = footprint / period * max(texture.aspect, 1.0)
     x = u / period * texture.aspect + 0.2 * (warped - u / texture.period)
@@ -169,7 +178,10 @@ def _marked(texture, rgb, u, v, warped, footprint):
 
 @inner
 def color(texture, u, v, footprint):
-    """Return RGB at u, v. footprint: distance between neighbouring pixels, in the same unit."""
+    """Return the RGB of a texture at (u, v).
+
+    footprint: distance between neighbouring pixels on the surface, in the unit of u and v.
+    """
     x = u / texture.period
     y = v / texture.period
     if texture.warp > 0:

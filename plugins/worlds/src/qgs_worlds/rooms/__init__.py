@@ -1,4 +1,4 @@
-"""Procedural rooms for qgs: plan, furniture, materials, camera paths."""
+"""Plugin `rooms`: procedural furnished rooms as training data."""
 
 from qgs.contracts import Plugin
 from qgs_worlds.rooms.source import RoomsSource

@@ -1,7 +1,7 @@
-"""Pieces of furniture, each a list of shapes around the origin with its back towards +y.
+"""Pieces of furniture. Each is a list of shapes around the origin with its back towards +y.
 
-The world frame of rooms is in metres: x and y along the walls, z up, the floor at z = 0, and the
-room centred on the z axis. Shapes are upright and may be turned about z.
+The world frame of a room is in metres: x and y along the walls, z up, the floor at z = 0. The z
+axis goes through the centre of the room. Shapes are upright and may be turned about z.
 """
 
 import math
@@ -24,7 +24,11 @@ WALLS = 6
 
 
 class Shape(NamedTuple):
-    """Shape of furniture. half: half size along each axis, or radii of round shapes."""
+    """Shape of furniture, turned by `turn` radians about z.
+
+    kind: BLOCK, BALL or CYLINDER. half: half size along each axis in metres; for round shapes, the
+    radii. texture: index of a material.
+    """
 
     kind: int
     center: Point
@@ -41,7 +45,7 @@ class Shape(NamedTuple):
         return Shape(self.kind, center, self.half, self.turn + turn, self.texture)
 
     def bounds(self) -> tuple[float, ...]:
-        """Return the lowest and highest x, y, z of the box around the shape."""
+        """Return the bounding box of the shape: lowest x, y, z, then highest x, y, z."""
         x, y, z = self.center
         a, b, c = self.half
         # most shapes are not turned, and bounds are asked for often
@@ -55,25 +59,25 @@ class Shape(NamedTuple):
 
 
 def box(x: float, y: float, z: float, w: float, d: float, h: float, texture: int) -> Shape:
-    """Return a box with bottom centre (x, y, z), width w along x, depth d along y and height h."""
+    """Return a w x d x h box. (x, y, z) is the centre of its bottom face."""
     return Shape(s.BLOCK, (x, y, z + h / 2), (w / 2, d / 2, h / 2), 0.0, texture)
 
 
 def cylinder(x: float, y: float, z: float, radius: float, height: float, texture: int) -> Shape:
-    """Return an upright cylinder with bottom centre (x, y, z)."""
+    """Return an upright cylinder. (x, y, z) is the centre of its bottom face."""
     half = (radius, radius, height / 2)
     return Shape(s.CYLINDER, (x, y, z + height / 2), half, 0.0, texture)
 
 
 def sphere(x: float, y: float, z: float, radius: float, texture: int) -> Shape:
-    """Return a sphere with lowest point (x, y, z)."""
+    """Return a sphere whose lowest point is (x, y, z)."""
     return Shape(s.BALL, (x, y, z + radius), (radius, radius, radius), 0.0, texture)
 
 
 def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
-    """Return the ray caster's table of SHAPE for a room of this size and the shapes inside it.
+    """Return a table of SHAPE for the ray caster: first the room itself, then the shapes in it.
 
-    Textures of walls, floor and ceiling come first, then the textures of the shapes.
+    Textures 0 to 5 are those of walls, floor and ceiling. The textures of the shapes follow.
     """
     walls = Shape(s.INTERIOR, (0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2]), 0.0, -WALLS)
     return shapes.packed(
@@ -89,7 +93,7 @@ def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
 
 Piece = list[Shape]
 Sizes = dict[str, Any]
-"""Lengths in metres and indices of materials, by their names in `furniture.toml`."""
+"""Values of the names in `furniture.toml`: lengths in metres and indices of materials."""
 
 _ORNAMENTS = ("vase", "globe", "table_lamp", "pile", "cube")
 # a name that is listed twice is drawn more often
@@ -104,7 +108,7 @@ _LEVEL = 0.38
 
 
 def _terms(value: float | str) -> float | list[tuple[float, str]]:
-    """Return factors and names of a sum such as "h-0.3r", or a plain number unchanged."""
+    """Parse a sum such as "h-0.3r" into pairs of factor and name. Return a number unchanged."""
     if not isinstance(value, str):
         return value
     found = re.findall(r"([+-]?)(?=[\d.a-z])([\d.]*)([a-z]*)", value)
@@ -131,21 +135,21 @@ for _kind in _KINDS.values():
 
 
 def _part(row: list[Any], sizes: Sizes) -> Shape:
-    """Return the part of a piece that a row of the file describes."""
+    """Return the shape that a row of `furniture.toml` describes."""
     make, lengths, material, *turn = row
     part = make(*_lengths(lengths, sizes), sizes[material])
     return part._replace(turn=sizes[turn[0]]) if turn else part
 
 
 class Furniture:
-    """Generator of random pieces of `furniture.toml` for one room."""
+    """Generator of random furniture for one room, from the kinds in `furniture.toml`."""
 
     def __init__(self, rng: Random, material: Materials) -> None:
         self.rng = rng
         self.material = material
 
     def piece(self, name: str, **sizes: Any) -> Piece:
-        """Draw a piece by name. sizes: given values, which are not drawn."""
+        """Return a random piece of furniture. sizes: values to use instead of random ones."""
         kind = _KINDS[name]
         for size, how in kind.get("draws", {}).items():
             if size not in sizes:
@@ -162,7 +166,7 @@ class Furniture:
         return piece
 
     def ornament(self, x: float, y: float, z: float) -> Piece:
-        """Draw a small ornament that stands at (x, y, z)."""
+        """Return a random small ornament that stands at (x, y, z)."""
         return self.piece(self.rng.choice(_ORNAMENTS), x=x, y=y, z=z)
 
     def _drawn(self, how: Any) -> float:
@@ -176,12 +180,12 @@ class Furniture:
         return self.material(next(name for name, below in how.items() if pick < below))
 
     def spots(self, most: float) -> list[float]:
-        """Draw one to three places as shares of a width."""
+        """Return one to three random offsets from the middle, shares of a width up to `most`."""
         return [self.rng.uniform(-most, most) for _ in range(self.rng.randrange(1, 4))]
 
 
 def _around_table(make: Furniture, sizes: Sizes) -> Piece:
-    """Return things on a table and chairs around it."""
+    """Return ornaments on a table and chairs around the table."""
     rng = make.rng
     w = sizes["w"]
     d = sizes["d"]
@@ -207,7 +211,7 @@ def _cushions(make: Furniture, sizes: Sizes) -> Piece:
 
 
 def _books(make: Furniture, sizes: Sizes) -> Piece:
-    """Return the boards of a shelf, rows of books on them, and a few ornaments."""
+    """Return the boards of a shelf with rows of books and a few balls on them."""
     rng = make.rng
     w = sizes["w"]
     levels = sizes["n"]

@@ -1,4 +1,4 @@
-"""Materials of a room: textures with matching colours, drawn from a table of kinds."""
+"""Random materials of a room, with matching colours; `materials.toml` lists their kinds."""
 
 import colorsys
 import tomllib
@@ -26,12 +26,12 @@ def toned(color: Color, factor: float) -> Color:
 
 
 def between(rng: Random, value: float | Sequence[float]) -> float:
-    """Return a given number, or draw one uniformly from a range [low, high]."""
+    """Return `value` if it is a number, or a uniform random number if it is a range [low, high]."""
     return value if isinstance(value, int | float) else rng.uniform(*value)
 
 
 class Materials:
-    """Growing list of a room's textures, drawn from a few matching hues."""
+    """Generator and list of the random textures of one room, in a few matching hues."""
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
@@ -42,7 +42,7 @@ class Materials:
         self._wood = rng.choice(_WOODS)
 
     def __call__(self, name: str) -> int:
-        """Draw a material of a kind of `materials.toml` and return its index."""
+        """Add a random material of kind `name` of `materials.toml` and return its index."""
         rng = self.rng
         paints = dict(_FIXED)
         kind = _KINDS[name]
@@ -64,7 +64,7 @@ class Materials:
         return len(self._rows) - 1
 
     def table(self, first: Sequence[int]) -> np.ndarray:
-        """Return the ray caster's table of TEXTURE: the materials `first`, then all."""
+        """Return a table of TEXTURE for the ray caster: materials `first`, then all materials."""
         rows = [self._rows[i] for i in first] + self._rows
         table = np.zeros(len(rows), TEXTURE)
         for field in rows[0].keys() - {"colors"}:
@@ -73,7 +73,7 @@ class Materials:
         return table
 
     def _pattern(self, kind: dict[str, Any], paints: dict[str, Color]) -> dict[str, int]:
-        """Draw the pattern of a kind, and add its paints to `paints`."""
+        """Choose a random pattern for a kind of material, and add its colours to `paints`."""
         names = kind.get("patterns", [])
         # a choice among one would consume a random number
         name = self.rng.choice(names) if len(names) > 1 else "".join(names)

@@ -1,4 +1,4 @@
-"""Plan of a room: walls, openings, furniture and lights, drawn from a seed."""
+"""Random plan of a room: walls, window, furniture and lights."""
 
 import math
 from random import Random
@@ -35,7 +35,10 @@ _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 
 def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
-    """Return a room of `size` with furniture away from the camera centres `eyes` (F, 3)."""
+    """Return a random room of `size` metres. Furniture keeps clear of the cameras.
+
+    eyes: camera centres (F, 3).
+    """
     material = Materials(rng)
     # in most rooms all four walls are of one kind
     wall = material("wall")
@@ -61,7 +64,7 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
 
 
 class Furnisher:
-    """Placer of pieces, one by one, without collisions with pieces or cameras."""
+    """Placer of furniture that refuses collisions with cameras and with earlier pieces."""
 
     def __init__(self, size: Size, eyes: np.ndarray) -> None:
         self.size = size
@@ -70,7 +73,7 @@ class Furnisher:
         self._taken: list[tuple[float, float, float, float]] = []
 
     def place(self, piece: Piece, x: float, y: float, turn: float) -> bool:
-        """Place `piece` at (x, y), turned; return False, without placing it, if it does not fit."""
+        """Place `piece` at (x, y), turned by `turn` radians. Return False if it does not fit."""
         low, high = turned(*bounds(piece), x, y, turn)
         if not self.free(low, high):
             return False
@@ -79,7 +82,7 @@ class Furnisher:
         return True
 
     def free(self, low: Point, high: Point) -> bool:
-        """Return True if the box between two corners is inside and clear of pieces and cameras."""
+        """Return True if a box is inside the room and clear of all pieces and cameras."""
         half_x = self.size[0] / 2
         half_y = self.size[1] / 2
         if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
@@ -97,13 +100,13 @@ class Furnisher:
 
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
-    """Return the lowest and the highest corner of the box around `shapes`."""
+    """Return the lowest and the highest corner of the bounding box of `shapes`."""
     x0, y0, z0, x1, y1, z1 = zip(*[shape.bounds() for shape in shapes], strict=True)
     return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
 
 
 def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
-    """Return the corners of a box around the given one after a turn about z and a move."""
+    """Return the bounding box of a box turned about z by `turn` radians and moved by (x, y)."""
     cos = math.cos(turn)
     sin = math.sin(turn)
     xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
@@ -124,7 +127,7 @@ def _centre(make: Furniture, furnisher: Furnisher) -> None:
 
 
 def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
-    """Place pieces in a row with their backs to a wall. Sides 0 to 3 are -x, -y, +x and +y."""
+    """Place a row of pieces with their backs to wall `side`: 0 to 3 are -x, -y, +x and +y."""
     rng = make.rng
     across = furnisher.size[side % 2]
     along = furnisher.size[1 - side % 2]
@@ -143,7 +146,7 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
 
 
 def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
-    """Return the point `away` from the centre towards wall `side`, `along` it."""
+    """Return x and y of a point `away` metres towards wall `side` and `along` metres beside it."""
     angle = math.pi + side * math.pi / 2
     cos = math.cos(angle)
     sin = math.sin(angle)
@@ -151,7 +154,7 @@ def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
 
 
 def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
-    """Return a window on one wall, and pictures on the others."""
+    """Return a window on wall `window_side`, and pictures on the three other walls."""
     rng = make.rng
     shapes: list[Shape] = []
     for side in range(4):
@@ -176,7 +179,7 @@ def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
 
 
 def _fixed(make: Furniture, size: Size) -> list[Shape]:
-    """Return the rug, the skirting boards and the ceiling lamp."""
+    """Return the shapes of skirting boards, ceiling lamp and, in most rooms, a rug."""
     rng = make.rng
     board = make.material("pale")
     w, d, h = size
@@ -193,7 +196,7 @@ def _fixed(make: Furniture, size: Size) -> list[Shape]:
 
 
 def _lights(rng: Random, size: Size, window_side: int) -> np.ndarray:
-    """Return the light table of a warm lamp below the ceiling and a cool window."""
+    """Return a table of LIGHT with two rows: a warm lamp below the ceiling, and a cool window."""
     x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
     lights = np.zeros(2, LIGHT)
     lights["place"] = (0.0, 0.0, size[2] - 0.2), (x, y, 1.6)

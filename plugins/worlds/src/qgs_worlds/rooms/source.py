@@ -1,6 +1,6 @@
 """Data source `rooms/procedural`: endless furnished rooms, ray-cast on demand.
 
-Kernels are imported when the first room is drawn, because numba takes longer to load than a recipe.
+The compiled kernels are imported when the first room is generated, because loading numba is slow.
 """
 
 import math
@@ -44,7 +44,7 @@ class RoomsConfig(DrawnConfig):
 
 
 class RoomScene(DrawnScene):
-    """Room with cameras on a path. World: metres, z up, the floor at 0."""
+    """Furnished room and its cameras on a path. World frame: metres, z up, floor at z = 0."""
 
     def __init__(
         self, name: str, index: int, config: RoomsConfig, split: Split, cache: ImageCache
@@ -60,7 +60,7 @@ class RoomScene(DrawnScene):
 
     @cached_property
     def tables(self) -> "Room":
-        """Furnished room."""
+        """Walls, furniture, textures and lights, as tables for the ray caster."""
         from qgs_worlds.rooms.plan import furnish
 
         return furnish(Random(self._plan_seed), self.size, self.c2w[:, :3, 3])
@@ -78,7 +78,7 @@ class RoomScene(DrawnScene):
 
 
 class RoomsSource(DrawnSource):
-    """Source of endless procedural rooms; room i of a split depends only on (seed, split, i)."""
+    """Source of random furnished rooms. Seed, split and index determine a room."""
 
     name = "procedural"
     Config = RoomsConfig
@@ -88,7 +88,10 @@ class RoomsSource(DrawnSource):
 def camera_path(
     rng: np.random.Generator, size: tuple[float, float, float], count: int
 ) -> np.ndarray:
-    """Return OpenCV c2w (count, 4, 4) of cameras that look across the room."""
+    """Return c2w (count, 4, 4) of a camera path that looks across a room of `size` metres.
+
+    Camera axes follow OpenCV. A path starts near a wall and may be walked in both directions.
+    """
     # drawn along one wall, then turned, so that all four walls are equally likely
     side = int(rng.integers(4))
     across = size[0] if side % 2 == 0 else size[1]

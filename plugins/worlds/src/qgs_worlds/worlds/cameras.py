@@ -1,4 +1,4 @@
-"""Cameras of a scene: walks, orbits, looks around, and sets that look at one point."""
+"""Random cameras: walks, orbits, turns on the spot, and scattered cameras around a target."""
 
 import math
 from typing import NamedTuple, TypeAlias
@@ -28,8 +28,8 @@ _PROBE = (6, 6)
 class Rig(NamedTuple):
     """Cameras of a scene.
 
-    c2w: OpenCV (F, 4, 4). fov: across the longer side of an image, in degrees. distance: from the
-    cameras to their target.
+    c2w: poses (F, 4, 4) with OpenCV axes. fov: field of view along the longer side of an image, in
+    degrees. distance: metres from the cameras to their target. motion: name of the camera motion.
     """
 
     c2w: np.ndarray
@@ -38,12 +38,12 @@ class Rig(NamedTuple):
     motion: str
 
     def lens(self, size: tuple[int, int]) -> np.ndarray:
-        """Return fx, fy, cx, cy in pixels of images (H, W)."""
+        """Return intrinsics fx, fy, cx, cy in pixels for images of size (H, W)."""
         focal = lens(self.fov, (max(size), max(size)))[0]
         return np.array([focal, focal, size[1] / 2, size[0] / 2])
 
     def sight(self, place: Place) -> tuple[np.ndarray, float]:
-        """Return centre and radius of a ball around most of the view; indoors, of the room."""
+        """Return centre and radius of a ball around most of the view; indoors, around the room."""
         if place.kind == "indoors":
             half = 0.5 * place.top
             return np.array([0.0, 0.0, half]), math.hypot(*place.high[:2], half) + 0.5
@@ -52,9 +52,10 @@ class Rig(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Path of cameras from `base`, `length` metres long, towards or around `target`.
+    """Parameters of a camera path through or around the point `base`, with views of `target`.
 
-    s: position of each camera on the path, from -.5 to .5. fov: see `Rig`.
+    length: length of the path in metres. s: position of each camera on the path, from -0.5 to 0.5.
+    fov: see `Rig`.
     """
 
     base: np.ndarray
@@ -65,7 +66,7 @@ class Path(NamedTuple):
 
 
 Motion: TypeAlias = tuple[np.ndarray, np.ndarray]
-"""Camera centres and the points that they look at, both (F, 3)."""
+"""Camera centres (F, 3), and the points (F, 3) that the cameras look at."""
 
 
 def draw_cameras(
@@ -75,10 +76,10 @@ def draw_cameras(
     count: int,
     varied: bool,
 ) -> Rig:
-    """Return cameras in `place` with a useful view. world: shapes and heights.
+    """Return `count` random cameras in `place` with useful views.
 
-    They are the best of a few draws and keep `CLEARANCE` from fixed shapes. The caller must remove
-    other shapes that are nearer.
+    world: table of SHAPE and height maps. The cameras are the best of a few random sets and keep
+    `CLEARANCE` from fixed shapes. The caller must remove movable shapes that are nearer.
     """
     best = None
     least = math.inf
@@ -99,13 +100,13 @@ def draw_cameras(
 
 
 def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
-    """Return 0 if all camera centres are at allowed places, otherwise 100."""
+    """Return 0 if all camera centres are in the allowed box and clear of fixed shapes, else 100."""
     inside = (eyes >= place.low).all() and (eyes <= place.high).all()
     return 0.0 if inside and clearances(shapes[: place.fixed], eyes).min() > CLEARANCE else 100.0
 
 
 def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
-    """Return the share of sky and of things close to the camera in the worst view."""
+    """Return a penalty, 0 or more, for views with much sky or with surfaces close to the camera."""
     intrinsics = rig.lens(_PROBE)
     near = clearances(world[0], rig.c2w[:, :3, 3]).min()
     views = [trace(*_PROBE, 0, 1, *world, c2w, intrinsics)[0].ravel() for c2w in rig.c2w]
@@ -116,7 +117,7 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
-    """Return cameras a few millimetres apart at the freest of some points, as a last resort."""
+    """Return cameras millimetres apart, where space is widest; used if all camera paths fail."""
     # any point is better than one inside a wall
     points = rng.uniform(place.low, place.high, (64, 3))
     base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
@@ -128,7 +129,7 @@ def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: in
 
 
 def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
-    """Draw cameras anywhere in the place. shrink: factor of the path's length."""
+    """Return random cameras, not yet tested for collisions. shrink: factor of the path's length."""
     target = np.array(place.targets[rng.integers(len(place.targets))])
     base, distance = _stand(rng, place, target, varied)
     s = np.linspace(-0.5, 0.5, count)
@@ -157,7 +158,7 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
 def _stand(
     rng: np.random.Generator, place: Place, target: np.ndarray, varied: bool
 ) -> tuple[np.ndarray, float]:
-    """Draw a point from which to look at the target; return it and its distance."""
+    """Return a random camera centre with a view of the target, and its distance to the target."""
     low, high = np.log(place.distance)
     for _ in range(20):
         distance = math.exp(rng.uniform(low, high))
@@ -179,7 +180,7 @@ def _stand(
 
 
 def _walk(rng: np.random.Generator, path: Path) -> Motion:
-    """Move along a bent line and look ahead or sideways; longer lenses look more sideways."""
+    """Move along a bent line. Cameras with a wide field of view may look ahead."""
     base, target, length, s, fov = path
     # people move more along the ground than up
     way = rng.normal(size=3) * (1, 1, 0.3)
@@ -191,7 +192,7 @@ def _walk(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _orbit(rng: np.random.Generator, path: Path) -> Motion:
-    """Move around the target, and slightly up and nearer."""
+    """Move around the target, with small changes of height and distance."""
     base, target, length, s, _ = path
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
@@ -205,7 +206,7 @@ def _orbit(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _round(rng: np.random.Generator, path: Path) -> Motion:
-    """Look from one place in several directions with overlapping views."""
+    """Turn almost on the spot, so that views overlap."""
     base, target, length, s, fov = path
     angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
     way = np.stack([*_turned(target - base, angles), np.full(len(s), (target - base)[2])], 1)
@@ -226,7 +227,7 @@ _MOTIONS = {"walk": _walk, "orbit": _orbit, "round": _round, "gather": _gather}
 
 
 def _turned(way: np.ndarray, angles: np.ndarray) -> Motion:
-    """Return x and y (F,) of a vector turned about z by each angle."""
+    """Turn the vector `way` about z by each angle (F,) in radians; return x and y, both (F,)."""
     cos = np.cos(angles)
     sin = np.sin(angles)
     return cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]

@@ -1,4 +1,4 @@
-"""Random scenes from a seed (place, light and camera), and their photos."""
+"""Random abstract scenes: shapes, lights, cameras and camera effects, and their images."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ _LAMPS = {"indoors": (1, 2), "outdoors": (0, 1), "objects": (0, 2)}
 _SUNNY = {"indoors": 0.5, "outdoors": 0.75, "objects": 0.45}
 
 Light = tuple[float, Sequence[float], np.ndarray, int]
-"""A row of LIGHT."""
+"""Row of the table LIGHT: lamp, place, color and shadows."""
 # Height maps of a world.
 _MAPS = 4
 # Size in pixels of the images that determine exposure and depth of a scene.
@@ -36,9 +36,9 @@ _THUMB = (10, 10)
 
 
 class Drawn(NamedTuple):
-    """Scene with place, world, cameras and effects of the camera.
+    """Random scene: place, world, cameras and camera effects.
 
-    scale: factor of all lengths that brings the median visible depth into its range.
+    scale: factor of all lengths that brings the median visible depth into the range of `depth`.
     """
 
     place: Place
@@ -48,14 +48,14 @@ class Drawn(NamedTuple):
     scale: float
 
     def photos(self, frames: list[int], size: Size, samples: int) -> list[np.ndarray]:
-        """Return an image (H, W, 3) uint8 for each frame."""
+        """Render one image (H, W, 3) uint8 for each frame, with samples^2 rays per pixel."""
         light = np.empty((len(frames), *size, 3), np.float32)
         cast(self.world, self.rig.c2w[frames], self.rig.lens(size), size, samples, paint, light)
         return [self.effects.photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
 
 
 def draw(key: list[int], config: "WorldsConfig") -> Drawn:
-    """Return the scene of a key (seed, split, index)."""
+    """Return the scene that a key (seed, split, index) determines."""
     numbers = np.random.default_rng(key)
     # four generators, so that each option changes only its own part
     plan, skin, shine, camera = (Random(int(numbers.integers(1 << 62))) for _ in range(4))
@@ -90,7 +90,7 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
 
 
 def _tinted(rng: Random, by: float) -> np.ndarray:
-    """Return a colour with mean 1, from warm to cool and slightly green or magenta."""
+    """Return a random RGB tint with mean 1. by: standard deviation in stops, red against blue."""
     warm = rng.gauss(0, by)
     green = rng.gauss(0, 0.3 * by)
     color = np.array([2**warm, 2**green, 2**-warm])
@@ -98,9 +98,9 @@ def _tinted(rng: Random, by: float) -> np.ndarray:
 
 
 def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return a table of LIGHT and one of AIR with one row. Lamps may be inside things.
+    """Return random lights: a table of LIGHT, and a table of AIR with one row.
 
-    If not `varied`, there is one white lamp above the middle without shadows, as in a studio.
+    varied: False gives one white lamp without shadows near the top. Lamps may be inside objects.
     """
     if not varied:
         lamp = (1.0, (0.3, 0.2, place.top - 0.3), np.full(3, 1.2), 0)
@@ -150,7 +150,10 @@ def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) ->
 
 
 def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> Effects:
-    """Return the camera effects of a scene. light: small images of all views, to set exposure."""
+    """Return random camera effects, or neutral ones if not `varied`.
+
+    light: small images (F, H, W, 3) of all views in linear light; they determine the exposure.
+    """
     luminance = light.reshape(-1, 3) @ (0.3, 0.6, 0.1)
     # the mean of logarithms, so that a bright sky leaves the rest visible
     grey = math.exp(float(np.log(luminance + 0.02).mean()))

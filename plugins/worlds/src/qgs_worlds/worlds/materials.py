@@ -1,4 +1,4 @@
-"""Textures of a world: noise in ramps of matching colours, with patterns on top."""
+"""Random textures of a world: noise in matching colours, with patterns on top."""
 
 import colorsys
 import math
@@ -23,11 +23,11 @@ _PATTERNS = (*_PLAIN_PATTERNS, s.TILES, s.GLYPHS, s.GLYPHS, s.RINGS)
 
 Color = tuple[float, float, float]
 Texture = Mapping[str, ArrayLike]
-"""Fields of TEXTURE by name."""
+"""Values of a row of the table TEXTURE, by field name."""
 
 
 class Palette:
-    """Hues of one world and its preference for colour or grey. Colours are linear."""
+    """Generator of random colours for one world, in linear RGB with matching hues."""
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
@@ -37,7 +37,7 @@ class Palette:
         self._grey = rng.uniform(1.5, 7)
 
     def color(self) -> Color:
-        """Draw a colour; most are dull, few are bright or dark."""
+        """Return a random colour, more often dull than saturated."""
         rng = self.rng
         hue = rng.choice(self._hues) if rng.random() < 0.8 else rng.random()
         saturation = rng.random() ** self._grey
@@ -46,14 +46,18 @@ class Palette:
         return red**2.2, green**2.2, blue**2.2
 
     def near(self, color: Color, by: float) -> Color:
-        """Draw a colour that differs from `color` by about `by` stops and slightly in hue."""
+        """Return a random colour about `by` stops from `color`, with a slightly different hue."""
         tone = 2 ** self.rng.gauss(0, by)
         red, green, blue = (min(tone * c * 2 ** self.rng.gauss(0, 0.25 * by), 0.9) for c in color)
         return red, green, blue
 
 
 def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
-    """Return a table of COUNT TEXTUREs. `highlights` changes nothing else in them."""
+    """Return a table of TEXTURE with COUNT random rows.
+
+    varied: noise instead of uniform surfaces. highlights: let some varied textures be shiny; all
+    else stays the same.
+    """
     palette = Palette(rng)
     table = np.zeros(COUNT, s.TEXTURE)
     for field in ("period", "stretch", "pattern_period", "aspect"):
@@ -67,7 +71,7 @@ def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
 
 
 def _plain(rng: Random, palette: Palette) -> Texture:
-    """Draw a uniform surface, or two colours in a simple pattern."""
+    """Return a random texture: a uniform colour, or a simple pattern of two colours."""
     base = palette.color()
     ramp = [palette.near(base, 0.1), base, palette.near(base, 0.1)]
     fields = {"octaves": 1, "period": rng.uniform(0.3, 1), "contrast": 0.6}
@@ -94,7 +98,10 @@ def _pattern(rng: Random, kinds: tuple[int, ...]) -> dict[str, float]:
 
 
 def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
-    """Draw noise with a spectrum near 1/f, half of it with a pattern; some surfaces are uniform."""
+    """Return a random texture of noise with a spectrum near 1/f.
+
+    Some textures have a pattern on top, and some are nearly uniform.
+    """
     base = palette.color()
     flat = rng.random() < 0.2
     by = 0.15 if flat else rng.uniform(0.5, 1.6)
@@ -128,7 +135,7 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
 
 @kernel
 def height_maps(seed, count):
-    """Return (count, 33, 33) float32 in [-1, 1] of smooth octaves, each map with its own grain."""
+    """Return smooth random height maps (count, 33, 33) float32 in [-1, 1], coarse to fine."""
     maps = np.empty((count, _SIDE, _SIDE), np.float32)
     for k in range(count):
         cells = 2.0 + 5.0 * chance(k, 0, seed)

@@ -1,4 +1,4 @@
-"""Kinds of scenes: rooms with openings, outdoor scenes with far things, objects on plain ground."""
+"""Kinds of scenes: rooms with openings, outdoor scenes, and objects on plain ground."""
 
 import math
 from collections.abc import Callable
@@ -22,11 +22,12 @@ _TERRAIN = 24.0
 
 @dataclass
 class Place:
-    """Shapes of a scene, and possible positions and targets of cameras.
+    """Shapes of a scene, and possible positions and targets of cameras, in metres.
 
-    fixed: number of first shapes that stay even if cameras come near. low, high: corners of the
-    box for camera centres. eyes: usual heights of camera centres. targets: points to look at.
-    distance: smallest and largest distance from a camera to its target. top: height of lamps.
+    kind: indoors, outdoors or objects. fixed: number of shapes, at the start of `shapes`, that are
+    never removed to make room for cameras. low, high: corners of the box for camera centres.
+    eyes: smallest and largest usual height of a camera. targets: points to look at. distance:
+    smallest and largest distance from a camera to its target. top: largest height of lamps.
     """
 
     kind: str
@@ -45,7 +46,7 @@ def _level(x: float, y: float) -> float:
 
 
 def _toward(angle: float, away: float) -> tuple[float, float]:
-    """Return x and y of the point at distance `away` from the middle in direction `angle`."""
+    """Return x and y of the point at distance `away` from the origin, in direction `angle`."""
     return away * math.cos(angle), away * math.sin(angle)
 
 
@@ -94,7 +95,7 @@ def _indoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
 
 
 def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) -> Thing:
-    """Draw a thing on the floor, at a random height, or under the ceiling."""
+    """Place a random object on the floor or, in varied scenes, at a random height."""
     thing = things.draw()
     pick = rng.random()
     lift = 0.0
@@ -104,7 +105,7 @@ def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) ->
 
 
 def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
-    """Draw a thin bar, column or cable through the room."""
+    """Return a thin random bar or column that crosses the room."""
     a = (rng.uniform(-x, x), rng.uniform(-y, y))
     b = (rng.uniform(-x, x), rng.uniform(-y, y))
     ends = rng.choice((((*a, 0.0), (*a, z)), ((-x, a[1], z * 0.9), (x, b[1], z * 0.9))))
@@ -112,7 +113,7 @@ def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
 
 
 def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
-    """Draw four walls and a ceiling, with windows or doors in up to `most` walls."""
+    """Return four walls and a ceiling, with random windows or doors in up to `most` walls."""
     half_x = size[0] / 2
     half_y = size[1] / 2
     height = size[2]
@@ -143,7 +144,7 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
 
 
 def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
-    """Draw bars in an opening."""
+    """Return one or two bars across the opening `hole` of a wall."""
     (x, y, z) = hole.center
     (_, wide, high) = hole.half
     radius = rng.uniform(0.015, 0.05)
@@ -189,14 +190,17 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
 
 
 def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
-    """Return a function that gives the height of a terrain at x, y."""
+    """Return a function of x, y that gives the height of a terrain, in metres.
+
+    field: height map with values in [-1, 1]. amplitude: height of the value 1, in metres.
+    """
     return lambda x, y: (
         amplitude * height_of(field, np.float32(x / _TERRAIN), np.float32(y / _TERRAIN))
     )
 
 
 def _far(rng: Random, things: Things, angle: float) -> Thing:
-    """Draw a hill, a building or a tree in a direction; its base is below all ground."""
+    """Return a random distant hill, building or tree, whose base is below the lowest ground."""
     pick = rng.random()
     if pick < 0.3:
         away = rng.uniform(60, 220)
@@ -262,5 +266,5 @@ def _objects(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
 
 
 PLACES = {"indoors": _indoors, "outdoors": _outdoors, "objects": _objects}
-"""Function that draws each kind with a number of things; terrains use one of the height maps."""
+"""Functions that make a random scene of each kind, with a given number of objects."""
 SHARES = (0.45, 0.3, 0.25)

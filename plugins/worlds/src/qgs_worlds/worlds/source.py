@@ -1,6 +1,6 @@
 """Data source `worlds/procedural`: endless abstract scenes, ray-cast on demand.
 
-Kernels are imported when the first scene is drawn, since numba takes longer to load than a recipe.
+The compiled kernels are imported when the first scene is generated, because loading numba is slow.
 """
 
 import math
@@ -29,30 +29,31 @@ class WorldsConfig(DrawnConfig):
     scenes: int = Field(default=100_000, ge=1)
     """Number of scenes in the training split."""
     complexity: int = Field(default=32, ge=4)
-    """Largest number of things near the cameras, each of a few shapes. The number is drawn
-    log-uniformly."""
+    """Largest number of objects near the cameras. The number is random, log-uniform from 4 up. An
+    object consists of a few shapes."""
     cameras: Variety = "varied"
-    """Camera paths. Plain: level walks along a line, with fields of view of 60 to 75 degrees.
-    Varied: walks, orbits, looks around and sets that look at one point, with tiny to wide
-    baselines, pitch, roll and 18 to 90 degrees. Fields of view are across the longer side of an
-    image."""
+    """Camera paths. `plain`: level walks along a line, with fields of view of 60 to 75 degrees.
+    `varied`: walks, orbits, turns on the spot, and scattered cameras that look at one point; with
+    pitch, roll, tiny to wide baselines, and fields of view of 18 to 90 degrees. Fields of view
+    are measured along the longer side of an image."""
     shapes: Variety = "varied"
-    """Shapes of things. Plain: upright boxes, balls and cylinders in closed rooms. Varied: freely
-    turned composites of all primitives, with cuts, bars, wires and height fields, in rooms with
-    openings, outdoors and on plain ground."""
+    """Shapes of objects. `plain`: upright boxes, balls and cylinders in closed rooms.
+    `varied`: freely turned composites of all primitives, with cuts, bars, wires and height
+    fields; the scenes are rooms with openings, outdoor scenes, and objects on plain ground."""
     textures: Variety = "varied"
-    """Textures. Plain: uniform surfaces and simple patterns. Varied: warped noise near 1/f, and
-    patterns."""
+    """Textures. `plain`: uniform surfaces and simple patterns. `varied`: warped noise with a
+    spectrum near 1/f, partly with a pattern on top."""
     light: Variety = "varied"
-    """Light. Plain: one lamp and soft shading. Varied: sun and lamps with shadows, highlights and
-    fog."""
+    """Light. `plain`: one lamp with soft shading and no cast shadows. `varied`: sun and lamps with
+    shadows and highlights."""
     depth: tuple[float, float] | None = (1.2, 4.0)
-    """Smallest and largest median depth in the views, in metres. Each scene is scaled to a depth
-    drawn log-uniformly from this range. Null: scenes are not scaled."""
+    """Range [min, max] of the median depth of a scene, in metres. Each scene is scaled to a random
+    median depth from this range, log-uniform. Null means that scenes are not scaled."""
     rooms: float = Field(default=0.0, ge=0, le=1)
-    """Share of scenes, from 0 to 1, to take from `rooms/procedural` at the same index."""
+    """Share of scenes, from 0 to 1, that are furnished rooms of `rooms/procedural`."""
     effects: bool = True
-    """Vary exposure, white balance, tone, vignette, noise and JPEG quality between cameras."""
+    """Vary exposure, white balance, tone curve, vignette, noise and JPEG quality from scene to
+    scene. False means the same neutral camera for all scenes."""
 
     @field_validator("depth")
     @classmethod
@@ -65,19 +66,19 @@ class WorldsConfig(DrawnConfig):
 
     @cached_property
     def of_rooms(self) -> RoomsConfig:
-        """Options of the scenes that are rooms."""
+        """Options of `rooms/procedural` for the share `rooms` of the scenes."""
         alike = self.model_dump(include={"image_size", *DrawnConfig.model_fields})
         return RoomsConfig(**alike)
 
 
 class WorldScene(DrawnScene):
-    """Scene with its cameras. World: metres, scaled by `drawn.scale`; z up."""
+    """Abstract scene and its cameras. World frame: metres, z up, scaled by `drawn.scale`."""
 
     _config: WorldsConfig
 
     @cached_property
     def drawn(self) -> "Drawn":
-        """Content, light and cameras of the scene."""
+        """Shapes, textures, lights and cameras, generated at first use."""
         from qgs_worlds.worlds.drawing import draw
 
         return draw(self.key, self._config)
@@ -110,7 +111,7 @@ class WorldScene(DrawnScene):
 def world_or_room(
     name: str, index: int, config: WorldsConfig, split: Split, cache: ImageCache
 ) -> DrawnScene:
-    """Return scene `index` of a split: a world, or a room for a share `rooms` of the scenes."""
+    """Return scene `index` of a split: a room for a share `config.rooms`, otherwise a world."""
     # a separate generator, so that the share changes no scene
     if Random(f"{config.seed} {split} {index}").random() >= config.rooms:
         return WorldScene(name, index, config, split, cache)
@@ -118,7 +119,7 @@ def world_or_room(
 
 
 class WorldsSource(DrawnSource):
-    """Source of endless procedural scenes; scene i of a split depends only on (seed, split, i)."""
+    """Source of random abstract scenes. Seed, split and index determine a scene."""
 
     name = "procedural"
     Config = WorldsConfig

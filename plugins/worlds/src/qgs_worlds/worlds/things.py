@@ -1,4 +1,4 @@
-"""Abstract things: composites of primitives, with cuts, bars and wires, repeated in rows."""
+"""Random objects: composites of primitives, cut primitives, rows, frames, bars and wires."""
 
 import math
 from collections.abc import Callable
@@ -22,21 +22,22 @@ Thing = list[Shape]
 
 
 def spread(rng: Random, low: float, high: float) -> float:
-    """Draw a number log-uniformly."""
+    """Return a log-uniform random number between `low` and `high`."""
     return low * (high / low) ** rng.random()
 
 
 def any_angle(rng: Random) -> float:
-    """Draw a direction in radians."""
+    """Return a random angle from 0 to 2 pi."""
     return rng.uniform(0, math.tau)
 
 
 class Style(NamedTuple):
-    """Distribution of the shapes of things.
+    """Distribution of the shapes of random objects.
 
-    kinds: kinds of primitives. tilted: share of freely turned primitives. cut, wired, repeated:
-    shares of things with a cut, of bars or wires, and of things repeated in rows. even: True if
-    primitives are as wide as deep.
+    kinds: kinds of primitives, repeated to be chosen more often. tilted: share of primitives with
+    a random 3D rotation. cut: share of objects with a cut. wired: share of objects made of bars or
+    wires. repeated: share of objects that repeat a shape in a row. even: True makes round
+    primitives as wide as deep. most: largest number of primitives in an object.
     """
 
     kinds: tuple[int, ...]
@@ -57,9 +58,9 @@ VARIED = Style(
 
 
 class Things:
-    """Generator of random things of about 2 units around the origin.
+    """Generator of random objects, about 2 units in size, around the origin.
 
-    textures: number of textures; a shape uses one, or six consecutive ones for its faces.
+    textures: number of textures; a shape uses one, or six consecutive ones, one for each face.
     maps: number of height maps.
     """
 
@@ -70,17 +71,17 @@ class Things:
         self._textures = textures
 
     def texture(self) -> tuple[int, int]:
-        """Draw the first texture of a shape and the number of its textures."""
+        """Return a random first texture (index) for a shape, and its number of textures, 1 or 6."""
         faces = 6 if self.rng.random() < 0.3 else 1
         return self.rng.randrange(self._textures - 5), faces
 
     def skinned(self, body: Primitive, scale: float = 1.0) -> Shape:
-        """Return a shape with its own random textures."""
+        """Return the primitive `body` as a shape with random textures."""
         first, faces = self.texture()
         return Shape(body, None, first, faces, self.rng.randrange(self._textures), scale)
 
     def draw(self) -> Thing:
-        """Draw a thing."""
+        """Return a random object: a composite, a row, a frame, a wire or bars."""
         # one number for both shares
         pick = self.rng.random() - self.style.wired
         if pick < 0:
@@ -114,7 +115,7 @@ class Things:
         return Primitive(kind, center, (a, b, c), self._turn(), extra)
 
     def _cut(self, body: Primitive) -> Primitive | None:
-        """Draw a primitive to cut from another one, at its surface or through it."""
+        """Return a random primitive to cut from `body`, or None for kinds that cannot be cut."""
         # cuts need exits, which these kinds do not have
         if body.kind in (s.TORUS, s.HEIGHT):
             return None
@@ -144,7 +145,7 @@ class Things:
         return thing
 
     def _row(self) -> Thing:
-        """Repeat one shape along a line, growing or turning from one to the next."""
+        """Repeat one random shape along a line. Size and direction may change from copy to copy."""
         rng = self.rng
         count = rng.randint(3, 7)
         first = self.skinned(self._primitive((0.0, 0.0, 0.0), 1.2 / count))
@@ -166,7 +167,7 @@ class Things:
         ]
 
     def _frame(self) -> Thing:
-        """Draw the edges of a box."""
+        """Return the edges of a random box, as rods."""
         rng = self.rng
         a, b, c = (rng.uniform(0.4, 1) for _ in range(3))
         points = [(x, y, z) for x in (-a, a) for y in (-b, b) for z in (-c, c)]
@@ -174,7 +175,7 @@ class Things:
         return self._rods(points, pairs, spread(rng, 0.012, 0.08))
 
     def _wire(self) -> Thing:
-        """Draw a line of rods through a few points, or an arc of them."""
+        """Return a chain of rods, along an arc or through random points."""
         rng = self.rng
         count = rng.randint(3, 8)
         if rng.random() < 0.5:
@@ -188,7 +189,7 @@ class Things:
         return self._rods(points, pairs, spread(rng, 0.008, 0.05))
 
     def _bars(self) -> Thing:
-        """Draw parallel bars between two rails, like a fence or a ladder."""
+        """Return parallel bars between two rails, like a fence or a ladder."""
         rng = self.rng
         count = rng.randint(3, 9)
         high = rng.uniform(0.4, 1)
@@ -200,14 +201,18 @@ class Things:
 
 
 def lowest(thing: Thing) -> float:
-    """Return a lower bound, close to the least height of a thing."""
+    """Return a lower bound for the z of all points of an object, close to the lowest point."""
     return min(shape.body.center[2] - shape.body.reach() for shape in thing)
 
 
 def placed(
     thing: Thing, to: Point, turn: float, size: float, on: Callable[[float, float], float]
 ) -> Thing:
-    """Return the thing scaled, turned and placed to[2] metres above the ground `on` (x, y)."""
+    """Return an object scaled by `size`, turned about z by `turn` and placed above the ground.
+
+    to: x, y and the height above the ground in metres. on: function of x, y that returns the z of
+    the ground.
+    """
     low = lowest(thing) * size
     place = (to[0], to[1], to[2] + on(to[0], to[1]) - low)
     return [shape.moved(place, about_z(turn), size) for shape in thing]
