@@ -73,4 +73,4 @@ def test_without_its_model_it_is_shown_as_it_is(opened):
 def test_a_reconstruction_keeps_its_background(opened):
     assert opened(model="", background=[0.0, 0.5, 1.0]).scene_of(()).background == (0.0, 0.5, 1.0)
     assert opened("scene", "views").scene_of(()).background == NEUTRAL
-    must_refuse(r"cameras\.json is no record", opened, background=[0.5])
+    must_refuse(r"cameras\.json does not describe a reconstruction", opened, background=[0.5])

@@ -1,1 +1,1 @@
-"""Reconstructions to look at: a scene in the browser with its queries, and figures for papers."""
+"""Show reconstructions and their queries: a viewer in the browser, reports, figures for papers."""

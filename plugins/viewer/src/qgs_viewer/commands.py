@@ -1,4 +1,7 @@
-"""`qgs view`, `qgs demo`, `qgs report` and `qgs figures`; their help waits for no torch."""
+"""Commands `qgs view`, `qgs demo`, `qgs report` and `qgs figures`.
+
+torch is imported only when a command runs, so that --help is fast.
+"""
 
 from __future__ import annotations
 
@@ -44,32 +47,43 @@ class FigureName(StrEnum):
 
 SourceName = Annotated[
     str,
-    typer.Argument(help="Run folder, checkpoint, PLUGIN/NAME, PLY, or what qgs reconstruct wrote."),
+    typer.Argument(
+        help="Run folder, checkpoint, shipped model (PLUGIN/NAME), PLY file, or the folder that "
+        "qgs reconstruct wrote."
+    ),
 ]
 ModelPhotos = Annotated[
     str | None,
     typer.Argument(
-        help="Photos or a video for a model; default: its recipe's data, of shipped models an "
-        "unseen room."
+        help="Folder of photos, or a video, that the model reconstructs. Default: a test scene of "
+        "the data in the model's recipe; for shipped models, a room not seen in training."
     ),
 ]
 Query = Annotated[
     int | None,
     typer.Option(
-        min=0, help="Query to show; default: none in the viewer, notable ones in figures."
+        min=0,
+        help="Number of the query to show. Default: no query in the viewer, well visible queries "
+        "in figures.",
     ),
 ]
 Page = Annotated[
     Path | None,
     typer.Option(
-        help="Write the scene as one new HTML page to turn; serve nothing. Queries cannot be "
-        "picked in it: --query chooses one."
+        help="Write the scene to this new HTML file, in which it can be turned, and start no "
+        "server. The page cannot pick queries: choose one with --query."
     ),
 ]
-Host = Annotated[str, typer.Option(help="Address to serve at; 0.0.0.0 lets other machines see it.")]
-Port = Annotated[int, typer.Option(min=0, max=65535, help="Port, or the next free one.")]
+Host = Annotated[
+    str,
+    typer.Option(help="Address to serve at. 0.0.0.0 lets other machines open the viewer."),
+]
+Port = Annotated[
+    int,
+    typer.Option(min=0, max=65535, help="Port to serve at. If it is taken, the next free one."),
+]
 OpenBrowser = Annotated[
-    bool, typer.Option("--open/--no-open", help="Open it in the browser of this machine.")
+    bool, typer.Option("--open/--no-open", help="Open the viewer in this machine's browser.")
 ]
 Runs = Annotated[
     list[str],
@@ -80,41 +94,58 @@ Runs = Annotated[
 Photos = Annotated[
     str | None,
     typer.Option(
-        help="Photos and cameras; default: the recipe's data, of shipped models unseen rooms."
+        help="Folder of photos, or a video, to compare the models on. Default: the data of the "
+        "models' recipe; for shipped models, rooms not seen in training."
     ),
 ]
 NewFolder = Annotated[
     Path | None,
     typer.Option(
-        help="New folder; default: named like the command, with -2, -3, ... if it exists."
+        help="New folder for the results. Default: the name of the command, with -2, -3, ... "
+        "appended if that folder exists."
     ),
 ]
 PhotosOrRecipes = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="[PHOTOS]",
-        help="Folder of your own photos, or a video; with --train, recipe files to compare.",
+        help="Folder of your own photos, or a video. Default: unseen rooms. With --train: recipe "
+        "files to compare.",
     ),
 ]
 Models = Annotated[
     list[str] | None,
-    typer.Option("--model", help="Trained model, as in qgs eval; repeatable; default: three."),
+    typer.Option(
+        "--model",
+        help="Trained model to compare, as qgs eval takes it. Repeatable. Default: three shipped "
+        "models.",
+    ),
 ]
 Train = Annotated[
-    bool, typer.Option("--train", help="Train and compare recipes instead, the tiny two.")
+    bool,
+    typer.Option(
+        "--train",
+        help="Train recipes and compare the results, not shipped models. Default recipes: tiny "
+        "TokenGS and tiny LocusGS.",
+    ),
 ]
 Seconds = Annotated[
-    float | None, typer.Option(min=1, help="With --train: time of each recipe; default 120.")
+    float | None,
+    typer.Option(
+        min=1, help="With --train: training time of each recipe in seconds. Default: 120."
+    ),
 ]
 Seed = Annotated[
-    int | None, typer.Option(min=0, help="With --train: seed of every recipe; default 0.")
+    int | None, typer.Option(min=0, help="With --train: random seed of all trainings. Default: 0.")
 ]
-Only = Annotated[list[FigureName] | None, typer.Option(help="Draw this figure; repeatable.")]
+Only = Annotated[
+    list[FigureName] | None, typer.Option(help="Draw this figure only. Repeatable. Default: all.")
+]
 
-view_app = typer.Typer(help="See a reconstruction in the browser.")
-demo_app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")
-report_app = typer.Typer(help="The report page of trained models.")
-figures_app = typer.Typer(help="Figures for a paper.")
+view_app = typer.Typer(help="Show a reconstruction in the browser.")
+demo_app = typer.Typer(help="Compare trained models on unseen rooms or on your photos.")
+report_app = typer.Typer(help="Evaluate trained models and write a report page.")
+figures_app = typer.Typer(help="Draw figures of trained models for a paper.")
 
 
 @view_app.command()
@@ -137,10 +168,10 @@ def view(
 ) -> None:
     """Show a reconstruction in the browser: turn it, pick a query, see its anchor and attention.
 
-    Anchors are shown layer by layer, and the input photos can be changed.
+    A slider selects the decoder layer whose anchors are shown. Tick boxes change the input photos.
     """
     if foreign := [text for text in overrides or () if not text.startswith("views.")]:
-        raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
+        raise ValueError(f"--set changes only `views` here: leave out {listed(foreign)}")
     # a wrong word is refused before torch is loaded, which takes seconds
     pixels = parse_size(size)
 
@@ -183,7 +214,7 @@ def _write_page(source: Source, query: int | None, file: Path, console: Console)
     write_text(file, page)
     console.print(f"wrote {file}", soft_wrap=True)
     if scene.queries:
-        console.print("--query picks a query in it; without --html the viewer does.")
+        console.print("--query picks a query for the page; leave out --html to pick by mouse.")
 
 
 def _serve(
@@ -224,18 +255,23 @@ def demo(
 ) -> None:
     """Compare trained models on unseen rooms or on your photos, and write report.html.
 
-    For videos and photos without camera poses, poses are made first (qgs poses). --train
-    trains the tiny TokenGS and LocusGS, or the named recipes, on the same rooms instead.
+    If your photos have no camera poses, or for a video, poses are computed first (qgs poses). With
+    --train, two small recipes (TokenGS and LocusGS), or the recipes that you name, are trained from
+    the start and compared.
     """
     if train and models:
-        raise ValueError("--model names trained models; leave out --train, or name recipes")
+        raise ValueError(
+            "--model names trained models, which --train does not use: leave out one of them"
+        )
     if not train and (seconds is not None or seed is not None):
         raise ValueError("--seconds and --seed are for training: add --train")
     if not train and len(given or ()) > 1:
-        raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
+        raise ValueError(f"name only one folder of photos, got {', '.join(given or ())}")
     # an option without effect would look as if it had one
     if (size, scale) != (None, None) and (train or not given):
-        raise ValueError("--size and --scale are for photos: name a folder, or leave them out")
+        raise ValueError(
+            "--size and --scale are for photos: name a folder of photos, or leave both out"
+        )
     from qgs_viewer.compare import RECIPES, compare_models, compare_trainings
 
     use_threads(threads)
@@ -256,9 +292,9 @@ def report(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Evaluate trained models, and write report.html with their scenes side by side."""
+    """Evaluate trained models, and write report.html with their results side by side."""
     if (size, scale) != (None, None) and photos is None:
-        raise ValueError("--size and --scale are for photos: give --photos, or leave them out")
+        raise ValueError("--size and --scale are for photos: give --photos, or leave both out")
     from qgs_viewer.compare import compare_models
 
     use_threads(threads)
@@ -275,9 +311,9 @@ def figures(
     out: NewFolder = None,
     device: Device = "auto",
 ) -> None:
-    """Draw figures of trained models for a paper, as PDF and PNG.
+    """Draw figures that compare trained models for a paper, as PDF and PNG.
 
-    Models stand side by side; figures.md explains each figure.
+    The file figures.md explains each figure.
     """
     from qgs.terminal import print_lines
     from qgs.train.distributed import choose_device
@@ -299,9 +335,9 @@ def figures(
 
 
 def new_folder(out: Path | None, name: str) -> Path:
-    """Return `out`, or the first of NAME, NAME-2, ... that does not exist.
+    """Return `out`, or without it the first of the folders NAME, NAME-2, ... that does not exist.
 
-    Raises FileExistsError where `out` holds anything.
+    Raises FileExistsError if `out` is a file or a folder that is not empty.
     """
     if out is None:
         names = (Path(f"{name}-{number}" if number > 1 else name) for number in count(1))

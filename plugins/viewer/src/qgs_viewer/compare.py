@@ -1,4 +1,4 @@
-"""Reports on the models or recipes that a user names."""
+"""Compare trained models, or train recipes and compare the results (`qgs demo`, `qgs report`)."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -23,9 +23,9 @@ ON_PHOTOS = {
     64: ("worlds/landmark-64", "worlds/locus-64", "worlds/tokengs-64"),
     128: ("worlds/landmark-128", "rooms/landmark-128", "rooms/locus-128"),
 }
-"""Default models for a user's photos, by pixels.
+"""Default models for a user's photos, by the size that they take, in pixels.
 
-The first one's training decides which photos are inputs.
+Which photos are inputs follows from the training data of the first model.
 """
 # The recipes that `qgs demo --train` trains.
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
@@ -39,7 +39,11 @@ def compare_models(
     size: str | None,
     scale: float | None,
 ) -> None:
-    """Judge `models`, by default those that come with qgs, and write their report."""
+    """Evaluate `models` (default: some that come with qgs), and write a report into `target`.
+
+    photos: folder or video; None takes unseen scenes of the models' data. size: of the photos, as
+    --size takes it. scale: factor of camera positions; None searches for one.
+    """
     pixels = parse_size(size)
     # models of 128 pixels need photos of that size at least
     side = 64 if pixels and min(pixels) < 128 else 128
@@ -61,9 +65,9 @@ def compare_models(
 def compare_trainings(
     recipes: Sequence[str], seconds: float, seed: int, target: Path, device: str
 ) -> None:
-    """Train `recipes` one after the other under one budget, and write their report.
+    """Train each recipe for `seconds`, one after the other, and write a report into `target`.
 
-    Raises typer.Exit where a training fails or is stopped.
+    Raises typer.Exit if a training fails, and typer.Abort if the user stops one.
     """
     console = Console()
     resolved = resolve_fairly([Path(recipe) for recipe in recipes], seconds, seed)
@@ -88,7 +92,7 @@ def compare_trainings(
 
 @contextmanager
 def kept_warnings() -> Iterator[list[str]]:
-    """Collect the warnings of qgs inside the block for the page; they are shown as well."""
+    """Collect the warnings that qgs logs inside the block; the terminal shows them as usual."""
     kept = list[str]()
     logger = logging.getLogger("qgs")
     # Python prints warnings itself only where no logger on the way has a handler

@@ -1,4 +1,4 @@
-"""Drawing into a scene of viser, as a user chooses: Gaussians, photos, anchors, a query."""
+"""Draw Gaussians, photos, anchors and a picked query in the viewer (viser)."""
 
 import colorsys
 from dataclasses import dataclass, replace
@@ -33,10 +33,12 @@ SOLID = 0.1
 
 @dataclass(frozen=True)
 class Choice:
-    """Choice of what the viewer shows.
+    """What the user chose to see in the viewer.
 
-    query: the picked one. layer: of supports and attention, 0 is the start.
-    others: how Gaussians of other queries look. patches: number of lines to those that are read.
+    query: index of the picked query; None for all. by_query: colour Gaussians by their query.
+    layer: decoder layer whose anchors and attention are shown; 0 is before the first layer. others:
+    how the Gaussians of queries that are not picked look. patches: number of lines from the picked
+    query to the patches that it attends to most. anchors, photos: whether they are shown.
     """
 
     query: int | None = None
@@ -49,7 +51,7 @@ class Choice:
 
 
 def query_color(query: int) -> Color:
-    """Return a colour for a query; neighbours in number differ much."""
+    """Return the RGB colour of a query; colours of consecutive queries differ clearly."""
     # multiples of the golden ratio spread over the circle of hues however many there are
     hue = (query * 0.61803398875) % 1
     light = (0.45, 0.6, 0.52)[query % 3]
@@ -58,13 +60,16 @@ def query_color(query: int) -> Color:
 
 
 def query_colors(scene: QueryScene) -> np.ndarray:
-    """Return `query_color` of every query, uint8 (N, 3)."""
+    """Return the colours of all N queries, uint8 (N, 3)."""
     colors = [query_color(query) for query in range(scene.queries)]
     return np.array(colors, np.uint8).reshape(-1, 3)
 
 
 def anchor_colors(scene: QueryScene, choice: Choice) -> np.ndarray:
-    """Return the colours of all anchors, uint8; pale but for the picked one, if there is one."""
+    """Return the colours of all anchors, uint8 (N, 3).
+
+    If a query is picked, the anchors of all other queries are pale.
+    """
     colors = query_colors(scene)
     if choice.query is None or choice.others == "shown":
         return colors
@@ -77,18 +82,21 @@ def anchor_colors(scene: QueryScene, choice: Choice) -> np.ndarray:
 def faded(
     colors: np.ndarray | Color, strength: float | np.ndarray, scene: QueryScene
 ) -> np.ndarray:
-    """Mix uint8 colours with the background of `scene`; strength 0 is the background alone."""
+    """Mix uint8 RGB colours with the background of `scene`.
+
+    strength: share of the colours, from 0 (background) to 1.
+    """
     mixed = strength * np.array(colors) + (1 - strength) * 255 * np.array(scene.background)
     return mixed.round().astype(np.uint8)
 
 
 def ink(scene: QueryScene) -> Color:
-    """Return the colour of lines that stand out from the background of `scene`."""
+    """Return a colour for lines: light on a dark background, dark on a light one."""
     return INK if np.mean(scene.background) > DARK else (235, 235, 235)
 
 
 def painted(scene: QueryScene, choice: Choice) -> Splats:
-    """Return the Gaussians of `scene`, coloured and faded as was chosen."""
+    """Return the Gaussians of `scene`, coloured and faded as `choice` says."""
     found = scene.splats
     if not scene.queries:
         return found
@@ -110,9 +118,10 @@ def painted(scene: QueryScene, choice: Choice) -> Splats:
 
 
 class Drawing:
-    """Everything drawn in a scene of viser; a part that is drawn again replaces the one before.
+    """Draw a scene with viser. Drawing a part again replaces it.
 
-    photo_depth: of photos before their cameras. anchor_radius: viser's `point_size`, half a width.
+    photo_depth: distance from a camera to its photo. anchor_radius: radius of the dots of anchors.
+    Both are in units of the shown world.
     """
 
     def __init__(self, api: viser.SceneApi) -> None:
@@ -121,7 +130,7 @@ class Drawing:
         self._painted: tuple[Any, ...] = ()
 
     def put(self, scene: QueryScene, choice: Choice) -> None:
-        """Draw a new scene."""
+        """Draw a scene in place of the one before."""
         unit = distance_to(scene)
         self.photo_depth = FRUSTUM * unit
         self.anchor_radius = 0.01 * unit
@@ -132,7 +141,7 @@ class Drawing:
         self.update(scene, choice)
 
     def update(self, scene: QueryScene, choice: Choice) -> None:
-        """Draw what a choice changes."""
+        """Draw again what depends on the user's choice: all but the photos and the background."""
         self._draw_gaussians(scene, choice)
         if (views := self.api.get_handle_by_name("/views")) is not None:
             views.visible = choice.photos
@@ -204,7 +213,7 @@ class Drawing:
         )
 
     def _draw_support(self, scene: QueryScene, query: int, layer: int) -> None:
-        """Draw the support of a query, and the path of its anchor from the start to the layer."""
+        """Draw the support of a query, and the path of its anchor from layer 0 to `layer`."""
         supports = [scene.support(number) for number in range(layer + 1)]
         points = [found.centers[0, query] for found in supports if found is not None]
         found = supports[-1]
@@ -231,10 +240,10 @@ class Drawing:
             self._lines("/path", torch.stack([path[:-1], path[1:]], 1), ink(scene), 3.0)
 
     def _draw_reading(self, scene: QueryScene, query: int, choice: Choice) -> None:
-        """Draw lines from where the query was when it read to the patches that it read most.
+        """Draw lines from a query to the patches of photos that it attends to most in a layer.
 
-        Colours grow with the share of the most that is read. A square of half its width marks each
-        patch.
+        A line starts at the anchor before that layer. Its colour is stronger for more attention,
+        relative to the patch with the most. A square of half the patch's width marks its end.
         """
         if not choice.layer or not choice.patches:
             return
@@ -258,22 +267,28 @@ class Drawing:
         )
 
     def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
-        """Draw segments (n, 2, 3), `width` pixels wide. color: uint8 RGB, of all or (n, 2, 3)."""
+        """Draw line segments (n, 2, 3), each `width` pixels wide.
+
+        color: uint8 RGB, one for all segments, or (n, 2, 3) for each end.
+        """
         points = lines.float().cpu().numpy()
         self.api.add_line_segments(name, points, color, thickness=width, thickness_units="screen")
 
 
 def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
-    """Return edges (V * 8, 2, 3) of pyramids from eyes (V, 3) to the corners `ends` (V, 4, 3)."""
+    """Return the edges of V camera pyramids, as segments (V * 8, 2, 3).
+
+    eyes: centres of the cameras, (V, 3). ends: corners of the photos, (V, 4, 3).
+    """
     spokes = torch.stack([eyes[:, None].expand_as(ends), ends], 2)
     rims = torch.stack([ends, ends.roll(-1, 1)], 2)
     return torch.cat([spokes, rims], 1).flatten(0, 1)
 
 
 def distance_to(scene: QueryScene) -> float:
-    """Return the median depth of the opaque Gaussians that the inputs see, in the shown world.
+    """Return the median depth of opaque Gaussians in the input cameras, in shown world units.
 
-    Without cameras the median distance of the Gaussians from their middle.
+    Without cameras, return the median distance of the Gaussians from their median position.
     """
     means = scene.gaussians.means[0].detach().cpu()
     # Gaussians that nobody sees may lie anywhere

@@ -1,4 +1,4 @@
-"""Figures for papers: sections of the report drawn by Matplotlib, as PDF and PNG."""
+"""Draw sections of the report as figures for papers by Matplotlib, as PDF and PNG."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -42,14 +42,15 @@ def write_figures(
     query: int | None,
     notes: Sequence[str],
 ) -> Iterator[str]:
-    """Write the figures `names`, all by default, and figures.md; yield a line on each.
+    """Write figures and figures.md into `folder`; yield one line for each written or omitted file.
 
-    notes: sentences for figures.md.
+    names: figures to draw; empty for all. query: index of the query to show; None chooses queries
+    that are well visible. notes: sentences for the head of figures.md.
     """
     detail = Detail(SIDE, query)
     first = models[0].samples[0]
     scene = (
-        f"Scene of the figures of one scene: {first.scene}, inputs {listed(first.input_frames)}."
+        f"Figures of one scene show {first.scene}, with input frames {listed(first.input_frames)}."
     )
     texts = [f"# {' and '.join(model.name for model in models)}", *notes, scene]
     for name in names or FIGURES:
@@ -63,11 +64,14 @@ def write_figures(
         text = section.words["text"]
         texts.append(f"## {name}\n\n![{name}]({name}.png)\n\n{text} ([PDF]({name}.pdf))")
     write_text(folder / LISTING, "\n\n".join(texts) + "\n")
-    yield f"{folder / LISTING}: what each shows"
+    yield f"{folder / LISTING}: explains each figure"
 
 
 def grid(section: Section) -> Figure:
-    """Return a figure with a panel for each tile of `section`, its pixels as they are."""
+    """Return a Matplotlib figure with one panel for each tile of `section`.
+
+    Tiles are not interpolated.
+    """
     columns = max(map(len, section.rows.values()))
     tiles = [tile for tile in next(iter(section.rows.values())) if tile]
     # all pictures of a section have the shape of its first
@@ -99,7 +103,7 @@ def grid(section: Section) -> Figure:
 
 
 def write_figure(figure: Figure, folder: Path, name: str) -> None:
-    """Write NAME.pdf with text as text, and NAME.png; the same figure gives the same bytes."""
+    """Write NAME.pdf, in which text stays text, and NAME.png. Equal figures give equal bytes."""
     # each drawing moves panels a little: both files show one layout
     figure.draw_without_rendering()
     figure.set_layout_engine("none")

@@ -1,4 +1,4 @@
-"""The look of pages and figures: colours, Jinja templates, pictures inside pages."""
+"""Style pages and figures: colours, Jinja templates, pictures embedded in pages."""
 
 import base64
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ CATEGORICAL: tuple[Color, ...] = (
     (230, 159, 0),
     (86, 180, 233),
 )
-"""Distinct for colour-blind readers, on light ground and on photos."""
+"""RGB colours that colour-blind readers can tell apart, on white and on photos."""
 
 INK: Color = (32, 36, 42)
 MUTED: Color = (122, 128, 136)
@@ -34,19 +34,22 @@ def hex_color(color: Color) -> str:
 
 
 def categorical(index: int) -> Color:
-    """Return the colour of the `index`-th series or token; they repeat after six."""
+    """Return the RGB colour of the series or query with this index; colours repeat after six."""
     return CATEGORICAL[index % len(CATEGORICAL)]
 
 
 def running_mean(values: Sequence[float]) -> np.ndarray:
-    """Return the mean over a centred twentieth of the values, cut off at both ends."""
+    """Return the running mean of values, with a centred window of a twentieth of their number.
+
+    At both ends the window is cut off.
+    """
     window = np.ones(2 * int(len(values) / 40) + 1)
     sums = np.convolve(values, window, "same")
     return sums / np.convolve(np.ones(len(values)), window, "same")
 
 
 def page_environment(**filters: Callable[..., str]) -> Environment:
-    """Jinja for pages that need no other file."""
+    """Return a Jinja environment for the plug-in's templates. filters: functions by name."""
     environment = Environment(
         loader=PackageLoader("qgs_viewer", "template"),
         autoescape=True,
@@ -59,7 +62,7 @@ def page_environment(**filters: Callable[..., str]) -> Environment:
 
 
 def data_uri(image: Picture, photo: bool = False) -> str:
-    """Encode a picture as PNG, a large `photo` as WebP."""
+    """Return the picture as a data URI for HTML: WebP for a large `photo`, otherwise PNG."""
     if not (photo and max(image.shape) > EXACT):
         return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
     buffer = BytesIO()
@@ -68,7 +71,7 @@ def data_uri(image: Picture, photo: bool = False) -> str:
 
 
 def enlarged(picture: Picture, side: int) -> Picture:
-    """Return the picture with its longer side at `side` pixels, smooth."""
+    """Resize the picture (bicubic) so that its longer side has `side` pixels."""
     height, width = picture.shape[:2]
     factor = side / max(height, width)
     size = (round(width * factor), round(height * factor))

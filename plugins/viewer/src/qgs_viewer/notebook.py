@@ -1,4 +1,4 @@
-"""Pictures in notebooks: a model's path from views to Gaussians, the scene of a prediction."""
+"""Show models as tables and predictions as pictures in notebooks."""
 
 import torch
 
@@ -14,16 +14,17 @@ SIDE = 192
 
 
 def model_html(model: QueryGaussianModel) -> str:
-    """Return sizes, and a table of all slots: components and parameters."""
+    """Return HTML with the model's sizes and a table of its components and their parameters."""
     template = page_environment().get_template("model.html")
     return template.render(heading=heading(model), rows=slot_rows(model))
 
 
 @torch.no_grad()
 def prediction_png(prediction: Prediction) -> bytes | None:
-    """Render the first scene and its depth from the origin; None if nothing lies before it.
+    """Return a PNG of the first scene and its depth, rendered from the origin of its world.
 
-    There stands the first input camera, or the mean of all, whichever the recipe says.
+    The origin is the first input camera or the mean of all, as the recipe says. None if no
+    Gaussian lies in front of it, or if positions are not finite.
     """
     gaussians = prediction.gaussians[:1]
     means = gaussians.means[0].float()
@@ -39,6 +40,6 @@ def prediction_png(prediction: Prediction) -> bytes | None:
 
 
 def show_pictures() -> None:
-    """Have notebooks show models and predictions as pictures from now on."""
+    """Let notebooks show models as tables and predictions as pictures from now on."""
     QueryGaussianModel._repr_html_ = model_html  # type: ignore[attr-defined]
     Prediction._repr_png_ = prediction_png  # type: ignore[attr-defined]

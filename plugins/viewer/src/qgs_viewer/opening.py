@@ -1,4 +1,4 @@
-"""Scenes that a user names: a PLY, a finished reconstruction, or a model with photos."""
+"""Open what `qgs view` shows: a PLY, a finished reconstruction, or a model with photos."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -29,9 +29,9 @@ from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 
 PLY = "gaussians.ply"
 CAMERAS = "cameras.json"
-"""Files in the folder of a finished reconstruction, as `qgs reconstruct --out` writes it."""
+"""The two files that `qgs reconstruct --out FOLDER` writes into FOLDER."""
 REFINED = "refined"
-"""The folder in it with the result of `qgs refine`."""
+"""The subfolder of a finished reconstruction with the result of `qgs refine`."""
 # Median distance of means, per spread of the scene, up to which a model made a PLY's Gaussians.
 #
 # A finished reconstruction keeps its photos in 8 bits, which moves means by some thousandths.
@@ -40,10 +40,12 @@ SAME = 0.02
 
 @dataclass
 class Source:
-    """Gaussians of no known model, whose inputs cannot be changed.
+    """What the viewer shows: Gaussians without a model, whose input photos cannot be changed.
 
-    notes: remarks for the user. frames: of the inputs at first. labels: of all frames; none where
-    the inputs cannot be changed.
+    `ModelSource` derives from this class and can change them. title: heading of the viewer. notes:
+    remarks for the user. fixed: the Gaussians; None with a model. frames: indices of the first
+    input photos in their scene. labels: a name for every photo of the scene; empty where the inputs
+    cannot be changed.
     """
 
     title: str
@@ -53,13 +55,19 @@ class Source:
     labels: Sequence[str] = ()
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
-        """Return the scene as made of these frames. Raises ValueError where they do not fit."""
+        """Return the scene reconstructed from the photos `frames`; without a model, always `fixed`.
+
+        Raises ValueError for frames that a model cannot take.
+        """
         assert self.fixed is not None
         return self.fixed
 
 
 class ModelSource(Source):
-    """A model with a scene, of any number of its frames. The first frames' world is shown."""
+    """A model and a scene: the user may choose any photos of the scene as inputs.
+
+    All reconstructions are shown in the world coordinates of the first choice, `frames`.
+    """
 
     def __init__(
         self,
@@ -78,9 +86,12 @@ class ModelSource(Source):
         self.world = own_world(scene, tuple(frames), views)
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
-        """Reconstruct from these frames, and place the result in the shown world."""
+        """Reconstruct from the photos `frames`, and place the result in the shown world.
+
+        Raises ValueError without frames, and for frames that are missing, repeated or too many.
+        """
         if not frames:
-            raise ValueError("a reconstruction needs an input photo: choose one at least")
+            raise ValueError("a reconstruction needs an input photo: choose at least one")
         # refuses frames that are not there, twice or too many
         picked, _ = checked_window(len(self.scene), frames)
         world = own_world(self.scene, picked, self.views)
@@ -92,10 +103,10 @@ class ModelSource(Source):
 
 
 def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
-    """Open a PLY, a reconstruction's folder, or a run folder or a model with `options`.
+    """Open what `name` says: a PLY file, the folder of a reconstruction, a run folder or a model.
 
-    options: see `open_model`. Raises ValueError for options that do not apply to it, and as the
-    readers do.
+    options: passed to `open_model`. Raises ValueError when options are given for a PLY or a
+    reconstruction, which have none, and what the readers of files raise.
     """
     path = Path(name).expanduser()
     finished = is_finished(path)
@@ -103,7 +114,7 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
         return open_model(name, device, **options)
     if given := [option for option, value in options.items() if value]:
         raise ValueError(
-            f"{listed(given)}: only for a model, and {name} holds Gaussians; leave that out"
+            f"{listed(given)}: only for a model, but {name} holds Gaussians; leave this option out"
         )
     if finished:
         return open_finished(path, device)
@@ -121,9 +132,11 @@ def open_model(
     size: Size | None = None,
     overrides: Sequence[str] = (),
 ) -> Source:
-    """Open a model with `photos`, or else with the data of its recipe.
+    """Open a model on the scene of `photos`, by default on a test scene of its recipe's data.
 
-    scene, frames, inputs, size, overrides: options of `qgs view`.
+    The remaining arguments are the options of `qgs view` with these names. scene: name of one scene
+    among several. frames: indices or files of the input photos; None chooses them. inputs: their
+    number. size: (H, W) of the photos in pixels. overrides: settings of `views`, as `KEY=VALUE`.
     """
     with CheckpointFile(name) as file:
         model = file.model(device)
@@ -147,7 +160,7 @@ def open_model(
     seen.see(sample.inputs.cameras, sample.targets.cameras)
     notes = [
         f"{scale.text}; --scale sets another" if scale else "",
-        f"inputs {listed(map(shown.frame_name, sample.input_frames))}" if photos else "",
+        f"input photos: {listed(map(shown.frame_name, sample.input_frames))}" if photos else "",
         verdict(trained, seen),
         scale.poor if scale else "",
     ]
@@ -157,26 +170,34 @@ def open_model(
 
 
 def _scene(recipe: Recipe, photos: str | None, size: Size | None, name: str | None) -> Scene:
-    """Return the scene of the photos, or the named or first test scene of the recipe's data."""
+    """Return the scene of `photos`, or a scene of the recipe's data: `name`, or the first of tests.
+
+    Raises ValueError for a recipe without data, and for a size without photos.
+    """
     if photos is not None:
         return chosen_scene(recipe, photos, size, name)[0]
     if recipe.data_config is None:
-        raise ValueError("the checkpoint's recipe has no data: name a folder of photos after it")
+        raise ValueError(
+            "the checkpoint's recipe has no data: name a folder of photos after the checkpoint"
+        )
     data = recipe.build_data()
     if size is not None:
-        raise ValueError("--size is for photos: name a folder of them, or leave it out")
+        raise ValueError("--size is for photos: name a folder of photos, or leave --size out")
     if name is not None:
         return named_scene(data, "the data of the recipe", name)
     return data.scenes("test" if data.names("test") else "train")[0]
 
 
 def is_finished(folder: Path) -> bool:
-    """Return if `folder` holds a finished reconstruction."""
+    """Return whether `folder` holds a finished reconstruction: its PLY and its cameras.json."""
     return (folder / CAMERAS).is_file() and (folder / PLY).is_file()
 
 
 class FinishedScene(Scene):
-    """The views that a reconstruction was compared with, as frames in its world."""
+    """Photos of a finished reconstruction, with cameras in the world of its Gaussians.
+
+    views: the entries `views` of cameras.json.
+    """
 
     def __init__(self, name: str, folder: Path, views: Sequence[dict[str, Any]]) -> None:
         self.name = name
@@ -185,14 +206,14 @@ class FinishedScene(Scene):
 
     @property
     def cameras(self) -> Cameras:
-        """All views of cameras.json."""
+        """Cameras (V,) of all views in cameras.json."""
         c2w = torch.tensor([view["c2w"] for view in self._views], dtype=torch.float64)
         lenses = torch.tensor([view["intrinsics"] for view in self._views], dtype=torch.float64)
         height, width = self._views[0]["size"]
         return Cameras(c2w, lenses, (height, width))
 
     def images(self, frames: Sequence[int]) -> Tensor:
-        """Photos, the left part of the pictures in views/."""
+        """Load photos (V, 3, H, W), the left halves of the pictures in the folder views/."""
         height, width = self.cameras.size
         pictures = []
         for view in (self._views[frame] for frame in frames):
@@ -203,15 +224,18 @@ class FinishedScene(Scene):
         return to_tensor(np.stack(pictures))
 
     def label(self, frame: int) -> str:
-        """Return the photo's file, or its number in the scene (not its place in cameras.json)."""
+        """Return the file of the photo, or its number in the original scene.
+
+        frame: index in cameras.json, which may differ from that number.
+        """
         view = self._views[frame]
         return str(view.get("photo") or f"frame {view['frame']}")
 
 
 def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str, Any]]:
-    """Read a reconstruction without its queries, its photos, and cameras.json.
+    """Read the Gaussians, the photos and cameras.json of a reconstruction; queries are not stored.
 
-    Raises ValueError with the file that is broken.
+    Raises ValueError that names the broken file.
     """
     path = folder / CAMERAS
     gaussians = load_ply(folder / PLY)
@@ -226,24 +250,27 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
         photos = views_in((torch.eye(4).double(), torch.ones(())), scene, inputs)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(
-            f"{path} is no record of a reconstruction ({type(error).__name__}: {error}); make it "
-            "again with `qgs reconstruct`, or view the PLY alone"
+            f"{path} does not describe a reconstruction ({type(error).__name__}: {error}); repeat "
+            "`qgs reconstruct`, or view the PLY alone"
         ) from error
     plain = QueryScene(gaussians, photos, inputs, background=(red, green, blue))
     return plain, scene, record
 
 
 def open_finished(folder: Path, device: str) -> Source:
-    """Open a reconstruction, with its queries where its model still makes the same Gaussians."""
+    """Open a reconstruction; show its queries if its model can be loaded and makes it again.
+
+    Otherwise the Gaussians of the PLY are shown, with a note on the reason.
+    """
     plain, scene, record = read_finished(folder)
     title = f"{scene.name} ({folder.name})"
     notes = []
     if is_finished(folder / REFINED):
-        notes.append(f"refined on photos: `qgs view {folder / REFINED}`.")
+        notes.append(f"To view the refined Gaussians: `qgs view {folder / REFINED}`.")
     try:
         source = _with_queries(plain, scene, record, device)
     except (ValueError, OSError) as error:
-        return Source(title, [f"Its queries are not shown: {error}", *notes], plain)
+        return Source(title, [f"Queries are not shown: {error}", *notes], plain)
     source.title = title
     source.notes = notes
     return source
@@ -252,14 +279,20 @@ def open_finished(folder: Path, device: str) -> Source:
 def _with_queries(
     plain: QueryScene, scene: FinishedScene, record: Mapping[str, Any], device: str
 ) -> ModelSource:
-    """Return the model that made a reconstruction. Raises ValueError and OSError without it."""
+    """Return the reconstruction `plain` with the model that made it, whose queries can be shown.
+
+    record: cameras.json. Raises ValueError or OSError if the model is unknown or cannot be read,
+    or if it makes other Gaussians.
+    """
     for change in ("refinement", "tuning"):
         if record.get(change):
-            raise ValueError(f"{change} on photos changed the Gaussians of its model.")
+            raise ValueError(f"{change} on photos changed the Gaussians that the model made.")
     name = str(record.get("model") or "")
     # nothing is fetched because a file says so
     if not name or "://" in name:
-        raise ValueError(f"its model is {name or 'not known'}: `qgs view MODEL PHOTOS` shows them.")
+        raise ValueError(
+            f"the model is {name or 'not known'}: `qgs view MODEL PHOTOS` shows queries."
+        )
     with CheckpointFile(name) as file:
         model = file.model(device)
         # the stored cameras are in the model's world already
@@ -271,5 +304,5 @@ def _with_queries(
     # medians: a few far Gaussians would hide any difference
     spread = (means - means.median(1, keepdim=True).values).norm(dim=-1).median()
     if made.shape != means.shape or (made - means).norm(dim=-1).median() > SAME * spread:
-        raise ValueError(f"{name} makes other Gaussians today.")
+        raise ValueError(f"{name} has changed and no longer makes these Gaussians.")
     return source

@@ -1,4 +1,4 @@
-"""A viser server that prints nothing, where its viewers stand, and scenes as single pages."""
+"""Serve scenes by viser without its output, set the first viewpoint, write scenes as HTML pages."""
 
 import http
 import io
@@ -31,9 +31,10 @@ FIELD_OF_VIEW = 0.95
 def quiet_server(
     host: str = "127.0.0.1", port: int = 0, label: str | None = None
 ) -> Iterator[viser.ViserServer]:
-    """Run a server, at the next free port from `port` on; 0 takes any.
+    """Run a viser server inside the block, and print nothing.
 
-    Only its own page may connect to it, see `foreign`.
+    port: the first port to try; later ones follow until one is free. 0 takes any free port. label:
+    title of the page. Only the page of this server may connect to it (see `foreign`).
     """
     # a message that is none ends its connection, which is no news
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
@@ -54,11 +55,11 @@ def quiet_server(
 
 
 def foreign(headers: Mapping[str, str], host: str) -> bool:
-    """Return if a request comes from another page, or by a name that is not the server's.
+    """Return whether to refuse a request: it comes from another page or by another host name.
 
-    Another page that is open in the browser could read the scene; under a name of its own that
-    resolves to this machine (DNS rebinding) it would look like this one. Addresses in digits, the
-    names of this machine and `host` are the server's.
+    Another page that is open in the browser could otherwise read the scene. By a host name that
+    resolves to this machine (DNS rebinding) such a page would look like the server's own. Names of
+    the server are: IP addresses, localhost, the name of this machine, and `host`.
     """
     named = headers.get("Host", "")
     origin = headers.get("Origin")
@@ -76,7 +77,7 @@ def foreign(headers: Mapping[str, str], host: str) -> bool:
 
 
 def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options: Any) -> Any:
-    """`websockets.asyncio.server.serve` that refuses `foreign` requests."""
+    """Call `serve` (`websockets.asyncio.server.serve`) so that it refuses `foreign` requests."""
 
     def checked(connection: Any, request: Any) -> Any:
         if foreign(request.headers, host):
@@ -88,7 +89,7 @@ def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options
 
 
 def stand(server: viser.ViserServer, scene: QueryScene) -> None:
-    """Have new viewers stand at `first_eye`."""
+    """Set the camera with which a browser first shows the scene (see `first_eye`)."""
     eye, target = first_eye(scene)
     up = up_of(scene).numpy()
     server.scene.set_up_direction(up)
@@ -100,7 +101,10 @@ def stand(server: viser.ViserServer, scene: QueryScene) -> None:
 
 
 def up_of(scene: QueryScene) -> torch.Tensor:
-    """Return up for the input cameras together, unit (3,), shown world; -y without cameras."""
+    """Return the mean up direction of the input cameras, a unit vector (3,) in the shown world.
+
+    Without cameras it is -y.
+    """
     if scene.views is None:
         return torch.tensor([0.0, -1.0, 0.0]).double()
     down = scene.views.cameras.c2w[0, :, :3, 1].cpu().double().mean(0)
@@ -108,9 +112,11 @@ def up_of(scene: QueryScene) -> torch.Tensor:
 
 
 def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the viewer stands at first and what it looks at, both (3,), shown world.
+    """Return the first viewpoint and the point that it looks at, both (3,) in the shown world.
 
-    Behind the camera in the middle; of a walk before its photo, since walls may stand behind it.
+    The viewpoint lies a little behind the input camera nearest to the mean of all. If the cameras
+    are far apart and do not look at one point, it lies before that camera, since a wall may be
+    behind it.
     """
     unit = distance_to(scene)
     if scene.views is None:
@@ -131,9 +137,10 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
-    """Return a page to turn `scene` and to record it: 0.8 MB, and 40 bytes a Gaussian.
+    """Return an HTML page in which `scene` can be turned and filmed.
 
-    choice: by default the scene with the anchors of the last layer.
+    Its size is 0.8 MB and 40 bytes for each Gaussian. choice: what is shown; by default all
+    Gaussians, and the anchors after the last layer.
     """
     with quiet_server() as server:
         stand(server, scene)
@@ -145,5 +152,8 @@ def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
 
 
 def gaussians_html(gaussians: Gaussians, views: Views, background: Background = NEUTRAL) -> str:
-    """Return a page of Gaussians (1, G) and the cameras of some photos (1, V) in their world."""
+    """Return an HTML page with Gaussians (1, G) and photos (1, V) at their cameras.
+
+    background: RGB in [0, 1].
+    """
     return scene_html(QueryScene(gaussians, views, background=background))

@@ -1,4 +1,4 @@
-"""The controls beside the scene: what is shown, which query, which input photos."""
+"""Show the viewer's controls: what is visible, the picked query, the input photos."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ NONE = -1
 
 
 class Panel:
-    """The viewer of one source: its scene, its controls, and what is chosen in them."""
+    """The viewer of one source: its scene, its controls, and the user's choices."""
 
     def __init__(self, server: viser.ViserServer, source: Source) -> None:
         self.server = server
@@ -57,8 +57,8 @@ class Panel:
         queries = self.scene.queries
         text = f"**{plain(self.source.title)}**\n\n{self.scene.gaussians.count:,} Gaussians"
         if queries:
-            text += f" of {queries:,} queries. Click on one (or on an anchor), or type its number; "
-            text += "Esc, or a click beside everything, shows all again."
+            text += f" of {queries:,} queries. Click on a Gaussian or an anchor to pick its query, "
+            text += "or type a query's number. Esc, or a click on the background, shows all again."
         gui.add_markdown(text)
         if queries:
             self._bind("by_query", gui.add_checkbox("colours by query", False))
@@ -79,10 +79,10 @@ class Panel:
                 "others",
                 gui.add_dropdown("other queries", get_args(Others), initial_value="faint"),
             )
-            hint = "Supports are those after this layer; 0 is the start."
+            hint = "Show anchors and attention of this decoder layer. 0: before the first layer."
             self.layer = gui.add_slider("layer", 0, depth, 1, depth, hint=hint)
             self._bind("layer", self.layer)
-            hint = "Lines to the patches that the query attends to most; strong is much."
+            hint = "Number of lines to the patches that the query attends to most."
             patches = gui.add_slider("patches", 0, 96, 1, self.choice.patches, hint=hint)
             self._bind("patches", patches)
             if self.scene.has_anchors:
@@ -97,14 +97,14 @@ class Panel:
         labels = self.source.labels
         self.boxes: list[Any] = []
         with gui.add_folder("reconstructed from", expand_by_default=len(labels) <= MOST_BOXES):
-            gui.add_markdown("Ticked photos are the inputs. Tick others to change them.")
+            gui.add_markdown("Ticked photos are the inputs. Tick or untick photos to change them.")
             for frame, label in enumerate(labels):
                 box = gui.add_checkbox(label, frame in self.source.frames)
                 box.on_update(self._reframed)
                 self.boxes.append(box)
 
     def _bind(self, name: str, control: Any) -> None:
-        """Have `control` set a field of the choice."""
+        """Let `control` set the field `name` of `Choice`."""
         control.on_update(lambda _: self.choose(**{name: control.value}))
 
     def _typed(self, event: Any) -> None:
@@ -116,25 +116,28 @@ class Panel:
             self.choose(query=number)
 
     def choose(self, **changes: Any) -> None:
-        """Change the choice (see `Choice`) and draw it."""
+        """Change fields of `choice`, and draw what they change."""
         with self._lock:
             choice = replace(self.choice, **changes)
             if choice != self.choice:
                 self._show(self.drawing.update, self.scene, choice)
 
     def pick(self, query: int | None) -> None:
-        """Pick a query, or none: then all are shown."""
+        """Pick a query; None shows all queries."""
         # setting the field calls `_typed`
         self.number.value = NONE if query is None else query
 
     def take(self, frames: Sequence[int]) -> None:
-        """Reconstruct from these frames. Raises ValueError where they do not fit, and OSError."""
+        """Reconstruct from the photos with the indices `frames`, and show the result.
+
+        Raises ValueError if the model cannot take these photos, and OSError if one is unreadable.
+        """
         with self._lock:
             if tuple(frames) != tuple(self.scene.frames):
                 self._show(self.drawing.put, self.source.scene_of(frames), self.choice)
 
     def _show(self, draw: Callable[..., None], scene: QueryScene, choice: Choice) -> None:
-        """Draw by `draw`, and describe the picked query; a failure leaves all as it was."""
+        """Call `draw` and describe the picked query. If this fails, the state does not change."""
         with self.server.atomic():
             draw(scene, choice)
             if scene.queries:
@@ -151,7 +154,7 @@ class Panel:
         self._text.content = "" if query is None else description(scene, query, layer)
 
     def _reframed(self, event: Any) -> None:
-        """Reconstruct from the ticked photos; where they do not fit, the last scene stays."""
+        """Reconstruct from the ticked photos; if this fails, keep the last scene and say why."""
         try:
             self.take([frame for frame, box in enumerate(self.boxes) if box.value])
         except (ValueError, OSError) as error:
@@ -164,7 +167,10 @@ class Panel:
             self.pick(query)
 
     def under(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
-        """Return the query under a ray of what is shown: by its anchor, or by its Gaussians."""
+        """Return the query whose anchor or Gaussian a ray hits; None if it hits nothing.
+
+        origin, direction: of the ray, both (3,) in the shown world. Anchors come before Gaussians.
+        """
         # anchors are drawn over Gaussians, so they are hit first
         found = self.scene.support(self.choice.layer) if self.choice.anchors else None
         if found is not None:
@@ -181,12 +187,12 @@ class Panel:
 
 
 def plain(text: str) -> str:
-    """Return Markdown that shows `text` as it is: no HTML, no formats, one line."""
+    """Escape `text` for Markdown: no HTML and no formatting, on one line."""
     return re.sub(r"[^\w\s]|_", lambda sign: f"&#{ord(sign[0])};", " ".join(text.split()))
 
 
 def description(scene: QueryScene, query: int, layer: int) -> str:
-    """Describe a query's Gaussians, its anchor, and why no attention is shown, as Markdown."""
+    """Describe a query in Markdown: its Gaussians, its anchor, and why attention is missing."""
     members = scene.members(query)
     lines = [f"**query {query}**, layer {layer}"]
     lines.append(f"Gaussians {members.start} to {members.stop - 1}")
@@ -197,6 +203,6 @@ def description(scene: QueryScene, query: int, layer: int) -> str:
         lines.append(f"anchor at {place}; semi-axes {sizes}")
     if layer and scene.attention(query, layer) is None:
         patches = scene.inside is None or scene.inside.memory.grid is not None
-        silent = "this component does not report its attention"
-        lines.append(silent if patches else "it reads latents, not patches of the photos")
+        silent = "the model's decoder does not report its attention"
+        lines.append(silent if patches else "the query attends to latents, not to photo patches")
     return "\n\n".join(lines)

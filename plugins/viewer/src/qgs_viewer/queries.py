@@ -1,4 +1,4 @@
-"""Queries drawn onto photos: their supports, what they attend to, their Gaussians."""
+"""Draw queries on photos: their anchors and supports, their attention, their Gaussians."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,10 +30,12 @@ FARTHEST = 1e4
 
 @full_precision
 def outline(support: SpatialSupport, query: int, cameras: Cameras) -> Tensor | None:
-    """Return pixels (OUTLINE_POINTS, 2) around the ellipsoid of a query, in cameras (1, 1).
+    """Return the outline of a query's support ellipsoid in a photo: pixels (OUTLINE_POINTS, 2).
 
-    None where not all of it lies before the camera. Where the ellipsoid is the unit ball, a camera
-    at e sees the circle around e / |e|^2 with radius sqrt(1 - 1 / |e|^2) as its border.
+    None if a part of the ellipsoid lies behind the camera. cameras: (1, 1), that of the photo.
+
+    In coordinates in which the ellipsoid is the unit ball, a camera at e sees as outline the circle
+    with centre e / |e|^2 and radius sqrt(1 - 1 / |e|^2), at right angles to e.
     """
     center = support.centers[0, query]
     axes = support.axes[0, query]
@@ -54,7 +56,7 @@ def outline(support: SpatialSupport, query: int, cameras: Cameras) -> Tensor | N
 def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
     """Return pixels (P, 2) of world points (P, 3) in the first of cameras (1, V).
 
-    z is floored at 1 mm.
+    Depths in the camera are at least 0.001, so that points behind it have a pixel.
     """
     in_camera = to_camera(points[None], cameras)[0, 0]
     in_camera = torch.cat([in_camera[:, :2], in_camera[:, 2:].clamp_min(1e-3)], -1)
@@ -63,14 +65,17 @@ def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
 
 
 def washed(picture: Picture, strength: float = 0.6) -> Picture:
-    """Return greys, lightened towards white by `strength`: a ground to draw on."""
+    """Return the picture in grey as a background to draw on.
+
+    strength: share of white in each pixel, from 0 to 1.
+    """
     grey = Image.fromarray(picture).convert("L").convert("RGB")
     white = Image.new("RGB", grey.size, "white")
     return np.asarray(Image.blend(grey, white, strength))
 
 
 def _oversampled(picture: Picture) -> Image.Image:
-    """Return an image OVERSAMPLING times as large; `_reduced` takes it back."""
+    """Return the picture enlarged OVERSAMPLING times; `_reduced` undoes this."""
     return Image.fromarray(enlarged(picture, OVERSAMPLING * max(picture.shape[:2])))
 
 
@@ -82,7 +87,10 @@ def _reduced(image: Image.Image) -> Picture:
 def support_picture(
     photo: Picture, support: SpatialSupport, cameras: Cameras, colors: Mapping[int, Color]
 ) -> Picture:
-    """Draw all centres as dots, queries of `colors` as ellipses, on the view of cameras (1, 1)."""
+    """Draw all anchors as dots on a photo, and the supports of some queries as ellipses.
+
+    cameras: (1, 1), that of the photo. colors: the queries with an ellipse, by index, in RGB.
+    """
     scale = OVERSAMPLING * photo.shape[1] / cameras.size[1]
     depths = to_camera(support.centers[:1], cameras)[0, 0, :, 2]
     places = (_pixels(support.centers[0], cameras) * scale).tolist()
@@ -107,16 +115,20 @@ def support_picture(
 
 
 def patch_maps(rows_hM: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
-    """Return scores (h, M) of image tokens as maps (V, H/P, W/P), the mean over heads.
+    """Return the mean over heads of scores (h, M), as one map for each view: (V, H/P, W/P).
 
-    Heads that a mask keeps from a token (-inf) do not count; NaN where none sees it.
+    Scores belong to the M = V * H/P * W/P patches of the photos. A head with score -inf is masked
+    and left out of the mean; a patch that is masked in all heads has NaN.
     """
     scores = rows_hM.detach().float().cpu()
     return scores.masked_fill(scores.isinf(), torch.nan).nanmean(0).reshape(grid).numpy()
 
 
 def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]:
-    """Colour each photo, in pale grey, by its map on one scale; NaN has the colour of nothing."""
+    """Turn each photo pale grey and colour it by its map: more colour for larger values.
+
+    All photos share one scale, from the least to the greatest value. Patches with NaN are grey.
+    """
     seen = maps[np.isfinite(maps)]
     low = float(seen.min()) if seen.size else 0.0
     high = float(seen.max()) if seen.size else 1.0
@@ -136,7 +148,10 @@ def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]
 
 @dataclass(frozen=True)
 class DrawnQuery:
-    """A query by its index. dispersion: mean distance of its Gaussians to their centroid."""
+    """A query in a figure: its index, its colour (RGB) and its dispersion.
+
+    dispersion: mean distance of its Gaussians from their centroid, in world units.
+    """
 
     index: int
     color: Color
@@ -144,14 +159,17 @@ class DrawnQuery:
 
 
 def colored_queries(gaussians: Gaussians, count: int, chosen: Sequence[int]) -> list[DrawnQuery]:
-    """Return `chosen` of the `count` queries of the first scene, with a colour by their place."""
+    """Return the queries `chosen` with their dispersion; colours follow the order in `chosen`.
+
+    gaussians: (B, G), of which the first scene counts. count: queries of that scene.
+    """
     distances = token_dispersion(gaussians.means.detach(), gaussians.count // count)[0]
     mean = distances.view(count, -1).mean(1)
     return [DrawnQuery(q, categorical(place), float(mean[q])) for place, q in enumerate(chosen)]
 
 
 def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return the blending weight (B, G) of each Gaussian over all pixels."""
+    """Return the blending weight (B, G) of each Gaussian, summed over all pixels of all views."""
     # it is the gradient of a render's sum by the colours
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
@@ -161,16 +179,18 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
 
 
 def _painted(gaussians: Gaussians, colors: Tensor) -> Gaussians:
-    """Return the Gaussians in `colors`, from everywhere."""
+    """Return the Gaussians with `colors`, the same from all directions."""
     return replace(gaussians, colors=colors, sh=None, features=None)
 
 
 def notable_queries(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
 ) -> list[DrawnQuery]:
-    """Choose `count` queries to show in cameras (1, V): heavy, well inside the first view, apart.
+    """Choose `count` queries to show in the first of cameras (1, V).
 
-    Queries with a Gaussian wider than half the view (2 sigma about its middle) come after others.
+    Preferred are queries with large blending weights whose Gaussians lie, on average, away from the
+    border of the picture and away from queries chosen before. Queries with a Gaussian wider than
+    half the picture (4 sigma) are taken only when others do not suffice.
     """
     per_query = model.head.gaussians_per_query
     weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().unflatten(0, (-1, per_query))
@@ -193,9 +213,9 @@ def notable_queries(
 
 
 def _widths(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return 4 sigma of each Gaussian (G,) as a share of the first view's longer side.
+    """Return the widths (G,) of Gaussians in the first view as shares of its longer side.
 
-    0 behind it.
+    The width is 4 sigma of the longest axis; 0 for Gaussians behind the camera.
     """
     depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2]
     focal = cameras.intrinsics[0, 0, :2].mean()
@@ -209,7 +229,10 @@ def query_picture(
     chosen: Sequence[DrawnQuery],
     cameras: Cameras,
 ) -> Picture:
-    """Paint the Gaussians of `chosen`, with lines to centroids, over a grey scene."""
+    """Draw the Gaussians of the queries `chosen` in colour over the scene in grey.
+
+    Lines lead from each Gaussian to the centroid of its query's Gaussians.
+    """
     scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
     per_query = model.head.gaussians_per_query
     indices = torch.tensor([query.index for query in chosen], dtype=torch.long)
@@ -239,9 +262,11 @@ def query_picture(
 def attention_pictures_of(
     scene: QueryScene, query: int, layer: int, side: int
 ) -> dict[str, list[Picture]]:
-    """Colour photos by what a query attends to, by PARTS; less those it lacks; means over heads.
+    """Return the input photos coloured by what a query attends to, averaged over heads.
 
-    side: pixels on the longer side of each photo.
+    Keys are those of `PARTS`: content logits, geometry bias, and the attention that results. Parts
+    that the model does not have are missing; without attention the result is empty. layer: number
+    of the decoder layer, from 1. side: pixels on the longer side of each photo.
     """
     found = scene.attention(query, layer)
     if found is None or scene.views is None:
@@ -256,7 +281,7 @@ def attention_pictures_of(
 
 
 def sheet(pictures: list[Picture]) -> Picture:
-    """Put all pictures into one, two in a row."""
+    """Join pictures of one size into a single picture with two in each row."""
     # the last row may lack one
     padded = [*pictures, np.full_like(pictures[0], 255)]
     rows = [side_by_side(padded[first : first + 2]) for first in range(0, len(pictures), 2)]

@@ -1,4 +1,4 @@
-"""report.html: how trained models compare, in one page that needs no other file."""
+"""Write report.html, a page without other files that compares trained models."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,10 +28,11 @@ TARGETS = 2
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several models on the same scenes, in the order of the report.
+    """Contents of a report that compares models on the same scenes.
 
-    facts: of training. commands: next commands, with what each does. scenes: heading of the
-    pictures. notes: below the table, before the remarks on results.
+    models: in the order of the report. facts: lines on the training, text by label. commands:
+    commands that a reader may run next, and what each does. scenes: heading of the pictures. notes:
+    sentences below the table of scores.
     """
 
     models: Sequence[Model]
@@ -42,7 +43,10 @@ class Comparison:
 
 
 def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
-    """Return cells by model, then by baseline, and if no other model has a better value."""
+    """Return rows of the table of scores: first the models, then the baselines.
+
+    A cell is its text and whether the value is the best of all models.
+    """
     columns = models[0].evaluation.columns
     means = [model.evaluation.means() for model in models]
     rows = {}
@@ -65,7 +69,7 @@ def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
 
 
 def show_scores(comparison: Comparison, console: Console) -> None:
-    """Print the table of scores."""
+    """Print the table of scores in the terminal."""
     columns = comparison.models[0].evaluation.columns.values()
     lines = [["", *(column.title for column in columns), "Gaussians", "parameters"]]
     for name, row in score_rows(comparison.models).items():
@@ -77,9 +81,9 @@ def show_scores(comparison: Comparison, console: Console) -> None:
 
 @torch.no_grad()
 def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
-    """Return the whole page; it needs no other file and no network.
+    """Return the whole page, which needs no other file and no network.
 
-    shown: what the models of the comparison make of the pictured scenes.
+    shown: for each model of the comparison, its reconstructions of the scenes with pictures.
     """
     models = comparison.models
     first = models[0]
@@ -94,7 +98,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     height, width = first.recipe.tree["data"]["image_size"]
     data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
     judged = "beside" if first.windows else "between"
-    views = f"{first.recipe.views.inputs} inputs, judged on views {judged} them"
+    views = f"{first.recipe.views.inputs} inputs, scored on views {judged} the inputs"
     names = listed((model.name for model in models), most=3)
     metrics = [part for place, part in first.recipe.parts.items() if place[0] == "metrics"]
     environment = page_environment(uri=data_uri, hex=hex_color)
@@ -114,7 +118,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
 
 
 def write_report(comparison: Comparison, folder: Path, console: Console) -> None:
-    """Show the scores, and write the page."""
+    """Print the remarks and the scores, write report.html into `folder`, print next commands."""
     notes = remarks(comparison.models)
     print_lines(console, notes)
     comparison = replace(comparison, notes=[*comparison.notes, *notes])

@@ -1,4 +1,4 @@
-"""Sections of report.html, most of which `qgs figures` draws as figures too."""
+"""Build the sections of report.html; `qgs figures` draws most of them as figures."""
 
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -48,10 +48,11 @@ Shown = Sequence[ModelScenes]
 
 @dataclass(frozen=True)
 class Tile:
-    """A picture. legend: queries in it, in their colours.
+    """A picture of a section, with its caption.
 
-    page: HTML without network that a reader can open in its place, in a frame without access to
-    the report.
+    legend: queries that the picture shows, with their colours. page: a complete HTML page that a
+    reader can open in place of the picture; empty for none. The report shows this page in a frame
+    that cannot read the report.
     """
 
     image: Picture
@@ -62,9 +63,11 @@ class Tile:
 
 @dataclass(frozen=True)
 class Section:
-    """Rows of tiles by label, None for a gap; words are in sections.toml.
+    """A section of the report: pictures in rows.
 
-    figure: for print, where the tiles are not all of it. width: least CSS pixels of a tile.
+    name: key of its texts in sections.toml. rows: tiles by label of the row; None leaves a gap.
+    figure: what `qgs figures` writes; None draws the tiles. width: least width of a tile in CSS
+    pixels.
     """
 
     name: str
@@ -74,16 +77,17 @@ class Section:
 
     @property
     def words(self) -> Mapping[str, str]:
-        """Texts of the section: `title`, `text`, and `empty` for models without data for it."""
+        """Texts of the section: `title`, `text`, and `empty` (why it has no pictures)."""
         file = files("qgs_viewer") / "template" / "sections.toml"
         return tomllib.loads(file.read_text(encoding="utf-8"))[self.name]
 
 
 @dataclass(frozen=True)
 class Detail:
-    """Settings of sections that show models.
+    """Settings of the pictures.
 
-    side: pixels on the longer side of pictures. query: the one to show; by default notable ones.
+    side: pixels on the longer side of a picture. query: index of the query to show; None chooses
+    queries that are well visible.
     """
 
     side: int = 256
@@ -91,7 +95,7 @@ class Detail:
 
 
 def scene_to_turn(models: Shown) -> Section:
-    """Show every model's first scene, each with a page to turn it."""
+    """Show every model's first scene as a picture, with a page in which it can be turned."""
     tiles = []
     for model in models:
         camera = images.finer(model.target_camera, Detail.side)
@@ -105,7 +109,7 @@ def scene_to_turn(models: Shown) -> Section:
 
 
 def queries(models: Shown, detail: Detail) -> Section:
-    """Show the Gaussians of notable queries of each model, seen from the first target view."""
+    """Show the Gaussians of well visible queries of each model, seen from the first target view."""
     tiles = []
     for model in models:
         camera = images.finer(model.target_camera, detail.side)
@@ -116,7 +120,7 @@ def queries(models: Shown, detail: Detail) -> Section:
 
 
 def anchors(models: Shown, detail: Detail) -> Section:
-    """Anchors and supports on the first input view, before the decoder and after its layers."""
+    """Show anchors and supports on the first input photo: at the start and after some layers."""
     rows = {}
     for model in models:
         if not model.scene.has_anchors:
@@ -140,7 +144,10 @@ def anchors(models: Shown, detail: Detail) -> Section:
 
 
 def attention(models: Shown, detail: Detail) -> Section:
-    """Show what one query of each model reads in the input views: by content, geometry and both."""
+    """Show the cross-attention of one query of each model over the patches of the input photos.
+
+    Columns: logits from content, bias from geometry, and the attention that results from both.
+    """
     rows = {}
     for model in models:
         (query,) = model.notable(1, model.target_camera, detail.query)
@@ -155,7 +162,7 @@ def attention(models: Shown, detail: Detail) -> Section:
 
 
 def training_curves(models: Shown, detail: Detail) -> Section:
-    """Loss and PSNR of every model whose training has a history."""
+    """Show loss and PSNR over the training, for every model with a stored history."""
     curves = {model.name: model.curves for model in models if model.curves}
     if not curves:
         return Section("training")
@@ -165,7 +172,10 @@ def training_curves(models: Shown, detail: Detail) -> Section:
 
 
 def novel_views(models: Shown, detail: Detail) -> Section:
-    """Show the middle target of three scenes: inputs, truth, renders, their error and depth."""
+    """Show the middle target view of up to three scenes: inputs, truth, and results of the models.
+
+    Rows for each scene: renders, their errors, depths.
+    """
     rows: dict[str, Sequence[Tile | None]] = {}
     for place, sample in enumerate(models[0].samples[:NOVEL_SCENES]):
         scene = pictured_scene(models, place, [len(sample.target_frames) // 2])
@@ -182,9 +192,12 @@ def novel_views(models: Shown, detail: Detail) -> Section:
 
 
 def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[str, Any]:
-    """Name, inputs and pictures of a scene by kind and column; `most`: the brightest error.
+    """Return the pictures of a scene as a dict for the template.
 
-    targets: places of the target views that are shown.
+    `name` of the scene; `inputs`, tiles of the input photos; `kinds`, tiles of the target views by
+    kind (Render, Error, Depth) and column (Truth, models); `most`, the error shown brightest.
+
+    place: index of the scene's sample. targets: indices of the target views to show.
     """
     sample = models[0].samples[place]
     views = sample.targets.select(list(targets))
