@@ -1,4 +1,4 @@
-"""Trained models on the same scenes: opened, and judged under one protocol."""
+"""Open several trained models and evaluate them on the same scenes under one protocol."""
 
 import math
 import os
@@ -46,8 +46,11 @@ OF_THE_METHOD = (
     "views.scale",
     "views.scale_factor",
 )
-"""Options that may differ between compared recipes: the method's training, tuning (not used here),
-and the unit of a model's world (no score depends on it)."""
+"""Options that may differ between compared recipes.
+
+They belong to the method: details of its training, tuning (not used here), and the unit of the
+model's world, which changes no score.
+"""
 
 
 # Cost above the best window's up to which a window is shown.
@@ -55,9 +58,11 @@ POOR = 1.0
 
 
 def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) -> list[Window]:
-    """Return at most `count` of `ranked_windows`, the best first, the others spread over the scene.
+    """Choose at most `count` windows, each with its input photos and the photos to compare with.
 
-    The compared frames of each are the photos near it. ValueError for fewer photos than inputs.
+    The first is the best of `ranked_windows`; the others are good and far from those chosen before.
+    inputs: number of input photos in a window. trained_on: measurements of the training data, by
+    which windows are ranked. Raises ValueError for fewer photos than inputs.
     """
     frusta = Frusta(scene, trained_on)
     ranked = ranked_windows(frusta, inputs)
@@ -70,7 +75,7 @@ def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) ->
 
 
 class PhotoWindows(Span):
-    """WINDOWS windows of each scene by `spread_windows`, chosen once."""
+    """View sampler that chooses WINDOWS windows of each scene once, by `spread_windows`."""
 
     def __init__(self, trained_on: Domain) -> None:
         super().__init__(Span.Config())
@@ -78,7 +83,10 @@ class PhotoWindows(Span):
         self._known: dict[str, list[Window]] = {}
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
-        """See `ViewSampler`; scenes that move have none. Raises ValueError without a target."""
+        """Return the windows of a scene; none for a scene that moves.
+
+        Raises ValueError if every photo is an input and none is left to compare with.
+        """
         if scene.times is not None:
             # a moment of a moving scene has few views; the recipe's sampler knows which
             return []
@@ -86,17 +94,18 @@ class PhotoWindows(Span):
             windows = spread_windows(scene, views.inputs, self._trained_on, WINDOWS)
             if not any(compared for _, compared in windows):
                 raise ValueError(
-                    f"all {len(scene)} photos are inputs, none is left to compare with: add one "
-                    "between them, or see what a model makes of them by qgs view MODEL PHOTOS"
+                    f"all {len(scene)} photos are inputs, none is left to compare with: add a "
+                    "photo between them, or view the reconstruction by qgs view MODEL PHOTOS"
                 )
             self._known[scene.name] = windows
         return self._known[scene.name]
 
 
 class ScaleSearch:
-    """The settings of views for windows of scenes, with the found factor in place of `search`.
+    """Replace `scale: search` in settings of views by the scale found for each window.
 
-    found: by scene, inputs and compared frames; no window is searched twice.
+    A window is the input frames and the compared frames of a scene. found: the scale found for each
+    window, by scene name, inputs and compared frames; no window is searched twice.
     """
 
     def __init__(self, model: QueryGaussianModel, views: ViewsConfig) -> None:
@@ -105,7 +114,7 @@ class ScaleSearch:
         self.found: dict[tuple[str, Frames, Frames], FoundScale] = {}
 
     def __call__(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
-        """See `find_scale`."""
+        """Return the settings for a window; call `find_scale` if they ask for a search."""
         if self.views.scale != "search":
             return self.views
         key = (scene.name, tuple(inputs), tuple(compared))
@@ -116,10 +125,12 @@ class ScaleSearch:
 
 @dataclass(frozen=True)
 class Model:
-    """A trained model by its short name.
+    """A trained model in a comparison.
 
-    recipe: with the compared data in place of the training's. search: the network, and the scales
-    found for it. step: of its training. windows: of a user's photos, else None.
+    name: short and unique. file: its checkpoint. recipe: that of its training, but with the data of
+    the comparison. search: the network, and the scales found for it. step: number of training
+    steps; None if unknown. windows: how inputs are chosen from a user's photos; None for data of
+    the recipe.
     """
 
     name: str
@@ -131,12 +142,12 @@ class Model:
 
     @property
     def network(self) -> QueryGaussianModel:
-        """The model itself."""
+        """The model as a module."""
         return self.search.model
 
     @cached_property
     def evaluation(self) -> Evaluation:
-        """Scores on the test views of its recipe; the model moves to the CPU for them."""
+        """Scores on the test views of `recipe`. Afterwards the model is on the CPU."""
         found = evaluate(
             self.network, self.recipe, self.step, views_of=self.search, sampler=self.windows
         )
@@ -146,7 +157,7 @@ class Model:
 
     @property
     def about(self) -> str:
-        """The first paragraph of its card, or else its sizes."""
+        """First paragraph of the model's card; without a card, a line with the model's sizes."""
         return about(self.file) or heading(self.network)
 
     @property
@@ -156,14 +167,14 @@ class Model:
 
     @property
     def recipe_text(self) -> str:
-        """The recipe as YAML."""
+        """The recipe of the comparison as YAML."""
         return yaml.safe_dump(dict(self.recipe.tree), sort_keys=False, allow_unicode=True)
 
 
 def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Return `short_names` of models or recipes, each another.
+    """Return short names of models or recipes, numbered where a path is repeated.
 
-    One that comes again is numbered: `a/x.yaml`, `b/x.yaml` and that again are a/x, b/x, b/x (2).
+    `a/x.yaml`, `b/x.yaml`, `b/x.yaml` give a/x, b/x, b/x (2); see `short_names`.
     """
     names = short_names(paths)
     before = [names[:index].count(name) for index, name in enumerate(names)]
@@ -171,7 +182,7 @@ def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
 
 
 def checkpoints(names: Sequence[str]) -> dict[str, Path]:
-    """Return the file of each model by short name (see `checkpoint_path`)."""
+    """Return the checkpoint file of each model, by its short name (see `checkpoint_path`)."""
     return dict(zip(numbered_names(names), map(checkpoint_path, names), strict=True))
 
 
@@ -182,7 +193,10 @@ def open_models(
     size: Size | None = None,
     overrides: Sequence[str] = (),
 ) -> list[Model]:
-    """Load models for unseen scenes, or for held-out photos. Raises as `recipes_alike`."""
+    """Load models for a comparison on unseen scenes of their data, or on held-out `photos`.
+
+    The parameters and the errors are those of `recipes_alike`.
+    """
     files = checkpoints(names)
     recipes = recipes_alike(files, photos, size, overrides)
     windows: PhotoWindows | None = None
@@ -200,9 +214,9 @@ def open_models(
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
-    """Resolve recipes, by short name, under one time budget and seed.
+    """Return resolved recipes by short name, all with one time budget (seconds) and one seed.
 
-    Raises ValueError when two files differ in anything but model, losses and `OF_THE_METHOD`.
+    Raises ValueError if two recipes differ in more than model, losses and `OF_THE_METHOD`.
     """
     # a number of steps that no time budget reaches
     overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
@@ -213,7 +227,7 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
 
 
 def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> None:
-    """Raise ValueError where two recipes differ in `sections`, except in `OF_THE_METHOD`."""
+    """Raise ValueError if two recipes differ in `sections`; `OF_THE_METHOD` may differ."""
 
     def compared(section: str, recipe: Recipe) -> dict[str, Any]:
         options = recipe.tree[section] or {}
@@ -225,8 +239,8 @@ def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> No
         unequal = [s for s in sections if compared(s, recipe) != compared(s, recipes[first])]
         if unequal:
             raise ValueError(
-                f"{name} and {first} differ in {', '.join(unequal)}, so their figures could not be "
-                "compared; make these parts equal, or take one at a time"
+                f"{name} and {first} differ in {', '.join(unequal)}, so their scores cannot be "
+                "compared; make these sections of the recipes equal, or report one model alone"
             )
 
 
@@ -236,12 +250,13 @@ def recipes_alike(
     size: Size | None,
     overrides: Sequence[str] = (),
 ) -> dict[str, Recipe]:
-    """Read the recipes of `files`, with the data at `photos` in place of their own.
+    """Return the recipes of checkpoints, by name; `photos`, if given, replaces their data.
 
-    size: (H, W) of the photos, by default one that all models take and at which they are whole.
-    overrides: settings of `views`, such as a scale.
+    files: checkpoint by name. size: (H, W) of the photos in pixels; by default one that all models
+    take and that crops no photo. overrides: settings of `views` for photos, such as a scale.
 
-    Raises ValueError where their protocols differ, and as `CheckpointFile` and the data do.
+    Raises ValueError if recipes differ in how they are evaluated, and what `CheckpointFile` and the
+    readers of photos raise.
     """
     recipes = dict[str, Recipe]()
     for name, path in files.items():
@@ -257,7 +272,7 @@ def recipes_alike(
 
 
 def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dict[str, Any]:
-    """Return the section `data` of the photos for all `recipes`, some photos held out."""
+    """Return a section `data` that reads `photos` for all `recipes` and holds some photos out."""
     sources = installed_sources()
     trained = [recipe.data_config for recipe in recipes]
     # as a model that was trained on them opens them: its held-out photos are no training data
@@ -282,7 +297,11 @@ def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dic
 def _on_photos(
     recipe: Recipe, photos: str, data: Mapping[str, Any], first: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the tree of `recipe` on the photos of `data`, which chooses views as `first` does."""
+    """Return the tree of `recipe` with photos as its data.
+
+    photos: their folder. data: section `data` that reads them. first: section `views` of the first
+    recipe, whose choice of views holds for all recipes.
+    """
     plugin = data["type"].split("/")[0]
     own = is_training_data(photos, recipe.data_config)
     views = {

@@ -1,4 +1,4 @@
-"""Curves of a training: loss and PSNR by steps."""
+"""Draw loss and PSNR over the steps of trainings."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,11 +12,14 @@ from qgs.metrics.images import Psnr
 from qgs_viewer.look import MUTED, categorical, hex_color, running_mean
 
 Curves = Sequence[Mapping[str, Any]]
-"""Records of a training: each a step, seconds since its start, loss, PSNR of supervised views."""
+"""Records of a training: step, seconds since the start, loss, PSNR of the supervised views."""
 
 
 def curves_figure(curves: Mapping[str, Curves]) -> Figure:
-    """Draw loss and PSNR by steps; pale as they are, strong their running means."""
+    """Draw loss and PSNR over steps: the values as pale lines, their running means as strong ones.
+
+    curves: records by model name.
+    """
     with figure_style():
         figure = Figure(figsize=(7, 2.6), layout="constrained")
         loss_axis, psnr_axis = figure.subplots(1, 2)
@@ -40,9 +43,10 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def curves_of(file: Path) -> Curves:
-    """Read NAME.history.jsonl beside NAME.safetensors, or history.jsonl of its run.
+    """Return the records of a training without skipped steps; empty if no history is stored.
 
-    Skipped steps are left out.
+    file: checkpoint NAME.safetensors. Its history is NAME.history.jsonl, or else history.jsonl, in
+    the same folder.
     """
     own = file.with_suffix(".history.jsonl")
     records = read_records(own if own.is_file() else file.with_name("history.jsonl"))

@@ -1,4 +1,4 @@
-"""Places in the shown world: similarity maps, splats, frusta, picking by a ray."""
+"""Place Gaussians, cameras and photos in the shown world, and pick a Gaussian by a ray."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ FLOAT16 = 2.0**15
 
 @dataclass(frozen=True)
 class Placement:
-    """The map p -> scale * rotation p + translation of one world into another; float64."""
+    """Similarity from one world to another: p -> scale * rotation p + translation, in float64."""
 
     rotation: Tensor
     translation: Tensor
@@ -32,7 +32,10 @@ class Placement:
 
     @staticmethod
     def between(world: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> "Placement":
-        """Return the map from a model's `world`, see `own_world`, into the `other` one."""
+        """Return the map from the world of one reconstruction into that of another.
+
+        world, other: pose and scale of the two worlds as `own_world` returns them.
+        """
         pose, scale = world
         other_pose, other_scale = other
         # out of the model's world into the photos', and into the other one
@@ -41,17 +44,20 @@ class Placement:
         return Placement(both[:3, :3], both[:3, 3] * float(other_scale), factor)
 
     def points(self, points: Tensor) -> Tensor:
-        """Place points (..., 3)."""
+        """Map points (..., 3) into the other world."""
         return self.scale * points.detach().cpu().double() @ self.rotation.mT + self.translation
 
     def vectors(self, columns: Tensor) -> Tensor:
-        """Place directions as columns (..., 3, n), with their lengths."""
+        """Map vectors, the columns of (..., 3, n): rotate and scale them, without translation."""
         return self.scale * self.rotation @ columns.detach().cpu().double()
 
 
 @dataclass(frozen=True)
 class Splats:
-    """G Gaussians: float32 centers (G, 3), covariances (G, 3, 3), opacities (G, 1), RGB (G, 3)."""
+    """G Gaussians for viser: float32 centres (G, 3), covariances (G, 3, 3), opacities (G, 1).
+
+    colors: RGB (G, 3) in [0, 1].
+    """
 
     centers: np.ndarray
     covariances: np.ndarray
@@ -60,18 +66,25 @@ class Splats:
 
     @property
     def magnification(self) -> float:
-        """Factor of lengths for which float16 holds the largest covariance.
+        """Factor by which lengths are multiplied so that covariances fit into float16.
 
-        It then holds standard deviations 10,000 times smaller beside it.
+        The largest covariance is then near the maximum of float16, and standard deviations that are
+        10,000 times smaller do not vanish.
         """
         return float(np.sqrt(FLOAT16 / max(np.abs(self.covariances).max(), 1e-30)))
 
 
 @full_precision
 def splats(gaussians: Gaussians, placement: Placement) -> Splats:
-    """Place the Gaussians (1, G) of one scene; warn that `sh` is not shown."""
+    """Place the Gaussians (1, G) of one scene in the shown world.
+
+    Colours do not depend on the direction: a warning says so if the Gaussians have `sh`.
+    """
     if gaussians.sh is not None:
-        warn_once("colours of these Gaussians depend on the direction; those of degree 0 are shown")
+        warn_once(
+            "the viewer shows these Gaussians with one colour from all directions: it leaves out "
+            "spherical harmonics above degree 0"
+        )
     rotated = placement.vectors(quat_to_matrix(gaussians.quats[0]))
     axes_G33 = rotated * gaussians.scales[0].detach().cpu().double()[:, None, :]
     return Splats(
@@ -87,9 +100,10 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
-    """Return the Gaussian that weighs most in the colour of a ray; None where all are nearly clear.
+    """Return the index of the Gaussian with the largest blending weight on a ray.
 
-    Each counts with its greatest value on the ray, the nearest first, as alpha is blended.
+    None if all weights are below LEAST_WEIGHT. The alpha of a Gaussian is its greatest value along
+    the ray; alphas are blended from near to far. origin, direction: of the ray, both (3,).
     """
     offsets = origin - found.centers.astype(np.float64)
     # flat Gaussians have no inverse
@@ -111,7 +125,7 @@ def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
 
 @full_precision
 def on_photo(cameras: Cameras, pixels: Tensor, depth: float) -> Tensor:
-    """Return world points (V, P, 3) at z `depth` behind pixels (P, 2) of cameras (V,)."""
+    """Return the world points (V, P, 3) that cameras (V,) see in pixels (P, 2) at z = `depth`."""
     focal = cameras.intrinsics[:, None, :2]
     principal = cameras.intrinsics[:, None, 2:]
     flat = (pixels.to(focal) - principal) / focal * depth
@@ -120,13 +134,16 @@ def on_photo(cameras: Cameras, pixels: Tensor, depth: float) -> Tensor:
 
 
 def corners(size: tuple[int, int]) -> Tensor:
-    """Return pixels (4, 2) of a picture's corners, in order around it. size: H, W."""
+    """Return the corners of a picture of `size` (H, W) in pixels: (4, 2), clockwise from (0, 0)."""
     height, width = size
     return torch.tensor([[0, 0], [width, 0], [width, height], [0, height]]).double()
 
 
 def patch_centers(grid: tuple[int, int, int], size: tuple[int, int]) -> Tensor:
-    """Return pixels (rows * columns, 2) of the patches of one view. grid: views, rows, columns."""
+    """Return the centres of the patches of one photo in pixels (x, y): (rows * columns, 2).
+
+    grid: number of views, rows and columns. size: (H, W) of the photo in pixels.
+    """
     _, rows, columns = grid
     height, width = size
     places = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).double() + 0.5

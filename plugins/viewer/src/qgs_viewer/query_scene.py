@@ -1,4 +1,4 @@
-"""A reconstructed scene with the queries that it is made of: their supports, what they read."""
+"""Hold a reconstructed scene with its queries: their supports and their attention."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,12 +15,16 @@ from qgs_viewer.placement import Placement, Splats, on_photo, patch_centers, spl
 
 Background = tuple[float, float, float]
 NEUTRAL: Background = RendererConfig().background
-"""Background of models, unless their recipe changes it."""
+"""Default background of renderers, RGB in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Inside:
-    """A model's image memory, and its state after each layer, 0 the start."""
+    """The model of a scene, with its intermediate results.
+
+    memory: tokens of the input photos. states: of the queries, before the first decoder layer and
+    after each layer.
+    """
 
     model: QueryGaussianModel
     memory: ImageMemory
@@ -29,7 +33,11 @@ class Inside:
 
 @dataclass(frozen=True)
 class Reading:
-    """Patches: points (k, 3) and width `side` in the shown world, shares (k,) of attention."""
+    """The k patches that a query attends to most.
+
+    points: their centres (k, 3) in the shown world. shares: the query's attention to each, (k,).
+    side: width of a patch in the shown world.
+    """
 
     points: Tensor
     shares: Tensor
@@ -38,10 +46,12 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class QueryScene:
-    """Gaussians (1, G), the input views (1, V), and the placement in the shown world.
+    """A reconstruction: Gaussians (1, G), the input views (1, V), and the model's queries.
 
-    inside: None without a model; then there are no queries. frames: numbers of the views in their
-    scene. background: RGB in [0, 1] behind the Gaussians.
+    frames: indices of the input views in their scene. placement: map from the world of the
+    Gaussians and views into the shown world. inside: the model and its states; None if only the
+    Gaussians are known, and then there are no queries. background: RGB in [0, 1] behind the
+    Gaussians.
     """
 
     gaussians: Gaussians
@@ -54,7 +64,7 @@ class QueryScene:
 
     @property
     def queries(self) -> int:
-        """Number of queries to pick from; 0 without a model."""
+        """Number of queries; 0 without a model."""
         return self.inside.states[0].features.shape[1] if self.inside else 0
 
     @property
@@ -66,7 +76,7 @@ class QueryScene:
         """Raise ValueError for a query that the scene does not have."""
         if query is not None and query >= self.queries:
             last = self.queries - 1
-            there = f"there are 0 to {last}" if self.queries else "no query is known of it"
+            there = f"queries are 0 to {last}" if self.queries else "this source has no queries"
             raise ValueError(f"--query {query} cannot be picked: {there}")
 
     @cached_property
@@ -85,13 +95,14 @@ class QueryScene:
 
     @property
     def has_anchors(self) -> bool:
-        """True if the queries have a place in space."""
+        """True if every query has an anchor, a point in space."""
         return self.support(0) is not None
 
     def support(self, layer: int) -> SpatialSupport | None:
-        """Return supports (1, N) after a layer, 0 the start, in the shown world, float64.
+        """Return the supports (1, N) of all queries in the shown world, float64.
 
-        None without anchors.
+        layer: decoder layer after which they are taken; 0 is before the first. None if the queries
+        have no anchors.
         """
         if self.inside is None:
             return None
@@ -102,9 +113,10 @@ class QueryScene:
         return SpatialSupport(place.points(found.centers), place.vectors(found.axes))
 
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
-        """Return what a query reads in a layer, (1, h, 1, M), patches of `grid`.
+        """Return the cross-attention of a query in a layer to all patches of `grid`: (1, h, 1, M).
 
-        None where it is not explained, in layer 0, and of tokens that are no patches of photos.
+        None in layer 0, which does not attend, without a model, if the tokens are not patches of
+        photos, and if the decoder does not report its attention.
         """
         inside = self.inside
         if inside is None or inside.memory.grid is None or self.views is None or not layer:
@@ -118,22 +130,25 @@ class QueryScene:
 
     @property
     def grid(self) -> tuple[int, int, int]:
-        """(V, H/P, W/P) of the patches that `attention` is of."""
+        """Shape of the patches of all input photos: (V, H/P, W/P), with P pixels on a side."""
         assert self.inside is not None
         assert self.inside.memory.grid is not None
         return self.inside.memory.grid
 
     def hub(self, query: int, layer: int) -> Tensor:
-        """Return where lines of a query start, (3,): its anchor, or its Gaussians' mean."""
+        """Return the point (3,) at which lines from a query start, in the shown world.
+
+        It is the anchor after `layer`, or the mean of the query's Gaussians if it has no anchor.
+        """
         found = self.support(layer)
         if found is not None:
             return found.centers[0, query]
         return self.placement.points(self.gaussians.means[0, self.members(query)]).mean(0)
 
     def strongest(self, query: int, layer: int, count: int, depth: float) -> Reading | None:
-        """Return the `count` patches that a query reads most, on photos `depth` before cameras.
+        """Return the `count` patches that a query attends to most, averaged over heads.
 
-        Mean over heads; None as for `attention`.
+        depth: distance from a camera to its photo in the shown world. None if `attention` is None.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:
@@ -156,7 +171,11 @@ def explained(
     frames: Sequence[int],
     placement: Placement | None = None,
 ) -> QueryScene:
-    """Reconstruct views (1, V) by `model`, and keep what can be asked of its queries."""
+    """Reconstruct views (1, V) by `model`, and keep the states of its queries after each layer.
+
+    frames: indices of the views in their scene. placement: map into the shown world; by default
+    none.
+    """
     memory = model.encoder(views)
     start = model.queries(memory, views)
     prediction = model.predict(views, memory, start, range(1, model.depth + 1))

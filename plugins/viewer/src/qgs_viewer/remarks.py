@@ -1,4 +1,4 @@
-"""Sentences on results: searched scales, chosen photos, and the commands that come next."""
+"""Write sentences on results: found scales, chosen photos, commands to run next."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
-    """Yield one sentence on all models whose scales were searched, if there are any."""
+    """Yield one sentence with the scales found by search; nothing if no model was searched."""
     parts = []
     for model in models:
         if found := model.search.found.values():
@@ -22,19 +22,22 @@ def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
             ends = dict.fromkeys(f"{factor:.3g}" for factor in (min(factors), max(factors)))
             mean = sum(scale.psnr for scale in found) / len(found)
             poor = sum(bool(scale.poor) for scale in found)
-            fault = f", no scale fits {counted(poor, 'window')}" if poor else ""
+            fault = f", no good scale for {counted(poor, 'window')}" if poor else ""
             parts.append(f"{model.name} {' to '.join(ends)} ({mean:.1f} dB{fault})")
     if parts:
         found_scales = "; ".join(parts)
-        yield f"Scales found by rendering photos: {found_scales}. --scale sets another."
+        yield f"Scales found by rendering photos: {found_scales}. --scale sets another scale."
 
 
 def remarks(models: Sequence[Model]) -> list[str]:
-    """Return the remarks of all evaluations, each once with its models, and those on scales."""
+    """Return all remarks: on chosen photos, on the evaluation of each model, on scales.
+
+    A remark that holds for several models stands once, with their names.
+    """
     names: dict[str, list[str]] = {}
     for model in models:
         evaluation = model.evaluation
-        missing = [f"{scene} is not judged: {why}" for scene, why in evaluation.missing.items()]
+        missing = [f"{scene} is not evaluated: {why}" for scene, why in evaluation.missing.items()]
         for remark in (*evaluation.remarks, *missing):
             # the same remark on three models stands once, with their names
             names.setdefault(remark, []).append(model.name)
@@ -43,7 +46,7 @@ def remarks(models: Sequence[Model]) -> list[str]:
 
 
 def chosen_windows(model: Model) -> Iterator[str]:
-    """Yield a line on each scene whose windows were chosen."""
+    """Yield a line for each scene of a user's photos: inputs and scored photos of each window."""
     if model.windows is None:
         return
     for score in model.evaluation.scores:
@@ -53,7 +56,7 @@ def chosen_windows(model: Model) -> Iterator[str]:
             judged = listed(score.names.get(frame, frame) for frame in targets)
             texts.append(f"{given} ({judged})")
         windows = "; ".join(texts)
-        yield f"{score.scene}, inputs (photos that are judged): {windows}"
+        yield f"{score.scene}, input photos (scored photos in parentheses): {windows}"
 
 
 def next_commands(
@@ -63,10 +66,10 @@ def next_commands(
     photos: str | None = None,
     options: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Return commands that a reader may want next, as a shell takes them, and what each does.
+    """Return shell commands that a reader may run next, and what each does.
 
-    names: the models as a command line names them. target: the folder of the report; what the
-    commands write goes there, since it is new. options: those of the report for its photos.
+    names: the models as given on the command line. target: folder of the report, into which the
+    commands write. options: options of the report that concern its photos, such as --size.
     """
     first, column = next(iter(models[0].evaluation.columns.items()))
     scores = [model.evaluation.mean(f"model_{first}") for model in models]
@@ -79,7 +82,7 @@ def next_commands(
     given = shlex.join([best, place, *chosen, *options])
     scene = shlex.quote(f"{target / 'scene'}")
     return {
-        f"qgs reconstruct {given} --out {scene}": "reconstructs the scene, as a PLY file too",
-        f"qgs refine {scene} {shlex.quote(place)}": "fits its Gaussians to all photos",
-        f"qgs view {given}": "shows the scene in the browser, to turn and to pick queries in",
+        f"qgs reconstruct {given} --out {scene}": "reconstructs the scene and writes a PLY file",
+        f"qgs refine {scene} {shlex.quote(place)}": "fits the scene's Gaussians to all photos",
+        f"qgs view {given}": "shows the scene in the browser: turn it, pick queries",
     }

@@ -1,4 +1,4 @@
-"""Reconstructions of the scenes that pages and figures show."""
+"""Reconstruct the scenes that pages and figures show."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,10 +20,11 @@ from qgs_viewer.query_scene import QueryScene, explained
 
 @dataclass(frozen=True)
 class ModelScenes:
-    """A model by name, and the Gaussians that it makes of the inputs of each of `samples`.
+    """A model and its reconstructions of several samples.
 
-    samples: in the scale of this model's world. scene: the first of them with its queries. curves:
-    of the training, where it has a history.
+    samples: inputs and targets in the world of this model. gaussians: the reconstruction of each
+    sample. scene: that of the first sample, with its queries. curves: loss and PSNR of the
+    training; empty without a stored history.
     """
 
     name: str
@@ -39,9 +40,10 @@ class ModelScenes:
         return self.samples[0].targets.cameras[:, :1]
 
     def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
-        """Return `query`, or the `count` most notable ones in the first of cameras (1, V).
+        """Return `query`; if it is None, the `count` best visible queries (see `notable_queries`).
 
-        Raises ValueError for a query that the model does not have.
+        cameras: (1, V), of which the first counts. Raises ValueError for a query that does not
+        exist.
         """
         if query is None:
             return notable_queries(self.network, self.gaussians[0], cameras, count)
@@ -53,10 +55,10 @@ class ModelScenes:
 def model_scenes(
     models: Sequence[Model], most: int | None = None, scene: str | None = None
 ) -> list[ModelScenes]:
-    """Reconstruct the scenes of the models' evaluation by each model, on the model's device.
+    """Reconstruct the scenes of the evaluation by each model, on the model's device.
 
-    most: scenes, one sample of each; by default all samples of the evaluation. scene: the one that
-    comes first. Raises ValueError for a scene that is not judged.
+    most: number of scenes, with one sample each; by default all samples of the evaluation. scene:
+    name of the scene that comes first. Raises ValueError for a scene that is not evaluated.
     """
     first = models[0].recipe
     # Scenes are drawn, whatever index the scores are of.
@@ -91,14 +93,14 @@ def _samples(plan: EvaluationPlan) -> list[Sample]:
         try:
             samples += plan.samples(scene)
         except Exception as error:  # whatever a reader raises
-            raise ValueError(f"scene {scene!r} cannot be judged: {one_line(error)}") from error
+            raise ValueError(f"scene {scene!r} cannot be evaluated: {one_line(error)}") from error
     return samples
 
 
 def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample]:
     names = dict.fromkeys(sample.scene for sample in samples)
     if scene is not None and scene not in names:
-        raise ValueError(f"--scene: {scene!r} is not judged; scenes are {listed(names)}")
+        raise ValueError(f"--scene {scene!r} is not evaluated: choose from {listed(names)}")
     # sorting is stable: the others keep their order
     return sorted(samples, key=lambda sample: sample.scene != scene)
 
@@ -107,7 +109,10 @@ def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample
 def scenes_of(
     name: str, network: QueryGaussianModel, samples: Sequence[Sample], file: Path | None = None
 ) -> ModelScenes:
-    """Reconstruct `samples`; `file` is the checkpoint, beside which curves may lie."""
+    """Reconstruct `samples` by `network`.
+
+    file: its checkpoint, beside which the history of the training may lie; None shows no curves.
+    """
     # components draw random numbers in training mode
     network.eval()
     device = next(network.parameters()).device
@@ -122,9 +127,9 @@ def scenes_of(
 
 
 def ratio(sample: Sample, own: Sample) -> float:
-    """Return the length in the world of `sample` of what has length 1 in that of `own`.
+    """Return the factor from lengths in the world of `own` to lengths in the world of `sample`.
 
-    Both have the same views.
+    Both samples have the same views.
     """
     lengths = []
     for one in (sample, own):
