@@ -1,1 +1,1 @@
-"""Photo formats, checks of data, camera poses and refinement of scenes."""
+"""Photo formats, checks of data sets, camera poses from photos, and refinement of scenes."""

@@ -1,4 +1,4 @@
-"""Photos in a folder, without cameras."""
+"""List the image files of a folder."""
 
 from upath import UPath
 
@@ -8,7 +8,7 @@ _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif",
 
 
 def image_files(folder: UPath) -> list[UPath]:
-    """Return the photos in a folder, by name."""
+    """Return the image files in a folder, sorted by name, without hidden files."""
     files = [item for item in listing(folder) if not item.name.startswith(".")]
     photos = [item for item in files if item.name.lower().endswith(_SUFFIXES)]
     return sorted(photos, key=lambda item: item.name)

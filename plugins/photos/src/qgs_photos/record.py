@@ -1,4 +1,4 @@
-"""A folder that `qgs reconstruct` wrote: Gaussians, cameras, and the world that they are in."""
+"""Read the folder that `qgs reconstruct` wrote: Gaussians, cameras and their world."""
 
 import json
 from collections.abc import Mapping
@@ -19,11 +19,13 @@ CAMERAS = "cameras.json"
 
 @dataclass(frozen=True)
 class Record:
-    """A reconstruction as its folder holds it, in its own world.
+    """A finished reconstruction, in the world coordinates of its Gaussians.
 
-    model: its checkpoint, "" if it was not loaded from a file. world: reference pose (4, 4) and
-    scale, see `own_world`. inputs, compared: frames, in this order in `cameras` (1, V). photos:
-    files of the frames that have some. renderer: options, with the background of the model.
+    model: checkpoint of the model, "" if unknown. tuning: settings of `--tune`; None without.
+    world: reference pose (4, 4) and scale that map the world of the photos to this one (see
+    `own_world`). inputs, compared: indices of the input frames and of the frames that it was
+    compared with. cameras: (1, V), first of the inputs, then of the compared frames. photos: files
+    by frame, where known. renderer: options with the background of the model.
     """
 
     folder: Path
@@ -39,24 +41,24 @@ class Record:
 
     @property
     def gaussians(self) -> Gaussians:
-        """Gaussians (1, G)."""
+        """The Gaussians (1, G), read from the folder."""
         return load_ply(self.folder / GAUSSIANS)
 
 
 def has_record(folder: Path) -> bool:
-    """Return whether `folder` has the files of a reconstruction."""
+    """Return whether `folder` holds a reconstruction: gaussians.ply and cameras.json."""
     return (folder / CAMERAS).is_file() and (folder / GAUSSIANS).is_file()
 
 
 def read_record(folder: Path) -> Record:
-    """Read the record in `folder`. Raises ValueError where it is damaged."""
+    """Read a reconstruction from `folder`. Raises ValueError if cameras.json is damaged."""
     file = folder / CAMERAS
     try:
         return _parsed(folder, json.loads(file.read_bytes()))
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(
-            f"{file} is no record of a reconstruction ({type(error).__name__}: {error}): make it "
-            "again with `qgs reconstruct`"
+            f"{file} does not describe a reconstruction ({type(error).__name__}: {error}): repeat "
+            "`qgs reconstruct`"
         ) from error
 
 

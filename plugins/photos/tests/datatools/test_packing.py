@@ -223,11 +223,11 @@ def test_the_command(six, tmp_path):
     out = tmp_path / "out"
     small = tmp_path / "small"
     told = command(f"{tmp_path}/scenes --out {out} --test-every 3 --set holdout=0")
-    assert "scenes 4 train, 2 test; 12 images now, 12 kept" in told
+    assert "scenes: 4 train, 2 test; images of this run: 12, of which 12 copied" in told
     assert packed(out).scenes("train")[0].held_out == ()
     assert list(packed(out).names("test")) == ["s2", "s5"]
     told = command(f"{out} --out {small} --image-size 8 12 --jpeg 80")
-    assert "scenes 4 train, 2 test; 12 images now, 0 kept as they were, 12 written" in told
+    assert "2 test; images of this run: 12, of which 0 copied unchanged and 12 enc" in told
     assert packed(small, size=(8, 12)).scenes("test")[0].encoded(0).size == (8, 12)
 
 

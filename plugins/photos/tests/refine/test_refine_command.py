@@ -96,7 +96,7 @@ def test_what_makes_no_sense_is_refused_in_a_sentence(reconstruction, photos, tm
     for source, given, options, message in (
         (tmp_path / "none", photos, (), "give a folder that `qgs reconstruct` wrote"),
         (by_hand, photos, (), "a model that is in no file"),
-        (damaged, photos, (), "is no record of a reconstruction"),
+        (damaged, photos, (), "does not describe a reconstruction"),
         (reconstruction, moved, ("--scene", "moved"), "or have other poses now"),
         (reconstruction, photos, ("--seconds", 0), "--seconds must be a time above 0"),
     ):

@@ -1,1 +1,1 @@
-"""Show reconstructions and their queries: a viewer in the browser, reports, figures for papers."""
+"""Viewer, reports and figures: reconstructions in the browser, report pages, figures for papers."""

@@ -25,39 +25,53 @@ _ROWS = 40
 
 Quality: TypeAlias = Annotated[
     int | None,
-    typer.Option(help="Quality of images written anew, as JPEG instead of PNG.", min=1, max=100),
+    typer.Option(
+        help="JPEG quality of images that must be encoded again. Default: PNG, without loss.",
+        min=1,
+        max=100,
+    ),
 ]
 EveryNth: TypeAlias = Annotated[
-    int | None, typer.Option(help="Every n-th scene is a test scene.", min=2)
+    int | None, typer.Option(help="Make every Nth scene a test scene.", min=2)
 ]
 
 
 @app.command("check")
 def check(
-    path: Annotated[str, typer.Argument(help="Data set: a folder, an archive, a chunk, a URL.")],
+    path: Annotated[
+        str, typer.Argument(help="Data set: a folder, an archive, a .torch chunk, or a URL.")
+    ],
     index: Annotated[
         list[str] | None,
-        typer.Option(help="Evaluation index to compare with the scenes; repeatable."),
+        typer.Option(help="Evaluation index to compare with the scenes. Repeatable."),
     ] = None,
     format: Annotated[
-        str, typer.Option(help="Only scenes in this format, such as colmap or chunks.")
+        str,
+        typer.Option(
+            help="Check only scenes in this format, such as colmap or chunks. auto: any format."
+        ),
     ] = "auto",
     images: Annotated[
-        str | None, typer.Option(help="Folder of photos to read, such as images_4.")
+        str | None,
+        typer.Option(
+            help="Folder of photos inside each scene, such as images_4. Default: the format's."
+        ),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Read only the headers of images, match none.")
+        bool,
+        typer.Option("--quick", help="Read only image headers: decode and match no images."),
     ] = False,
     geometry: Annotated[
-        int, typer.Option(help="In how many scenes poses are judged by photos.", min=0)
+        int,
+        typer.Option(help="Number of scenes whose poses are checked by matching photos.", min=0),
     ] = 20,
     threads: Annotated[int, typer.Option(help="Threads that decode images.", min=1)] = 8,
 ) -> None:
-    """Find what is wrong with a data set: one line for each fault, with scene, frame and remedy.
+    """Find faults of a data set: one line for each fault, with scene, frame and remedy.
 
-    Every image is decoded, and poses are compared with what neighbouring photos share. Exit code 1
-    when there are errors, 0 when there are none or only warnings. Imports every installed plugin to
-    ask which reads PATH; with --format PLUGIN/NAME that one, with another format none.
+    Every image is decoded. Poses are checked by points that neighbouring photos share. The exit
+    code is 1 for errors, and 0 for no faults or only warnings. To find the reader of PATH, every
+    installed plugin is imported; --format PLUGIN/NAME imports only that plugin, other formats none.
     """
     from qgs.paths import opened_path
     from qgs_photos.datatools.check import Options, check
@@ -107,31 +121,44 @@ def _table(scenes: Sequence[SceneReport]) -> Table:
 
 @app.command("pack")
 def pack(
-    path: Annotated[str, typer.Argument(help="Data set, or recipe (.yaml) whose data to pack.")],
-    out: Annotated[str, typer.Option(help="New folder or URL for the chunks.")],
+    path: Annotated[
+        str, typer.Argument(help="Data set, or a recipe (.yaml) whose data set is packed.")
+    ],
+    out: Annotated[str, typer.Option(help="New folder for the chunks, or its URL.")],
     options: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Option of the source, such as images=images_4; repeatable."),
+        typer.Option(
+            "--set", help="Option of the data source, such as images=images_4. Repeatable."
+        ),
     ] = None,
     image_size: Annotated[
         tuple[int, int] | None,
-        typer.Option(help="Height and width of all images; their own by default.", min=1),
+        typer.Option(
+            help="Height and width to which all images are resized. Default: no resizing.", min=1
+        ),
     ] = None,
     jpeg: Quality = None,
-    chunk_mb: Annotated[int, typer.Option(help="Size of a chunk, in megabytes.", min=1)] = 100,
+    chunk_mb: Annotated[
+        int, typer.Option(help="Largest size of a chunk in mebibytes (2^20 bytes).", min=1)
+    ] = 100,
     test_scenes: Annotated[
-        str | None, typer.Option(help="File that names the test scenes: an index, a list.")
+        str | None,
+        typer.Option(help="File that names the test scenes: an evaluation index or a list."),
     ] = None,
     test_every: EveryNth = None,
     leave_out_broken: Annotated[
-        bool, typer.Option(help="Leave out scenes that cannot be read, and name them.")
+        bool,
+        typer.Option(
+            help="Leave out scenes that cannot be read, and list them at the end. Default: stop at "
+            "the first."
+        ),
     ] = False,
 ) -> None:
-    """Turn any data set into chunks, the format that training reads fastest.
+    """Convert any data set into chunks, the format that training reads fastest.
 
-    JPEG and PNG photos of pinhole cameras stay as they are; others are undistorted, resized if
-    asked to, and written as PNG. Called again, it finishes what was interrupted. Imports every
-    installed plugin to ask which reads a data set; for a recipe only its own.
+    JPEG and PNG photos of pinhole cameras are copied unchanged. Other photos are undistorted and
+    written as PNG. The same command again finishes an interrupted conversion. To find the reader of
+    a data set, every installed plugin is imported; for a recipe, only the plugins that it names.
     """
     from qgs.paths import opened_path
     from qgs_photos.datasets.dl3dv import read_scene_list
@@ -171,7 +198,10 @@ def pack(
 def _opened(
     path: str, options: list[str], image_size: tuple[int, int] | None
 ) -> tuple[SceneSource, dict[str, Any]]:
-    """Return the source of scenes at `path`, and what it was asked for."""
+    """Return the source of the scenes at `path`, and its options for `packing.json`.
+
+    path: data set or recipe. options: settings of the source, as KEY=VALUE.
+    """
     from qgs.data.recognition import recognised
     from qgs.paths import opened_path
     from qgs.recipe import resolve
@@ -193,15 +223,15 @@ def _opened(
 
 def _print_packed(console: Console, packed: Packed, out: str) -> None:
     scenes = ", ".join(f"{count} {split}" for split, count in packed.scenes.items())
-    again = f", {packed.resumed} of them packed before" if packed.resumed else ""
+    again = f", {packed.resumed} of them by an earlier run" if packed.resumed else ""
     say(
         console,
-        f"{out}: scenes {scenes}{again}; {packed.frames} images now, {packed.kept} kept as they "
-        f"were, {packed.frames - packed.kept} written anew",
+        f"{out}: packed scenes: {scenes}{again}; images of this run: {packed.frames}, of which "
+        f"{packed.kept} copied unchanged and {packed.frames - packed.kept} encoded again",
     )
     if not packed.scenes["test"]:
-        say(console, "there are no test scenes: held-out frames are what is evaluated")
+        say(console, "there are no test scenes: evaluations will use held-out photos of scenes")
     if packed.left_out:
-        say(console, f"{len(packed.left_out)} scenes could not be read and are left out:")
+        say(console, f"scenes left out since they cannot be read: {len(packed.left_out)}")
         for name, reason in packed.left_out.items():
             say(console, f"  {name}: {reason}")

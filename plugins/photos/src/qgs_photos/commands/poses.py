@@ -1,4 +1,4 @@
-"""`qgs poses`."""
+"""The command `qgs poses`."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from qgs.cli.options import Threads
 from qgs_photos.printing import say
 
-app = typer.Typer(help="Camera poses of photos or a video.")
+app = typer.Typer(help="Find camera poses of photos or a video.")
 
 
 @app.command()
@@ -19,35 +19,46 @@ def poses(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="New folder for poses and photos; default: NAME_poses beside them."),
+        typer.Option(
+            help="New folder for poses and images. Default: NAME_poses beside the photos or the "
+            "video."
+        ),
     ] = None,
     frames: Annotated[
         int | None,
         typer.Option(
-            min=3, help="Frames of a video; default: two a second, more of fast motion, 40 to 240."
+            min=3,
+            help="Number of frames taken from a video. Default: two a second, more for fast "
+            "motion, between 40 and 240.",
         ),
     ] = None,
     side: Annotated[
-        int, typer.Option(min=200, help="Longer side in pixels at which points are looked for.")
+        int,
+        typer.Option(
+            min=200, help="Longer side in pixels to which photos are reduced to find features."
+        ),
     ] = 1600,
     matching: Annotated[
         Literal["auto", "exhaustive", "sequential"],
         typer.Option(
-            help="Match all pairs, or neighbours by name; auto: the latter for videos and above 80 "
-            "photos."
+            help="exhaustive: match all pairs of photos. sequential: match neighbours in the order "
+            "of names. auto: sequential for videos and for more than 80 photos, else exhaustive."
         ),
     ] = "auto",
     features: Annotated[
-        int, typer.Option(min=100, help="Points of a photo that are matched, at most.")
+        int, typer.Option(min=100, help="Largest number of features in a photo.")
     ] = 4096,
     seed: Annotated[
-        int, typer.Option(min=0, help="With --threads 1 the same seed gives the same file.")
+        int,
+        typer.Option(
+            min=0, help="Random seed. With --threads 1 the same seed gives the same poses."
+        ),
     ] = 0,
     threads: Threads = None,
 ) -> None:
-    """Find camera poses of photos or a video, by COLMAP: sparse/0 and images, checked at once.
+    """Find camera poses of photos or a video by COLMAP, and check them.
 
-    The photos stay where they are.
+    The new folder holds the poses (sparse/0) and the images. Your photos are not changed.
     """
     from rich.console import Console
 
@@ -57,9 +68,9 @@ def poses(
     from qgs_photos.poses.making import Options, make_poses
 
     if not source.exists():
-        raise FileNotFoundError(f"{source} does not exist: give photos or a video")
+        raise FileNotFoundError(f"{source} does not exist: give a folder of photos or a video")
     if frames is not None and not source.is_file():
-        raise ValueError("--frames is for a video: leave it out")
+        raise ValueError("--frames is for a video: leave --frames out for photos")
     console = Console()
     options = Options(frames, side, matching, features, threads or os.cpu_count() or 1, seed)
     folder = out or beside(source)
@@ -70,5 +81,5 @@ def poses(
     for finding in report.findings:
         say(console, str(finding))
     (scene,) = report.scenes
-    say(console, f"matched points lie {scene.epipolar} pixels from their epipolar lines")
+    say(console, f"median distance of matches from epipolar lines, pixels: {scene.epipolar}")
     say(console, f"wrote {folder}; next: qgs demo {folder}")

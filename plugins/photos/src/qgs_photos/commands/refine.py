@@ -1,4 +1,4 @@
-"""`qgs refine`."""
+"""The command `qgs refine`."""
 
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -12,7 +12,10 @@ from qgs_photos.printing import say
 app = typer.Typer(help="Fit a reconstruction to the photos of its scene.")
 
 Count: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Number at the end; default: as many as there are.")
+    int | None,
+    typer.Option(
+        min=1, help="Number of Gaussians in the result. Default: that of the reconstruction."
+    ),
 ]
 
 
@@ -20,33 +23,43 @@ Count: TypeAlias = Annotated[
 def refine(
     reconstruction: Annotated[Path, typer.Argument(help="Folder that `qgs reconstruct` wrote.")],
     photos: Annotated[
-        str, typer.Argument(help="The photos that it was made of: a folder, its URL, or a video.")
+        str,
+        typer.Argument(
+            help="Photos from which the reconstruction was made: a folder, its URL, or a video."
+        ),
     ],
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the result, or .ply/.splat file; default: RECONSTRUCTION/refined."
+            help="New folder, or a .ply or .splat file, for the result. Default: "
+            "RECONSTRUCTION/refined."
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Time of the optimisation.")] = 30.0,
+    seconds: Annotated[float, typer.Option(help="Time of the optimisation in seconds.")] = 30.0,
     gaussians: Count = None,
     size: Annotated[
         str | None,
         typer.Option(
-            metavar="HxW", help="Size of the photos; default: that of the reconstruction's."
+            metavar="HxW",
+            help="Height and width of the photos in the optimisation. Default: the size with which "
+            "the reconstruction was made.",
         ),
     ] = None,
     inputs_only: Annotated[
-        bool, typer.Option("--inputs-only", help="Optimise on the input photos alone.")
+        bool,
+        typer.Option(
+            "--inputs-only",
+            help="Optimise only on the input photos of the reconstruction, not on further photos.",
+        ),
     ] = False,
     scene_name: SceneName = None,
     device: Device = "auto",
 ) -> None:
     """Optimise the Gaussians of a reconstruction on the photos of its scene.
 
-    All photos take part but those that it was compared with and those held out of training. The
-    result has the same files; both tables show scores before and after. Ctrl-C ends the
-    optimisation and writes what there is.
+    Photos with which the reconstruction was compared, and photos held out of training, are not
+    used. The result has the same files as a reconstruction. Two tables show the scores before and
+    after. Ctrl-C ends the optimisation early and writes its result.
     """
     # a result is never overwritten: minutes of work are in it
     target = out or reconstruction / "refined"

@@ -1,4 +1,4 @@
-"""`qgs scene`."""
+"""The command `qgs scene`."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -10,50 +10,67 @@ import typer
 from qgs.cli.options import Device, Frames, Scale, SceneName, parse_size
 from qgs_photos.commands import refuse_filled, refuse_no_time
 
-app = typer.Typer(help="The best scene of photos in a given time.")
+app = typer.Typer(help="Make the best 3D scene from photos in a given time.")
 
 
 class Adjustment(StrEnum):
-    """Properties of a photo that can be optimised beside the Gaussians."""
+    """Properties of each photo that can be optimised together with the Gaussians."""
 
     POSES = "poses"
     EXPOSURE = "exposure"
 
 
 Minutes: TypeAlias = Annotated[
-    float, typer.Option(help="Time for everything, from the start to the last file.")
+    float,
+    typer.Option(help="Time in minutes, from the start of the command to the last file."),
 ]
 Model: TypeAlias = Annotated[
     str | None,
     typer.Option(
-        help="Trained model of the start, or none; default: of fewer than four photos a shipped "
-        "one, else none."
+        help="Trained model that makes the Gaussians to start from; none: start from depth "
+        "measured in the photos. Default: a shipped model for fewer than four photos, else none."
     ),
 ]
 PhotoSize: TypeAlias = Annotated[
     str | None,
-    typer.Option(metavar="HxW", help="Size of the photos; default: what the time allows."),
+    typer.Option(
+        metavar="HxW",
+        help="Height and width of the photos in the optimisation. Default: chosen for the time.",
+    ),
 ]
 Count: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="How many; default: what the time allows.")
+    int | None, typer.Option(min=1, help="Number of Gaussians. Default: chosen for the time.")
 ]
 Seconds: TypeAlias = Annotated[
-    float | None, typer.Option(help="Time of the optimisation alone, in place of --minutes.")
+    float | None,
+    typer.Option(help="Time of the optimisation alone in seconds; --minutes then has no effect."),
 ]
 Holdout: TypeAlias = Annotated[
-    str, typer.Option(help="Judge every n-th photo and optimise on the others, or none.")
+    str,
+    typer.Option(
+        help="Hold out every Nth photo: leave it out of the optimisation and score the result on "
+        "it. none: optimise on all photos."
+    ),
 ]
 Degree: TypeAlias = Annotated[
-    int, typer.Option(min=0, max=3, help="Harmonics of the colours, which grow with time.")
+    int,
+    typer.Option(
+        min=0,
+        max=3,
+        help="Final degree of the spherical harmonics of colours. 0: one colour from all "
+        "directions.",
+    ),
 ]
 Adjust: TypeAlias = Annotated[
     list[Adjustment] | None,
     typer.Option(
-        help="Optimise the camera of each photo too, or an affine map of its colours; repeatable."
+        help="Optimise a property of each photo together with the Gaussians. poses: its camera. "
+        "exposure: an affine map of its colours. Repeatable."
     ),
 ]
 Masks: TypeAlias = Annotated[
-    bool, typer.Option("--masks", help="What the photos' masks leave out is background.")
+    bool,
+    typer.Option("--masks", help="Treat pixels outside the masks of photos as background."),
 ]
 
 
@@ -75,11 +92,12 @@ def scene(
     scene_name: SceneName = None,
     device: Device = "auto",
 ) -> None:
-    """Make the best scene of photos in a given time: PLY, .splat, a page, held-out scores.
+    """Make the best 3D scene from photos in a given time.
 
-    The start is made of the photos, or of a model, and then optimised on the photos. What was
-    chosen is printed as a command that makes the scene again. Ctrl-C ends the optimisation and
-    writes what there is.
+    Writes a PLY, a .splat file, an HTML page, and scores on held-out photos. First Gaussians are
+    made from depth in the photos or by a model; then they are optimised on the photos. The settings
+    that were chosen are printed as a command that makes the scene again. Ctrl-C ends the
+    optimisation early and writes its result.
     """
     # imports took time already
     began = perf_counter() - process_time()

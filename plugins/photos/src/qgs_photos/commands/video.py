@@ -1,4 +1,4 @@
-"""`qgs video`."""
+"""The command `qgs video`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,40 +8,54 @@ import typer
 from qgs.cli.options import SceneName, Threads, parse_size, use_threads
 from qgs_photos.printing import say
 
-app = typer.Typer(help="A camera path through Gaussians, as a video.")
+app = typer.Typer(help="Render a camera path through Gaussians as a video.")
 
 
 @app.command()
 def video(
     source: Annotated[
-        Path, typer.Argument(help="What qgs reconstruct or qgs scene wrote, or a PLY file.")
+        Path,
+        typer.Argument(help="Folder that qgs reconstruct or qgs scene wrote, or a PLY file."),
     ],
     photos: Annotated[
         str | None,
-        typer.Argument(help="Photos of the scene, for qgs scene and PLY: the path follows them."),
+        typer.Argument(
+            help="Photos of the scene, whose cameras the path follows. Needed for a PLY file and a "
+            "folder of qgs scene."
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="New .mp4 (H.264) or .webp file.")] = Path("video.mp4"),
+    out: Annotated[
+        Path, typer.Option(help="New file for the video: .mp4 (H.264) or .webp.")
+    ] = Path("video.mp4"),
     path: Annotated[
         str,
         typer.Option(
-            help="orbit, spiral, walk, or a file: a camera path of nerfstudio's viewer or a "
-            "transforms file, in the world of the photos."
+            help="Camera path: orbit, spiral, walk, or a file in the world of the photos, either a "
+            "camera path of nerfstudio's viewer or a transforms file."
         ),
     ] = "orbit",
     size: Annotated[
         str | None,
-        typer.Option(metavar="HxW", help="Of the video; default: the photos', from 480 pixels on."),
+        typer.Option(
+            metavar="HxW",
+            help="Height and width of the video. Default: those of the photos, enlarged to at "
+            "least 480 pixels.",
+        ),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Of orbit, spiral and walk.")] = 8.0,
-    rate: Annotated[int, typer.Option(min=1, max=120, help="Frames a second.")] = 24,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, help="Length of an orbit, a spiral or a walk in seconds.")
+    ] = 8.0,
+    rate: Annotated[int, typer.Option(min=1, max=120, help="Frames per second.")] = 24,
     fov: Annotated[
         float | None,
-        typer.Option(min=1, max=170, help="Vertical angle of view, degrees; default: the photos'."),
+        typer.Option(
+            min=1, max=170, help="Vertical angle of view in degrees. Default: that of the photos."
+        ),
     ] = None,
     scene: SceneName = None,
     threads: Threads = None,
 ) -> None:
-    """Film a camera path through Gaussians, as mp4 or webp."""
+    """Render a camera path through Gaussians as a video (mp4 or webp)."""
     from rich.console import Console
 
     from qgs.files import refuse_existing
