@@ -32,7 +32,7 @@ from qgs.data.samples import Sample, make_sample, own_world
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
-from qgs.reconstruction.scale import at_factors, constant_scale, find_scale
+from qgs.reconstruction.scale import at_factor, constant_scale, find_scale
 from qgs.types import Cameras, Views
 
 SYSTEMS = ("landmark", "locus", "tokengs")
@@ -106,9 +106,8 @@ def rendered(
 
     seconds: of a refinement on the inputs.
     """
-    scale = torch.tensor([factor])
-    inputs = at_factors(sample.inputs, scale)
-    cameras = at_factors(sample.targets, scale).cameras
+    inputs = at_factor(sample.inputs, factor)
+    cameras = at_factor(sample.targets, factor).cameras
     with torch.no_grad():
         gaussians = model.forward(inputs).gaussians
     if seconds:

@@ -142,27 +142,38 @@ def _close_rows(state, live):
 
 
 @kernel
+def _take(state, i, dx, power_of, opacity, options):
+    """Let a splat cover the pixel at offset `i` of the buffer `state`, at distance dx from it.
+
+    Alpha is opacity * 2^power with power = (quadratic dx + linear) dx + constant. Returns alpha
+    before its limits, alpha, the transmittance before the splat, and the splat's weight. options:
+    alpha_min, alpha_cap, transmittance_min.
+    """
+    linear, quadratic, constant = power_of
+    alpha_min, alpha_cap, transmittance_min = options
+    power = max(min((quadratic * dx + linear) * dx + constant, _ZERO), _LOWEST)
+    full = opacity * _exp2(power)
+    before = state[i]
+    live = state[i + _BLOCKS[1]]
+    alpha = min(full, alpha_cap) if full >= alpha_min else _ZERO
+    live = live if before - before * alpha > transmittance_min else _ZERO
+    alpha = alpha * live
+    weight = before * alpha
+    state[i] = before - weight
+    state[i + _BLOCKS[1]] = live
+    return full, alpha, before, weight
+
+
+@kernel
 def _blend_row(state, base, dx0, power_of, look, options):
     """Blend a splat into one row of a tile, at offset `base` of the buffer `state`.
 
-    At horizontal distance dx from the splat, alpha is opacity * 2^power with
-    power = (quadratic dx + linear) dx + constant. dx0: distance of the first lane. look: opacity,
-    r, g, b, depth. options: alpha_min, alpha_cap, transmittance_min.
+    dx0: distance of the first lane from the splat. look: opacity, r, g, b, depth.
     """
-    (linear, quadratic, constant), (opacity, r, g, b, z) = power_of, look
-    alpha_min, alpha_cap, transmittance_min = options
+    opacity, r, g, b, z = look
     for lane in range(_LANES):
         i = base + lane
-        dx = dx0 + np.float32(lane)
-        power = max(min((quadratic * dx + linear) * dx + constant, _ZERO), _LOWEST)
-        alpha = opacity * _exp2(power)
-        before = state[i]
-        live = state[i + _BLOCKS[1]]
-        alpha = min(alpha, alpha_cap) if alpha >= alpha_min else _ZERO
-        live = live if before - before * alpha > transmittance_min else _ZERO
-        weight = before * alpha * live
-        state[i] = before - weight
-        state[i + _BLOCKS[1]] = live
+        _, _, _, weight = _take(state, i, dx0 + np.float32(lane), power_of, opacity, options)
         state[i + _BLOCKS[2]] += weight * r
         state[i + _BLOCKS[3]] += weight * g
         state[i + _BLOCKS[4]] += weight * b
@@ -177,21 +188,11 @@ def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
     The blocks are h, h dx, h dy, h dx dx, h dx dy, h dy dy, where h is the gradient of the power to
     base e; then the gradients of depth, r, g, b. dx, dy: distance of the pixel from the splat.
     """
-    (linear, quadratic, constant), (opacity, r, g, b, z) = power_of, look
-    alpha_min, alpha_cap, transmittance_min = options
+    opacity, r, g, b, z = look
     for lane in range(_LANES):
         i = base + lane
         dx = dx0 + np.float32(lane)
-        power = max(min((quadratic * dx + linear) * dx + constant, _ZERO), _LOWEST)
-        full = opacity * _exp2(power)
-        before = state[i]
-        live = state[i + _BLOCKS[1]]
-        alpha = min(full, alpha_cap) if full >= alpha_min else _ZERO
-        live = live if before - before * alpha > transmittance_min else _ZERO
-        alpha = alpha * live
-        weight = before * alpha
-        state[i] = before - weight
-        state[i + _BLOCKS[1]] = live
+        full, alpha, before, weight = _take(state, i, dx, power_of, opacity, options)
         g_r = state[i + _BLOCKS[3]]
         g_g = state[i + _BLOCKS[4]]
         g_b = state[i + _BLOCKS[5]]
@@ -201,7 +202,7 @@ def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
         rest = state[i + _BLOCKS[2]] - weight * value
         state[i + _BLOCKS[2]] = rest
         slope = before * value - rest / (_ONE - alpha)
-        h = slope * alpha if full <= alpha_cap else _ZERO
+        h = slope * alpha if full <= options[1] else _ZERO
         hx = h * dx
         hy = h * dy
         totals[lane] += h
@@ -291,7 +292,7 @@ def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out,
     """Blend all splats (G, 9) of one image in the tile rows from tile_rows[0] up to tile_rows[1].
 
     If `backward` is false, it fills sums (5, H, W). If true, it reads them and adds the gradients
-    of the splats to out (G, 10). slopes: gradients of `sums`. options: see `_blend_row`.
+    of the splats to out (G, 10). slopes: gradients of `sums`. options: see `_take`.
     """
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)

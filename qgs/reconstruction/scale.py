@@ -7,15 +7,14 @@ photos that are no inputs are scored too.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean
 
 import torch
-from torch import Tensor
 
-from qgs.containers import map_tensors
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.samples import Sample, make_sample
+from qgs.data.samples import make_sample
 from qgs.domain import TOLERANCE, Domain
 from qgs.geometry.poses import look_at_depth, scaled
 from qgs.metrics.baselines import pose_distance
@@ -46,8 +45,6 @@ PENALTY = 5.0
 but the inputs is scored."""
 POOR = 14.0
 """PSNR in dB of the scored photos below which no scale fits; novel views then average 12 dB."""
-PIXELS = 2**18
-"""Largest number of input pixels in one forward pass, which limits memory."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +127,16 @@ def find_scale(
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))
     # Places are thirds of a step, so that the finer search lies between those of the first.
-    trial = _Trial(model, sample, low, ratio ** (1 / 3), 0.0 if further else nearest)
+    trial = _Trial(
+        model,
+        sample.inputs.joined(sample.targets).to(next(model.parameters()).device),
+        len(given),
+        # Photos that are not given count twice: inputs alone mislead.
+        [1 / len(given) for _ in given] + [2 / len(further) for _ in further],
+        low,
+        ratio ** (1 / 3),
+        0.0 if further else nearest,
+    )
     best = trial.best(range(0, 3 * count, 3))
     if ratio > 1:
         while (end := trial.past(best)) and len(trial.tried) < MOST:
@@ -139,10 +145,10 @@ def find_scale(
         best = trial.best([best + trial.vertex(best)])
     return FoundScale(
         factor=trial.factor(best),
-        psnr=trial.psnr(best),
+        psnr=trial.tried[best],
         further=further,
         names=[scene.frame_name(frame) for frame in further],
-        tried=sorted((trial.factor(place), trial.psnr(place)) for place in trial.tried),
+        tried=sorted((trial.factor(place), found) for place, found in trial.tried.items()),
     )
 
 
@@ -188,50 +194,37 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
 class _Trial:
     """Scores of factors of camera positions; the factor of a place is low * step ** place.
 
-    sample: its cameras have the factor 1. nearest: factor below which PENALTY lowers the score.
-    tried: mean PSNR of the inputs and mean PSNR of further photos, by place.
+    views: (1, V), whose cameras have the factor 1; the first `inputs` of them are given to the
+    model. weights: of the views in the mean PSNR. nearest: factor below which PENALTY lowers the
+    score. tried: mean PSNR by place.
     """
 
     model: QueryGaussianModel
-    sample: Sample
+    views: Views
+    inputs: int
+    weights: Sequence[float]
     low: float
     step: float
     nearest: float
-    tried: dict[float, tuple[float, float]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        device = next(self.model.parameters()).device
-        self.inputs = self.sample.inputs.to(device)
-        self.further = self.sample.targets.to(device)
+    tried: dict[float, float] = field(default_factory=dict)
 
     def factor(self, place: float) -> float:
         return self.low * self.step**place
 
-    def psnr(self, place: float) -> float:
-        # Photos that are not given count twice: inputs alone mislead.
-        own, further = self.tried[place]
-        return own if math.isnan(further) else (own + 2 * further) / 3
-
     def score(self, place: float) -> float:
         below = self.nearest / self.factor(place)
-        found = self.psnr(place) - PENALTY * math.log(max(below, 1.0))
+        found = self.tried[place] - PENALTY * math.log(max(below, 1.0))
         return -math.inf if math.isnan(found) else found
 
-    def best(self, places: Sequence[float]) -> float:
+    def best(self, places: Iterable[float]) -> float:
         """Score these places; return the best place of all that were scored so far."""
-        new = [place for place in places if place not in self.tried]
-        each = max(PIXELS // self.inputs.images[:, :, 0].numel(), 1)
-        for start in range(0, len(new), each):
-            part = new[start : start + each]
-            factors = self.inputs.images.new_tensor([self.factor(place) for place in part])
-            gaussians = self.model(at_factors(self.inputs, factors)).gaussians
-            columns = []
-            for views in (self.inputs, self.further):
-                cameras = at_factors(views, factors).cameras
-                empty = not views.images.shape[1]
-                seen = views.images if empty else self.model.render(gaussians, cameras).rgb
-                columns.append(psnr(seen, views.images).mean(1).expand(len(part)).tolist())
-            self.tried.update(zip(part, zip(*columns, strict=True), strict=True))
+        for place in places:
+            if place in self.tried:
+                continue
+            views = at_factor(self.views, self.factor(place))
+            gaussians = self.model(views.select(slice(self.inputs))).gaussians
+            seen = self.model.render(gaussians, views.cameras).rgb
+            self.tried[place] = fmean(psnr(seen, views.images)[0].tolist(), self.weights)
         return max(self.tried, key=self.score)
 
     def past(self, place: float) -> Sequence[float]:
@@ -249,8 +242,7 @@ class _Trial:
         return 0.5 * (left - right) / bend if bend < 0 else 0.0
 
 
-def at_factors(views: Views, factors: Tensor) -> Views:
-    """Repeat views (1, V) as (F, V), with camera positions multiplied by each of `factors` (F,)."""
-    many = map_tensors(lambda tensor: tensor.expand(len(factors), *tensor.shape[1:]), views)
-    c2w = scaled(many.cameras.c2w, factors[:, None])
-    return replace(many, cameras=replace(many.cameras, c2w=c2w))
+def at_factor(views: Views, factor: float) -> Views:
+    """Return views whose camera positions are multiplied by `factor`."""
+    c2w = scaled(views.cameras.c2w, factor)
+    return views.replace(cameras=views.cameras.replace(c2w=c2w))

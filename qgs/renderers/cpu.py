@@ -80,19 +80,18 @@ class _Splat(torch.autograd.Function):
 
         *tensors, size, config = inputs
         tensors = [tensor.contiguous() for tensor in tensors]
-        colors, means, scales, quats, opacities, c2w, lenses = _arrays(*tensors)
-        batch, views = c2w.shape[:2]
-        splats = tensors[0].new_empty((batch, views, means.shape[1], kernels.SPLAT_FIELDS))
+        colors, *geometry = _arrays(*tensors)
+        opacities = geometry[3]
+        batch, views = tensors[5].shape[:2]
+        splats = tensors[0].new_empty((batch, views, opacities.shape[1], kernels.SPLAT_FIELDS))
         sums = splats.new_empty((batch, views, kernels.SUMS, *size))
         rows, out = _arrays(splats, sums)
         projection, blending = _limits(config, size)
         chunks, stripes = _parts(rows, size)
 
         def project(scene: int, chunk: _Part) -> None:
-            project_unit(
-                means[scene], scales[scene], quats[scene], opacities[scene], c2w[scene],
-                lenses[scene], chunk[1], projection, rows[scene],
-            )  # fmt: skip
+            own = [array[scene] for array in geometry]
+            project_unit(*own, chunk[1], projection, rows[scene])
 
         def blend(scene: int, view: int, stripe: _Part) -> None:
             image = scene, view
