@@ -1,1 +1,1 @@
-"""Training: the loop, one step, saved states, trackers."""
+"""Training: the loop, one step, the files of a run, and experiment trackers."""

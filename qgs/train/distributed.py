@@ -1,4 +1,4 @@
-"""Devices and processes of a run; requests to stop."""
+"""Device and processes of a training run, and signals that ask it to stop."""
 
 import os
 import signal
@@ -19,16 +19,18 @@ from accelerate.utils import (
 )
 
 TIMEOUT = timedelta(hours=24)
-"""Longest wait of the other processes while one evaluates or saves.
+"""Longest time that processes wait for each other, such as while one evaluates or saves.
 
-NCCL's default of 10 minutes would end such runs. If a process dies, the launcher ends the others.
+NCCL's default of 10 minutes would end a run with a long evaluation. If a process dies, the launcher
+ends all others.
 """
 
 
 def make_accelerator(device: str, unread: bool) -> Accelerator:
-    """Return an Accelerator for the processes that a launcher started (DDP), or for this one alone.
+    """Return an Accelerator for all processes that a launcher started (DDP), or for a single one.
 
-    unread: some parameters never get a gradient, so DDP must search for them.
+    device: as for `choose_device`. unread: some parameters never get a gradient, so DDP must search
+    for them.
     Raises ValueError if the launcher asks for anything but DDP.
     """
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
@@ -51,10 +53,11 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def choose_device(wanted: str, say: Callable[[str], None] = print) -> str:
-    """Return "cpu" or "cuda" for one of DEVICES.
+    """Return "cpu" or "cuda" for the name "auto", "cpu" or "cuda".
 
     "auto" chooses CUDA if a CUDA device exists and gsplat is installed. If only gsplat is missing,
-    `say` gets a note. Raises ValueError for another name, and for "cuda" without a CUDA device.
+    `say` gets a message on how to use CUDA. Raises ValueError for an unknown name, and for "cuda"
+    without a CUDA device.
     """
     if wanted not in DEVICES:
         raise ValueError(f"the device must be one of {', '.join(DEVICES)}, got {wanted!r}")
@@ -78,12 +81,12 @@ def choose_device(wanted: str, say: Callable[[str], None] = print) -> str:
 
 
 StopRequest: TypeAlias = list[signal.Signals]
-"""Signals that asked the run to stop. The list is empty, and therefore false, until one arrives."""
+"""Signals that asked the run to stop. The list is empty until a signal arrives."""
 
 
 @contextmanager
 def stop_requests(quiet: bool) -> Iterator[StopRequest]:
-    """Collect SIGINT and SIGTERM in a list inside the block; print the first unless `quiet`.
+    """Collect the signals SIGINT and SIGTERM inside the block; print the first unless `quiet`.
 
     Does nothing outside the main thread, because Python handles signals only there.
     """

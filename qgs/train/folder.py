@@ -1,4 +1,4 @@
-"""Folder of one training run: its files, saving to it, and continuing a run from it."""
+"""Folder of a training run: its files, and how the run is saved and continued."""
 
 import json
 import os
@@ -24,7 +24,7 @@ from qgs.recipe import Recipe, resolve
 from qgs.recipe.recipe import differing_options
 
 State: TypeAlias = Mapping[str, Any]
-"""Tensors, JSON values and mappings of them, by name."""
+"""Tensors, JSON values, and nested mappings of such values, by name."""
 
 HISTORY = "history.jsonl"
 EVALUATIONS = "evaluations.jsonl"
@@ -60,14 +60,14 @@ model learns. If the budget changes, the learning rate follows the new budget fr
 
 
 class OtherRunError(ValueError):
-    """Error: a run cannot be continued with this recipe, these processes or this data."""
+    """Error: a run cannot be continued with the given recipe, processes or data."""
 
 
 class RunFolder:
     """Paths of the files of a run; the files need not exist yet.
 
-    checkpoint: the latest good weights. checkpoint_ema: their moving average, if the recipe asks
-    for one. state: everything needed to continue the run. evaluation: output of `qgs eval`.
+    checkpoint: latest good weights. checkpoint_ema: moving average of the weights, if the recipe
+    asks for one. state: everything needed to continue the run. evaluation: output of `qgs eval`.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -124,18 +124,18 @@ class RunFolder:
             leftover.unlink()
 
     def append(self, *records: Mapping[str, Any], name: str = HISTORY) -> None:
-        """Append one line per record to the history or to the file `name`; all lines or none."""
+        """Append one line per record to the file `name`; on failure no line is added."""
         path = self.path / name
         # Opened for each call: readers see every step, and a kill loses no buffered lines.
         with naming_full_disk(path), path.open("a", encoding="utf-8") as file:
             file.write("".join(json.dumps(record) + "\n" for record in records))
 
     def history(self) -> list[dict[str, float]]:
-        """Return one record per optimiser step so far; skipped steps have only finite numbers."""
+        """Return one record per optimiser step so far, without values that are not finite."""
         return read_records(self.history_file)
 
     def cut_records(self, step: int) -> None:
-        """Drop the records of later steps than `step`, and lines that are damaged."""
+        """Drop records of steps after `step`, and damaged lines."""
         for path in (self.history_file, self.path / EVALUATIONS):
             if path.exists():
                 kept = [record for record in read_records(path) if record["step"] <= step]
@@ -154,7 +154,8 @@ class Saver:
     """Writer of the checkpoint and the state of a run; only the main process writes.
 
     stateful: objects to save and restore besides the weights, by name. Each has `state()`, which
-    returns a State, and `load_state(state)`, which restores it. "ema" also gets a checkpoint.
+    returns a State, and `load_state(state)`, which restores it. The state of the entry "ema" is
+    saved as a checkpoint too.
     Each file is written completely or not at all. All processes must call each method together.
     """
 
@@ -165,8 +166,8 @@ class Saver:
     def save(self, step: int, good: tuple[int, Weights] | None = None) -> None:
         """Save the run after `step` optimiser steps.
 
-        good: steps and weights to save as the checkpoint instead of the present ones. The
-        checkpoint of the moving average then stays as it is.
+        good: steps and weights to save as the checkpoint in place of the present weights. The
+        checkpoint of the moving average is then not written.
         """
         states: dict[str, State] = {"weights": unique_tensors(self.model)}
         states |= {name: one.state() for name, one in self.stateful.items()}
@@ -183,13 +184,16 @@ class Saver:
         wait_for_everyone()
 
     def save_checkpoint(self, step: int, weights: Weights) -> None:
-        """Save a checkpoint with the given weights instead of the present ones."""
+        """Save `weights`, reached after `step` steps, as the checkpoint of the run."""
         if PartialState().is_main_process:
             self._write_checkpoint(self.folder.checkpoint, step, weights)
         wait_for_everyone()
 
     def restore(self, states: Mapping[str, State]) -> None:
-        """Restore the weights and every entry of `stateful`; raises CheckpointError."""
+        """Restore the weights and every entry of `stateful`.
+
+        Raises CheckpointError if `states` does not fit this run.
+        """
         load_weights(self.model, states.get("weights", {}), self.folder.state)
         for name, one in self.stateful.items():
             try:
@@ -215,7 +219,7 @@ class Saver:
 
 
 def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, State]) -> None:
-    """Write `states` to `path`, completely or not at all; recipe: the resolved tree."""
+    """Write `states` to `path`, completely or not at all. recipe: resolved recipe of the run."""
     # safetensors refuses views and tensors that share memory.
     tensors = {
         place: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
@@ -226,7 +230,10 @@ def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, Stat
 
 
 def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
-    """Read a file of `write_state`; raises FileNotFoundError, CheckpointError, RecipeError."""
+    """Read a file that `write_state` wrote; return its recipe and states.
+
+    Raises FileNotFoundError, CheckpointError for a damaged file, and RecipeError.
+    """
     with TensorFile(path) as file:
         tensors = file.read()
 
@@ -241,9 +248,9 @@ def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
 
 
 def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
-    """Return the states to continue the run in `folder` from; empty to start it at step 0.
+    """Return the saved states of the run in `folder`; none if it must start at step 0.
 
-    Raises OtherRunError if `recipe` differs from the run's in more than FREE, and CheckpointError
+    Raises OtherRunError if `recipe` and the run's recipe differ in more than FREE, CheckpointError
     if the state cannot be read.
     """
     if folder.state.is_file():

@@ -1,4 +1,4 @@
-"""Checks that stop a run: a dead model, NaN or infinite steps, and too little memory."""
+"""Checks that stop a run: dead model, NaN or infinity in a step, and too little memory."""
 
 import logging
 import math
@@ -25,22 +25,22 @@ from qgs.wording import listed
 _log = logging.getLogger(__name__)
 
 EMPTY_ALPHA = 2e-3
-"""Mean alpha below which a rendering shows the background alone."""
+"""Mean alpha of a rendering below which it counts as empty: it shows only the background."""
 
 FLAT = 1 / 255
-"""Mean deviation from the background below which a rendering shows the background alone."""
+"""Mean |rgb - background| of a rendering below which it counts as flat background."""
 
 NO_GRADIENT = 1e-8
 """Gradient norm below which a model no longer learns."""
 
 LOSS_OF_QUALITY = 1.0
-"""Largest drop in dB from the best PSNR so far for weights that still count as good.
+"""Largest drop in dB below the best PSNR so far at which weights still count as good.
 
-Both values are running means of about ten steps.
+The present and the best PSNR are running means of about ten steps.
 """
 
 MAX_SKIPPED = 10
-"""Most steps in a row that may be skipped before training stops."""
+"""Largest number of steps in a row that are skipped. One more stops training."""
 
 _TOO_FAST = (
     "\n  - a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
@@ -69,11 +69,11 @@ class TrainingError(RuntimeError):
 
 
 class CollapseError(TrainingError):
-    """Error for a model that died; the last good weights are kept."""
+    """Error for a model that no longer renders or learns; the last good weights are kept."""
 
 
 class NonFiniteError(TrainingError):
-    """Error for a step with NaN or infinity; the run is saved as it was before that step."""
+    """Error for a step with NaN or infinity; the run was saved as it was before this step."""
 
 
 class OutOfMemoryError(TrainingError):
@@ -82,13 +82,14 @@ class OutOfMemoryError(TrainingError):
 
 @dataclass
 class Guard:
-    """Guard that stops a run that is dead or not finite, and keeps good weights.
+    """Guard that stops a run with a dead model or values that are not finite.
 
-    All processes must call each method together. `step` counts finished optimiser steps. Methods
-    that save raise CollapseError if weights are not finite.
+    It keeps copies of the last good weights. A model is dead if it no longer renders or learns, see
+    `SignsOfLife`. All processes must call each method together. `step` is the number of finished
+    optimiser steps. Methods that save raise CollapseError if weights are not finite.
 
-    training_pass: the module, not wrapped by accelerate. repeat: computes the gradients of a step
-    again. skipped: number of latest steps in a row that were not finite.
+    training_pass: the module, not wrapped by accelerate. repeat: function that computes the
+    gradients of a step again. skipped: number of latest steps in a row that were not finite.
     """
 
     training_pass: TrainingPass
@@ -109,11 +110,12 @@ class Guard:
         self.signs = SignsOfLife(**state["detector"])
 
     def refuse_nonfinite(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
-        """Raise an error for the step after `step`, which is not finite, or skip that step.
+        """Skip the step after `step`, which is not finite, or raise an error for it.
 
-        The step is repeated to find the first bad tensor. A skipped step logs a warning. Otherwise
-        the run is saved as it was before the step and NonFiniteError is raised, or CollapseError if
-        the model was already dead.
+        Its gradients are computed again to find the first tensor that is not finite.
+        With on_nonfinite "skip", up to MAX_SKIPPED steps in a row are skipped with a warning.
+        Otherwise the run is saved as it was before the step, and NonFiniteError is raised;
+        CollapseError if the model was already dead. symptom: the numbers that are not finite.
         """
         self.skipped += 1
         # All processes repeat the step: its collective operations need everyone.
@@ -133,10 +135,10 @@ class Guard:
         )
 
     def watch(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Record the numbers of `step`, all finite; copy the weights if they are good and due.
+        """Record the numbers of `step`, all finite; copy the weights if they are good.
 
-        Raises CollapseError if all steps of the last window were dead, or if weights to copy are
-        not finite.
+        Raises CollapseError if the last `training.collapse_window` steps were dead, or if weights
+        to copy are not finite.
         """
         self.skipped = 0
         self.signs.observe(numbers)
@@ -151,7 +153,7 @@ class Guard:
     def save(self, step: int, ends: bool = False) -> None:
         """Save the run; for a dead model the checkpoint keeps the last good weights.
 
-        ends: the budget is used up; a dead model then raises CollapseError.
+        ends: the training budget is used up; then a dead model raises CollapseError.
         """
         # A run shorter than a window is dead when all of its steps were.
         if self.signs.dead < min(self.config.collapse_window, step):
@@ -167,8 +169,8 @@ class Guard:
     def memory_explained(self, step: int, saves: bool = False) -> Iterator[None]:
         """Raise OutOfMemoryError if the block runs out of memory.
 
-        saves: try to save the run before, which a single process can do if the block does not
-        change weights.
+        saves: try to save the run first. Only for blocks that do not change weights; runs with
+        several processes are not saved.
         """
         try:
             yield
@@ -195,7 +197,7 @@ class Guard:
     def _collapse(self, step: int, problem: str = "") -> NoReturn:
         """Save the last good weights and raise CollapseError.
 
-        problem: values that are not finite; "" for dead steps.
+        problem: what is not finite, for the message; "" if steps were dead.
         """
         causes = NONFINITE_CAUSES if problem else COLLAPSE_CAUSES
         problem = problem or f"for the last {self.signs.dead} steps {self.signs.symptom}"
@@ -209,10 +211,12 @@ class Guard:
 
 @dataclass
 class SignsOfLife:
-    """Counter of dead steps. dead: number of dead steps in a row; symptom: reason for the latest.
+    """Counter of dead steps, in which the model does not render or learn.
 
-    A step is dead if nothing is drawn (mean alpha under EMPTY_ALPHA), if the gradient has vanished,
-    or if the images show only the background after they once showed more.
+    A step is dead if the rendering is empty (mean alpha below EMPTY_ALPHA), if the gradient has
+    vanished (norm below NO_GRADIENT), or if the images show only the background although earlier
+    images showed more. dead: number of latest steps in a row that were dead. symptom: why the
+    latest step was dead. has_drawn: an earlier image clearly differed from the background.
     """
 
     dead: int = 0
@@ -238,12 +242,12 @@ class SignsOfLife:
 class GoodWeights:
     """Copies of the weights in host memory from the last two times that the model was healthy.
 
-    A collapse is noticed late, so the newer copy may already be damaged. The older one is the
-    latest that is certainly good. Copies are made every fifth of a window at first, and every
-    window in long runs. No copy is made while the images are worse than before.
+    A collapse is noticed late, so the newer copy may already be damaged, and only the older copy is
+    trusted. The interval between copies is a fifth of `training.collapse_window` at first, and
+    grows to the whole window in long runs. No copy is made while the images are worse than before.
 
-    Only the main process holds copies. psnr: running mean in dB. best: largest `psnr` so far when
-    a copy was due.
+    Only the main process holds copies. psnr: running mean of the steps' PSNR in dB. best: largest
+    `psnr` so far at the times of possible copies.
     """
 
     model: nn.Module
@@ -266,7 +270,12 @@ class GoodWeights:
         self.psnr = psnr if self.psnr is None else self.psnr + (psnr - self.psnr) / 10
 
     def due(self, step: int, window: int) -> bool:
-        """Return whether to copy the weights after `step` steps; the same in all processes."""
+        """Return whether to copy the weights after `step` steps.
+
+        They are copied if the last copy is old enough and the PSNR is good.
+
+        window: `training.collapse_window`, in steps. All processes get the same result.
+        """
         # Rarer in long runs: each copy moves the whole model to the host.
         interval = max(window // 5, min(window, step // 10))
         newest, _ = self.copies[-1]
@@ -276,7 +285,7 @@ class GoodWeights:
         return self.psnr >= self.best - LOSS_OF_QUALITY
 
     def refresh(self, step: int) -> None:
-        """Copy the present weights, after `step` optimiser steps."""
+        """Copy the present weights, reached after `step` optimiser steps."""
         present = unique_tensors(self.model) if PartialState().is_main_process else {}
         # In host memory, because training needs the device's.
         copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
@@ -302,10 +311,10 @@ def not_finite(numbers: Mapping[str, float]) -> str:
 def first_bad_tensor(
     training_pass: nn.Module, batches: Sequence[Batch], repeat: Callable[[], Any]
 ) -> str:
-    """Return text about the first tensor that is not finite while `repeat` computes a step.
+    """Find the first tensor that is not finite while `repeat` computes a step; return text on it.
 
     The text names the tensor and the samples of its batch; it is "" if all tensors are finite.
-    Torch's anomaly mode would name an operation instead of a module. It also misses infinities, and
+    Torch's anomaly mode is not used: it names an operation, not a module, misses infinities, and
     raises in the middle of a step while other processes wait.
     """
     found: list[str] = []
@@ -313,7 +322,7 @@ def first_bad_tensor(
     batch = batches[0]
 
     def see(name: str, value: Any) -> None:
-        """Check `value`: a tensor, or nested mappings, sequences and containers of tensors."""
+        """Check `value`, a tensor or a nested container of tensors. name: for the message."""
         for path, tensor in named_tensors(value, name):
             bad = tensor[~tensor.isfinite()]
             if bad.numel() and not found:

@@ -1,4 +1,4 @@
-"""Option `init_from`: training that starts from the weights of another training."""
+"""Option `init_from`: training that starts from the weights of a checkpoint."""
 
 import torch
 from torch import Tensor
@@ -16,18 +16,18 @@ from qgs.recipe import Recipe
 from qgs.recipe.recipe import differing_predictions
 
 _QUERIES = "queries."
-_KEPT = ", the first ones are kept, additional ones are noisy copies"
+_KEPT = ": the first queries are kept, additional queries are noisy copies"
 
 
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
-    """Give `model`, freshly built from `recipe`, the weights of `recipe.init_from`, if any.
+    """Load the weights of the checkpoint `recipe.init_from` into `model`; nothing if it is null.
 
-    `init_from` is a name that `CheckpointFile` accepts. Queries grow or shrink by `Queries.resized`
-    with random numbers from the recipe's seed. Encoder, feedback and head adapt their weights with
+    model: newly built from `recipe`. The number of queries is adapted by `Queries.resized`, with
+    random numbers from the recipe's seed. Encoder, feedback and head adapt their weights with
     `ModelComponent.adapted`. All other weights must have the same names and shapes.
 
-    Returns lines that list resized weights, new weights, and options that change the Gaussians
-    predicted from the same weights. Raises FileNotFoundError, or CheckpointError with all
+    Returns lines for the user: resized weights, new weights, and differing options of the two
+    recipes that change the predictions. Raises FileNotFoundError, or CheckpointError that lists all
     differences.
     """
     if recipe.init_from is None:
@@ -51,10 +51,10 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     own = _comparable(unique_tensors(model), model.queries.count)
     if found := differing_tensors(_comparable(weights, count), own):
         first = (
-            f"init_from: {path} does not fit this recipe; only the number of queries, sizes that "
-            "encoder and head can adapt (of patches, to a multiple) and new feedback may differ:"
+            f"init_from: {path} does not fit this recipe. Only the number of queries, the patch "
+            "size (to a multiple), sizes that the head can adapt, and new feedback may differ:"
         )
-        trained = "options of the checkpoint's model that differ:"
+        trained = "options of the checkpoint's recipe that differ:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
     generator = torch.Generator().manual_seed(recipe.seed)
     resized = model.queries.resized(_part(_QUERIES, learned), generator)
@@ -67,16 +67,16 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         for name, shape in shapes_of(weights).items()
         if shape != before.get(name)
     ]
-    return [f"weights start from {path}", *changes, *(f"learned with {o}" for o in options)]
+    return [f"weights start from {path}", *changes, *(f"trained with {o}" for o in options)]
 
 
 def _part(prefix: str, weights: Weights) -> dict[str, Tensor]:
-    """Return the weights of one part of the model, by their names inside that part."""
+    """Return the weights whose names begin with `prefix`, by the rest of their names."""
     return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 
 def _comparable(tensors: Weights, count: int | None) -> Shapes:
-    """Return shapes by name, with -1 for the number of queries `count`, which may differ."""
+    """Return shapes by name. -1 replaces the number of queries `count`, which may differ."""
     return {
         name: (-1, *shape[1:]) if name.startswith(_QUERIES) and shape[:1] == (count,) else shape
         for name, shape in shapes_of(tensors).items()

@@ -24,7 +24,7 @@ from qgs.train.tracking import Trackers
 from qgs.types import Rendering
 
 SAMPLES = 4
-"""Number of samples that are drawn, the same ones each time."""
+"""Number of samples in each picture; all pictures of a run show the same samples."""
 
 
 def judge(
@@ -40,7 +40,7 @@ def judge(
 
     Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png. Restores the model's mode.
     Raises InterruptedError after a scene if a stop is requested, and the errors of `evaluate`.
-    step: optimiser steps so far.
+    step: optimiser steps so far. average: None without a moving average.
     """
 
     def between_scenes(done: int, wanted: int) -> None:
@@ -81,7 +81,7 @@ def judge(
 
 
 def _row(sample: Sample, rendering: Rendering) -> Picture:
-    """Draw a sample: the first target view, its rendering and its depth."""
+    """Return a picture of the first target view, its rendering and its depth, side by side."""
     depth = rendering.depth[0, 0]
     images = (sample.targets.images[0, 0], rendering.rgb[0, 0])
     return side_by_side([*map(rgb_picture, images), depth_picture(depth, *depth_range(depth))])

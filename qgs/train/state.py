@@ -1,4 +1,4 @@
-"""State of a run besides its weights: steps, random states, moments, averaged weights."""
+"""State of a run besides its weights: step counts, random states, moments, averaged weights."""
 
 import math
 import time
@@ -23,9 +23,10 @@ def make_optimizer(
 ) -> torch.optim.Optimizer:
     """Build torch's optimiser, with parameters grouped by weight decay and learning rate factor.
 
-    The innermost component around a parameter decides whether it decays (`ModelComponent.decays`).
-    Outside of components, all parameters but 1-d ones decay. A shared parameter counts under its
-    first name. factors: the result of `Recipe.rate_factors`. A factor of 0 freezes a parameter.
+    The innermost component that has a parameter decides whether weight decay applies to it
+    (`ModelComponent.decays`). Outside of components, it applies to all but 1-d parameters. A shared
+    parameter has its first name. factors: learning-rate factors by name of the parameter, the
+    result of `Recipe.rate_factors`; 0 freezes a parameter.
     Raises ValueError if all parameters are frozen.
     """
     groups: defaultdict[tuple[bool, float], list[nn.Parameter]] = defaultdict(list)
@@ -73,19 +74,19 @@ class Counters:
 
     @property
     def used(self) -> float:
-        """Fraction of the budget that is used: the larger of those for steps and seconds."""
+        """Used fraction of the budget: of the steps or of the seconds, whichever is larger."""
         of_seconds = self.seconds / (self.config.seconds or math.inf)
         return max(self.step / self.config.steps, of_seconds)
 
     def every(self, steps: int) -> bool:
-        """Return True at every `steps`-th step; never if `steps` is 0."""
+        """Return whether the present step is a multiple of `steps`; False if `steps` is 0."""
         return bool(steps) and self.step % steps == 0
 
     def read(self, measured: Mapping[str, Tensor]) -> dict[str, float]:
-        """Return the means of a step's numbers over processes, and advance the clock.
+        """Return the means of the values `measured` over all processes, and advance the clock.
 
-        The host waits for the device here, so the clock measures the whole step. The time is also a
-        mean over processes, so that all processes use up a time budget together.
+        The host waits for the device here, so the clock measures the whole step. The clock advances
+        by the mean time of all processes, so that all use up a time budget at the same step.
         """
         now = time.perf_counter()
         values = torch.stack([value.float() for value in measured.values()])
@@ -97,7 +98,7 @@ class Counters:
         return dict(zip(measured, numbers, strict=True))
 
     def state(self) -> dict[str, Any]:
-        """Return the counts, and the batch size and scenes that they depend on."""
+        """Return step, seconds, batch size, and the fingerprint of the scenes."""
         return {
             "step": self.step,
             "seconds": self.seconds,
@@ -129,7 +130,7 @@ class Counters:
 class RandomStates:
     """States of torch's random generators in every process, by rank.
 
-    Components draw from no other generators.
+    Components draw random numbers from no other generators.
     """
 
     def state(self) -> dict[str, Any]:
@@ -140,7 +141,7 @@ class RandomStates:
         return {str(rank): states for rank, states in enumerate(gather_object([own]))}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore this process's generators; a rank without a saved state keeps its own."""
+        """Restore the generators of this process; a rank without a saved state changes nothing."""
         rank = PartialState().process_index
         # A run may continue with more processes than before.
         if rank and str(rank) not in state:
@@ -154,8 +155,8 @@ class RandomStates:
 class OptimizerState:
     """State of torch's optimiser (moments, steps), by the names of parameters.
 
-    Torch's own `state_dict` numbers parameters by their place in the groups. The helpers of
-    `torch.distributed` use names too, but they invent moments for parameters without a gradient.
+    Torch's own `state_dict` numbers parameters by their position in the groups, which may change.
+    The helpers of `torch.distributed` invent moments for parameters that never had a gradient.
     """
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
@@ -166,15 +167,15 @@ class OptimizerState:
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
-        """Return the values of every parameter, by name."""
+        """Return the optimiser's values, such as moments, of every parameter by name."""
         kept = self._optimizer.state_dict()["state"]
         # A parameter without a gradient has no moments; its empty mapping records that.
         return {name: kept.get(place, {}) for place, name in enumerate(self._names)}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the values from `state()`; the options of the groups stay.
+        """Restore the result of `state()`; learning rates and options of parameter groups stay.
 
-        Raises KeyError for a missing entry.
+        Raises KeyError if a parameter has no entry.
         """
         kept = {place: state[name] for place, name in enumerate(self._names) if state[name]}
         present = self._optimizer.state_dict()
@@ -182,9 +183,10 @@ class OptimizerState:
 
 
 class MovingAverage(AveragedModel):
-    """Moving average of a model, in its copy `module`; `update_parameters` adds present weights.
+    """Moving average of a model's weights, in the copy `module` of the model.
 
-    average = decay * average + (1 - decay) * weights. Buffers are copied without averaging.
+    `update_parameters` sets average = decay * average + (1 - decay) * weights. Buffers are copied
+    without averaging.
     """
 
     module: Any
@@ -195,9 +197,9 @@ class MovingAverage(AveragedModel):
         self.n_averaged += 1
 
     def state(self) -> dict[str, Tensor]:
-        """Return the averages, with the names that `qgs.checkpoint.model_file.save` expects."""
+        """Return the averaged weights by the names that checkpoints use."""
         return unique_tensors(self.module)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from the averages in `state`; raises CheckpointError if they do not fit."""
+        """Restore the averaged weights in `state`; raise CheckpointError if they do not fit."""
         load_weights(self.module, state, "the moving average")

@@ -1,6 +1,7 @@
 """Experiment trackers, and the progress bar of training.
 
-A distribution adds a tracker with an entry point in the group `qgs.trackers` for a `Tracker` class.
+A distribution adds a tracker, a subclass of `Tracker`, by an entry point in the group
+`qgs.trackers`.
 """
 
 import logging
@@ -27,14 +28,14 @@ _log = logging.getLogger(__name__)
 
 
 class Tracker(ABC):
-    """Additional destination of the numbers and pictures of one run, besides its folder."""
+    """Base class of experiment trackers, which record numbers and pictures of a run."""
 
     package: ClassVar[str] = ""
-    """Package that the tracker needs, by its name for both Python and pip; "" for none."""
+    """Package that the tracker needs, under the name that Python and pip share; "" for none."""
 
     @abstractmethod
     def __init__(self, run: Path, options: Mapping[str, Any], step: int):
-        """Start tracking the run in the folder `run`, or continue after `step` steps.
+        """Start to track the run in the folder `run`; if `step` is not 0, continue after that step.
 
         options: the recipe's options by dotted path.
         """
@@ -44,7 +45,7 @@ class Tracker(ABC):
         """Record the numbers of a step, by name."""
 
     def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        """Record a uint8 (H, W, 3) picture; the default ignores it."""
+        """Record a uint8 (H, W, 3) picture. This base class ignores pictures."""
         return
 
     def close(self) -> None:
@@ -53,7 +54,7 @@ class Tracker(ABC):
 
 
 class Trackers:
-    """Trackers of a recipe, opened when the run's folder exists, on the main process only.
+    """Trackers that a recipe names. Only the main process opens them, when the run's folder exists.
 
     A tracker that fails is logged, closed and no longer used; training continues without it.
     Raises ValueError for a tracker that is not installed, and MissingExtraError if a package that
@@ -79,7 +80,7 @@ class Trackers:
         self._open: dict[str, Tracker] = {}
 
     def open(self, run: Path, options: Mapping[str, Any], step: int = 0) -> None:
-        """Start tracking the run in `run` from step `step` + 1 on; log the recipe's `options`."""
+        """Start all trackers for the run in the folder `run`; arguments as for `Tracker`."""
         for name, kind in self._kinds.items():
             try:
                 self._open[name] = kind(run, options, step)
@@ -87,7 +88,7 @@ class Trackers:
                 _warn(name, error)
 
     def close(self) -> None:
-        """End tracking."""
+        """Close all trackers."""
         self.tell(lambda tracker: tracker.close())
 
     def tell(self, act: Callable[[Tracker], None]) -> None:
@@ -109,7 +110,7 @@ def _warn(name: str, error: Exception) -> None:
 
 
 class TrainingProgress(Progress):
-    """Progress bar with loss, PSNR and time left; without a terminal, a line now and then."""
+    """Progress bar with loss, PSNR and time left; without a terminal, occasional lines."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(
@@ -125,7 +126,7 @@ class TrainingProgress(Progress):
         self._next = 0.0
 
     def show(self, step: int, loss: float, psnr: float, used: float) -> None:
-        """Show a step. used: fraction of the budget used so far."""
+        """Show the numbers of a step. used: fraction of the training budget used so far."""
         line = f"loss {loss:.4f}  {Psnr.column.heading} {Psnr.column.shown(psnr):>5}"
         self.update(self._task, completed=used, step=step, line=line)
         now = time.monotonic()

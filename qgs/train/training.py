@@ -1,4 +1,4 @@
-"""Training loop."""
+"""Training of a model: the function `train` and its loop."""
 
 import logging
 import math
@@ -48,14 +48,14 @@ from qgs.wording import one_line, warn_once
 
 _log = logging.getLogger(__name__)
 
-ELSEWHERE = "another process of this training has no next batch; see the message of that process"
+ELSEWHERE = "another process of this training cannot load its next batch; see its message"
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Result of a run: trained model, folder, optimiser steps and seconds on the clock.
+    """Result of a run: trained model, folder, optimiser steps, and seconds spent training.
 
-    stopped_by: name of the signal that ended the run early; None if no signal did. main: True in
+    stopped_by: name of the signal that ended the run early; None if it is complete. main: True in
     the process that writes the files. resumed_at: step from which the run was continued; None for
     a new run.
     """
@@ -81,8 +81,8 @@ def train(
 
     Writes recipe.yaml, history.jsonl (one record per optimiser step), checkpoint.safetensors (the
     model) and state.safetensors (everything needed to continue). The run is saved on schedule, at
-    the end, and after SIGINT or SIGTERM. These signals finish the current step and return. A start
-    that fails leaves no folder. Only the main process writes; all processes must see `run`.
+    the end, and after SIGINT or SIGTERM, which end training after the current step. A start that
+    fails leaves no folder. Only the main process writes; all processes must have access to `run`.
 
     resume: continue the run in `run` as if it had never been interrupted, or start a run if there
     is none yet. A run whose budget is used up is left as it is.
@@ -90,10 +90,10 @@ def train(
     Raises:
     - FileExistsError if `run` is not empty; with `resume`, if it holds anything but a run.
     - ValueError from `choose_device`, `Recipe.rate_factors`, `make_optimizer` and the optimiser.
-    - OtherRunError if the recipe or the data differ from the run's.
-    - CollapseError if the model died; the checkpoint then holds the last good weights.
+    - OtherRunError if `resume` continues a run of another recipe or other data.
+    - CollapseError if the model no longer renders or learns; the last good weights are saved.
     - NonFiniteError for a step with NaN or infinity.
-    - Errors of the data source; the run is saved first, and a note of the error says so.
+    - Errors of the data source. The run is saved first, and a note on the error says so.
     """
     RunFolder(run).refuse_other(resume)  # before the data is opened, which may take minutes
     terminal = console or Console(stderr=True)
@@ -110,10 +110,10 @@ def train(
 
 
 class Trainer:
-    """Parts and loop of one run.
+    """One training run: its model, data, optimiser and loop.
 
     The constructor opens the data and draws the first batch, but writes no file of a new run. The
-    folder is created after the first step, when everything has proved to work.
+    folder is created after the first step, so that a start that fails leaves no folder.
     """
 
     def __init__(
@@ -152,13 +152,13 @@ class Trainer:
             self._resources = resources.pop_all()
 
     def close(self) -> None:
-        """Stop reading ahead, end tracking and unlock the folder."""
+        """Stop loading batches, close trackers and unlock the folder."""
         self._resources.close()
 
     def _build_model(self, initial: bool) -> None:
         """Build the model, its training pass, torch's optimiser and the moving average.
 
-        Collects warnings in `notes`. initial: load pretrained weights and `init_from`.
+        Collects warnings in `notes`. initial: load pretrained weights and those of `init_from`.
         """
         recipe = self.recipe
         self.model = recipe.build_model(self.accelerator.device, pretrained=initial).train()
@@ -179,7 +179,7 @@ class Trainer:
         self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
 
     def _build_watchers(self, source: SceneSource) -> None:
-        """Build the counters, the guard and the saver; check the metrics."""
+        """Build the counters, the guard and the saver; check the metrics before training."""
         recipe = self.recipe
         # Only the main process writes checkpoints, which carry the range of the training views.
         if self.accelerator.is_main_process:
@@ -207,7 +207,7 @@ class Trainer:
         self.saver.stateful = stateful
 
     def _open_data(self, source: SceneSource) -> Generator[Batch, None, None]:
-        """Return the batches, starting with the first that the run has not seen yet."""
+        """Return an iterator of batches that starts with the first unseen batch of the run."""
         processes = self.accelerator.num_processes
         return training_batches(
             source,
@@ -263,7 +263,7 @@ class Trainer:
         )
 
     def _one_step(self, progress: TrainingProgress, stop: StopRequest) -> None:
-        """Run one optimiser step, record it, and save and evaluate if due."""
+        """Run one optimiser step and record it; save and evaluate as the recipe asks."""
         counters = self.counters
         batches = self._batches
         numbers = self._compute(batches, stop)
@@ -281,7 +281,7 @@ class Trainer:
             numbers["skipped"] = True
         counters.step += 1
         for reason in chain.from_iterable(batch.left_out for batch in batches):
-            warn_once(f"a sample is left out: {reason}")
+            warn_once(f"a training sample is left out: {reason}")
         self._follow_schedules()
         self._report(numbers, progress)
         if not symptom:
@@ -298,7 +298,7 @@ class Trainer:
             self._evaluate(stop)
 
     def _compute(self, batches: Sequence[Batch], stop: StopRequest) -> dict[str, float]:
-        """Compute the gradients of `batches`, fetch the next ones, return the step's numbers."""
+        """Compute gradients of `batches`, fetch the next batches; return the step's numbers."""
         step = self.counters.step
         rate = self.optimizer.learning_rate(step, self.counters.seconds)
         for group in self.torch_optimizer.param_groups:
@@ -313,7 +313,7 @@ class Trainer:
         return {"lr": rate, **self.counters.read(measured)}
 
     def _open_folder(self) -> None:
-        """Create the folder, write the recipe, and drop records of steps that were lost."""
+        """Create the folder, write the recipe, and drop records of steps after the last save."""
         if self.accelerator.is_main_process:
             self.folder.refuse_other(self._resumes)
             self.folder.take()
@@ -333,7 +333,7 @@ class Trainer:
         progress.show(counters.step, record["loss"], record["psnr"], counters.used)
 
     def _evaluate(self, stop: StopRequest) -> None:
-        """Evaluate the weights; a failure is logged and does not stop training."""
+        """Evaluate the present weights; log a failure without stopping training."""
         started = time.perf_counter()
         step = self.counters.step
         used = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
@@ -358,7 +358,7 @@ class Trainer:
         self.counters.last_tick += time.perf_counter() - started
 
     def _refuse_missing_batches(self) -> None:
-        """Save the run and raise in all processes if one process has no next batches."""
+        """Save the run and raise in all processes if one failed to load its next batches."""
         own = self._no_batches
         if not any(gather_object([own is not None])):
             return

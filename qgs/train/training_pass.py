@@ -1,4 +1,4 @@
-"""Forward pass of a training step (objective, model and losses), and its gradients."""
+"""Forward and backward pass of a training step: objective, model, losses and gradients."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -19,20 +19,20 @@ from qgs.recipe import Recipe
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 
 RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
-"""Names in the records of history.jsonl that a loss term must not use."""
+"""Names of values in history.jsonl. A loss term must not have one of these names."""
 
 
 class TrainingPass(nn.Module):
-    """Module with the model, its losses and its objective; it gives the objective its `Passes`.
+    """Model, losses and objective as one module, which implements `Passes` for the objective.
 
     `forward` passes a batch to `objective.forward`, which calls `predict` (the model) and `judge`
-    (renderings and losses). All of it is one module, so that DDP sees one forward pass even if the
-    objective runs the model several times.
+    (renderings and losses). One module holds all of them, so that DDP sees one forward pass even if
+    the objective runs the model several times.
 
-    `judge` computes the gradients of the losses with respect to the Gaussians immediately. It takes
-    one layer and `render_views` target views at a time (0: all views), and frees each graph before
-    the next one. The backward pass starts from the sums. Memory therefore grows neither with layers
-    nor with views. If a loss needs all renderings at once, only the renderer's graphs are split.
+    To save memory, `judge` computes the gradients of the losses with respect to the Gaussians
+    immediately, for one layer and `render_views` target views at a time (0: all views), and frees
+    each autograd graph before the next. The backward pass through the model starts from the sums of
+    these gradients. If a loss needs all renderings at once, only the renderer splits the views.
     """
 
     def __init__(self, recipe: Recipe, model: QueryGaussianModel) -> None:
@@ -52,7 +52,10 @@ class TrainingPass(nn.Module):
         self.judge_inputs = recipe.training.judge_inputs
 
     def forward(self, inputs: Views, targets: Views) -> Outcome:
-        """Return the objective's outcome for a batch."""
+        """Return the objective's `Outcome` for a batch of input and target views.
+
+        Raises ValueError if a term has a reserved name.
+        """
         # Input views are appended to the targets.
         targets = targets.joined(inputs) if self.judge_inputs else targets
         outcome = self.objective.forward(inputs, targets, self)
@@ -62,11 +65,13 @@ class TrainingPass(nn.Module):
         return outcome
 
     def predict(self, inputs: Views) -> Prediction:
-        """See `Passes`."""
+        """Return the model's prediction; implements `Passes.predict`."""
         return self.model(inputs)
 
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
-        """See `Passes`: the supervision weights the layers; `signs` come from the last layer.
+        """Sum the losses of all supervised layers; implements `Passes.judge`.
+
+        The supervision sets the weight of each layer. `signs` are those of the last layer.
 
         Raises ValueError if two losses have a term of the same name.
         """
@@ -105,7 +110,10 @@ class TrainingPass(nn.Module):
         return Outcome(total, terms, signs)
 
     def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """See `Passes`: the graphs of at most `render_views` views exist at a time."""
+        """Render Gaussians; implements `Passes.render`.
+
+        The autograd graph is split into groups of at most `render_views` views.
+        """
         if not self.render_views or cameras.shape[1] <= self.render_views:
             return self.model.render(gaussians, cameras)
         # Rendered again in the backward pass: memory for one part instead of all.
@@ -123,7 +131,7 @@ class TrainingPass(nn.Module):
         target: Views,
         inputs: Views,
     ) -> dict[str, Tensor]:
-        """Return the terms of the losses `names`; see `Loss` for the other arguments."""
+        """Return the terms of the losses `names`; the remaining arguments are those of `Loss`."""
         terms: dict[str, Tensor] = {}
         for name in names:
             found = self.losses[name](prediction, rendering, target, inputs)
@@ -131,8 +139,8 @@ class TrainingPass(nn.Module):
                 owner = self._owners.setdefault(term, name)
                 if owner != name:
                     raise ValueError(
-                        f"losses.{name} and losses.{owner} both have a term {term}; a recipe can "
-                        "use each such loss once"
+                        f"losses.{name} and losses.{owner} both have a term {term}: remove one of "
+                        "them from the recipe"
                     )
                 terms[term] = value
         return terms
@@ -144,10 +152,11 @@ def compute_gradients(
     config: TrainingConfig,
     batches: Sequence[Batch],
 ) -> dict[str, Tensor]:
-    """Compute the clipped gradients of the mean loss of `batches`; return 0-d measurements.
+    """Compute the clipped gradients of the mean loss of `batches`; return 0-d values by name.
 
-    training_pass: the module wrapped by accelerate. "gradient" is the norm before clipping, over
-    all processes; the other values belong to this process. The host does not wait for the device.
+    training_pass: the module wrapped by accelerate. The value "gradient" is the norm over all
+    processes before clipping. All other values, such as "loss", are of this process. The host does
+    not wait for the device.
     """
     device = accelerator.device
     sums: dict[str, Tensor] = {}
@@ -168,14 +177,14 @@ def compute_gradients(
 
 
 class DetachedLayer:
-    """Detached copy of a layer's prediction, and the gradients of the losses with respect to it.
+    """Detached copy of a layer's prediction, which collects the gradients of losses.
 
-    gradients: sums so far by name; tensors that no loss reads are absent. terms: detached sums of
-    the losses' terms.
+    gradients: sums of gradients by name of the tensor in the prediction; tensors that no loss reads
+    are absent. terms: detached sums of the losses' terms.
     """
 
     def __init__(self, layer: LayerPrediction, parameters: Mapping[str, Tensor]) -> None:
-        """Detach `layer`. parameters: the losses' parameters by name, which get gradients too."""
+        """Detach `layer`. parameters: those of the losses by name, which get gradients too."""
         self.prediction: LayerPrediction = map_tensors(
             lambda x: x.detach().requires_grad_() if x.requires_grad else x, layer
         )
@@ -200,7 +209,7 @@ class DetachedLayer:
         )
 
     def total(self) -> Tensor:
-        """Return the sum of the terms, 0-d, whose backward pass passes `gradients` on."""
+        """Return the 0-d sum of the terms. Its backward pass hands `gradients` to the model."""
         total = _sum(self.terms)
         for name, gradient in self.gradients.items():
             # The graph of the losses is freed. Their gradient g with respect to a source x reaches
@@ -213,9 +222,10 @@ class DetachedLayer:
 
 @torch.no_grad()
 def signs_of(rendering: Rendering, target: Views, background: Tensor) -> dict[str, Tensor]:
-    """Return mean PSNR and alpha, and the largest of the views' mean |rgb - background|; all 0-d.
+    """Return "psnr", "alpha" and "deviation" of a rendering, each 0-d.
 
-    Deviations are means over a view's pixels, so that a stray splat does not count as life.
+    psnr, alpha: means. deviation: mean |rgb - background| over the pixels of a view, largest of all
+    views; a mean, so that a single stray Gaussian does not hide that the model is dead.
     """
     deviation = (rendering.rgb - background[:, None, None]).abs().mean((-3, -2, -1))
     return {

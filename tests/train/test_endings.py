@@ -93,7 +93,7 @@ def test_bad_samples_are_skipped_and_named_if_asked_for(tmp_path, monkeypatch, c
     must_refuse("frame 1", run, tiny("tokengs"), tmp_path / "stops", kind=SampleError)
     skipping = tiny("tokengs", "training.on_bad_sample=skip")
     assert run(skipping, tmp_path / "skips").steps == 3
-    assert caplog.text.count("a sample is left out: scene 'x', frame ") == 2
+    assert caplog.text.count("a training sample is left out: scene 'x', frame ") == 2
     bad.update(range(100))
     must_refuse(str(MAX_REPLACED + 1), run, skipping, tmp_path / "ends", kind=SampleError)
 

@@ -48,9 +48,8 @@ def test_old_queries_stay_and_new_ones_are_noisy_copies(learned):
                 continue
             assert len(now) == count
             assert torch.equal(now[:COUNT], before[:count])
-            change = (
-                f"{parameter}: {tuple(before.shape)} -> {tuple(now.shape)}, the first ones are kept"
-            )
+            shapes = f"{tuple(before.shape)} -> {tuple(now.shape)}"
+            change = f"{parameter}: {shapes}: the first queries are kept"
             assert any(line.startswith(change) for line in told)
             if count > COUNT:
                 noise = (now[COUNT:] - before[torch.arange(COUNT, count) % COUNT]) / GROWTH_NOISE

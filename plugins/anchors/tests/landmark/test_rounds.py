@@ -168,7 +168,7 @@ def test_a_model_without_rounds_starts_one_with_rounds(tmp_path):
     given = views()
     said = initialise(model, grown)
     assert "feedback.marker: none -> (32,)" in said
-    assert "learned with model.feedback.type: qgs/none (here landmark/rendered)" in said
+    assert "trained with model.feedback.type: qgs/none (here landmark/rendered)" in said
     weights = model.state_dict()
     assert all(torch.equal(weights[name], values) for name, values in plain.state_dict().items())
     memory = model.encoder(given)
