@@ -1,1 +1,1 @@
-"""Checkpoints: weights with the recipe of their model, by path, name or URL."""
+"""Checkpoints: files with weights and the recipe of their model, found by path, name or URL."""

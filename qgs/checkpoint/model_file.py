@@ -1,4 +1,4 @@
-"""A model as one safetensors file that carries its recipe; pickles are never read."""
+"""Models saved as safetensors files that contain the recipe. Pickle files are never read."""
 
 import json
 import os
@@ -32,7 +32,7 @@ from qgs.version import __version__
 from qgs.wording import listed
 
 FORMAT_VERSION = 3
-"""Number of the format; it rises when the metadata of checkpoints change."""
+"""Version of the file format. It rises when the metadata of checkpoints change."""
 
 _RECIPE = "qgs.recipe"
 _FORMAT = "qgs.format_version"
@@ -42,16 +42,16 @@ _DISTRIBUTIONS = "qgs.distributions"
 
 
 class CheckpointFile(TensorFile):
-    """A checkpoint, opened once for all that it holds.
+    """A checkpoint that is opened once to read model, recipe and metadata from it.
 
         with CheckpointFile("rooms/locus-64") as file:
             model = file.model()
             recipe = file.recipe
 
-    name: a path, of a run folder too, PLUGIN/NAME of a shipped model, or a URL; see
-    `checkpoint_path`. Parts are read when they are used.
-    extra: the metadata that `save` was given.
-    Raises FileNotFoundError, and CheckpointError for another kind of file or another format.
+    name: path of a file or run folder, PLUGIN/NAME of a model that a plugin ships, or a URL; see
+    `checkpoint_path`. Recipe and weights are read at first use. extra: metadata given to `save`.
+    Raises FileNotFoundError, and CheckpointError for a file that is not a checkpoint of this
+    format version.
     """
 
     def __init__(self, name: AnyPath) -> None:
@@ -68,7 +68,7 @@ class CheckpointFile(TensorFile):
         if written != FORMAT_VERSION:
             raise CheckpointError(
                 f"{self.path} has {_FORMAT} {written}, and qgs {__version__} reads only "
-                f"{FORMAT_VERSION}: install the qgs that wrote it"
+                f"{FORMAT_VERSION}: install the version of qgs that wrote the file"
             )
         if SEAL not in self.metadata:
             raise self.damaged(f"its metadata lack {SEAL}")
@@ -82,8 +82,8 @@ class CheckpointFile(TensorFile):
     def recipe(self) -> Recipe:
         """Recipe of the model.
 
-        Raises CheckpointError that names the releases which wrote the file, where components are
-        missing here or differ.
+        Raises CheckpointError if components are missing here or have changed. The message names the
+        releases that wrote the file.
         """
         try:
             return self.stored_recipe(_RECIPE)
@@ -94,8 +94,8 @@ class CheckpointFile(TensorFile):
                 f"{names.get(plugin, plugin)} {version}" for plugin, version in versions
             )
             raise CheckpointError(
-                f"{self.path} was made with {releases}, and its recipe fails here; install those "
-                f"releases:\n{error}"
+                f"{self.path} was written with {releases}; install them, because its recipe fails "
+                f"here:\n{error}"
             ) from error
 
     @cached_property
@@ -105,7 +105,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def step(self) -> int | None:
-        """Training step; None where the file has none, as for imported weights."""
+        """Optimiser steps of the training so far; None if unknown, as for imported weights."""
         if "step" not in self.extra:
             return None
         with self.entry(_EXTRA + "step") as text:
@@ -113,7 +113,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def domain(self) -> Domain:
-        """Ranges of the views that the model was trained on; empty where unknown."""
+        """Ranges of the cameras that the model was trained on; empty if unknown."""
         key = _EXTRA + KEY
         if key not in self.metadata:
             return Domain()
@@ -121,7 +121,10 @@ class CheckpointFile(TensorFile):
             return Domain.read(self.mapping(key))
 
     def untrained(self, device: str | torch.device | None = None) -> QueryGaussianModel:
-        """Build the model with initial weights; "meta" takes no memory. Raises CheckpointError."""
+        """Build the recipe's model without the saved weights; the device "meta" takes no memory.
+
+        Raises CheckpointError if it cannot be built.
+        """
         try:
             return self.recipe.build_model(device, pretrained=False)
         except (RecipeError, TooLargeError) as error:
@@ -130,9 +133,9 @@ class CheckpointFile(TensorFile):
             ) from error
 
     def model(self, device: str | torch.device | None = None) -> QueryGaussianModel:
-        """Return the model on `device` (default: CPU), in evaluation mode, in float32.
+        """Load the model in float32 and evaluation mode on `device` (default: CPU).
 
-        Raises CheckpointError, and ValueError for weights that are NaN or infinite.
+        Raises CheckpointError if weights do not fit, and ValueError for NaN or infinite weights.
         """
         # On the meta device first: sizes are compared before the recipe's model takes memory.
         refuse_misfit(self.untrained("meta"), self.tensors, self.path)
@@ -146,7 +149,10 @@ class CheckpointFile(TensorFile):
 
 
 def load(name: AnyPath, device: str | torch.device | None = None) -> QueryGaussianModel:
-    """Load a checkpoint's model in evaluation mode; name, device and errors: `CheckpointFile`."""
+    """Load the model of a checkpoint in evaluation mode.
+
+    name: as for `CheckpointFile`. device, errors: as for `CheckpointFile.model`.
+    """
     with CheckpointFile(name) as file:
         return file.model(device)
 
@@ -160,9 +166,9 @@ def save(
 ) -> None:
     """Write the weights of `model` and its resolved recipe to `path`, atomically.
 
-    extra: more metadata, such as the training step. weights: written instead of the model's present
-    ones, named as by `unique_tensors`.
-    Raises ValueError for a model that was not composed from a recipe, OSError for a full disk.
+    extra: additional metadata, such as {"step": "1000"}. weights: weights to write in place of the
+    model's present weights, by the names of `unique_tensors`.
+    Raises ValueError for a model that was not built from a recipe, and OSError, as for a full disk.
     """
     if model.recipe is None:
         raise ValueError(
@@ -187,8 +193,8 @@ def write_checkpoint(
 ) -> None:
     """Write a checkpoint from its parts, without copying a tensor.
 
-    tensors: on the CPU, contiguous, named as by `unique_tensors`. tree: the resolved recipe.
-    releases: as `Recipe.releases`.
+    tensors: on the CPU, contiguous, by the names of `unique_tensors`. tree: resolved recipe.
+    releases: see `Recipe.releases`. extra: additional metadata.
     """
     metadata = {
         _RECIPE: json.dumps(tree),
@@ -202,7 +208,7 @@ def write_checkpoint(
 
 
 def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
-    """Return parameters and persistent buffers, a shared one only under its first name."""
+    """Return parameters and persistent buffers by name; a shared tensor only by its first name."""
     first: dict[int, tuple[str, Tensor]] = {}
     for name, tensor in model.state_dict(keep_vars=True).items():
         first.setdefault(id(tensor), (name, tensor))
@@ -210,10 +216,10 @@ def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
 
 
 def load_weights(model: nn.Module, tensors: Weights, origin: object) -> None:
-    """Copy `tensors`, read from `origin`, into `model`; nothing is copied where one does not fit.
+    """Copy `tensors` into `model`; copy nothing if any tensor does not fit.
 
-    Raises CheckpointError that lists differences in names, shapes and types, and ValueError for NaN
-    and infinity.
+    origin: file of the tensors, for messages. Raises CheckpointError that lists differences in
+    names, shapes and types, and ValueError for NaN and infinity.
     """
     # Everything is compared before anything is copied.
     refuse_misfit(model, tensors, origin)
@@ -224,14 +230,14 @@ def load_weights(model: nn.Module, tensors: Weights, origin: object) -> None:
 
 
 def refuse_nonfinite(tensors: Weights, origin: object) -> None:
-    """Raise ValueError for NaN and infinity in weights read from `origin`."""
+    """Raise ValueError for NaN and infinity in `tensors`, which were read from `origin`."""
     if broken := nonfinite(tensors):
-        fix = "its training had diverged, or the file is damaged: take another"
+        fix = "its training diverged, or the file is damaged: take another checkpoint"
         raise ValueError(f"{origin}: weights are not finite: {listed(broken)}; {fix}")
 
 
 def refuse_misfit(model: nn.Module, tensors: Weights, origin: object) -> None:
-    """Raise CheckpointError with a list of differences between `tensors` and `model`."""
+    """Raise CheckpointError if names, shapes or types of `tensors` differ from those of `model`."""
     own = unique_tensors(model)
     differences = differing_tensors(shapes_of(tensors), shapes_of(own))
     differences += differing_types(tensors, own)
@@ -239,6 +245,6 @@ def refuse_misfit(model: nn.Module, tensors: Weights, origin: object) -> None:
         raise CheckpointError(
             f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
             + listed(differences, 20, "\n  ")
-            + "\nInstall the versions of qgs and of its plugins that wrote the file; if they are, "
-            "it is damaged: copy it again."
+            + "\nInstall the versions of qgs and its plugins that wrote the file. If they are "
+            "installed, the file is damaged: copy it again."
         )

@@ -1,6 +1,6 @@
-"""Checkpoints by name: a path, a model that an installed plugin ships, or any URL of fsspec.
+"""Find checkpoints by path, by the name of a model that an installed plugin ships, or by URL.
 
-What is at a URL is downloaded once, within a limit of size, and kept.
+A file at a URL is downloaded once and kept.
 """
 
 import hashlib
@@ -24,20 +24,20 @@ from qgs.terminal import without_secrets
 from qgs.wording import did_you_mean, warn_once
 
 CHECKPOINT = "checkpoint.safetensors"
-"""Name of the latest good weights in a run folder."""
+"""Name of the file in a run folder that holds the latest good weights."""
 LARGEST = 20 * 10**9
 """Largest download, in bytes."""
 PATIENCE = 60.0
-"""Seconds that a server may stay silent."""
+"""Seconds after which a download fails if the server sends nothing."""
 
 
 def checkpoint_path(name: AnyPath) -> Path:
-    """Return the local file of `name`; what exists under that name comes first.
+    """Return the local file of the checkpoint `name`.
 
-    name: a path, of a run folder for the checkpoint in it, PLUGIN/NAME of a model that an installed
-    plugin ships (`qgs list`), or a URL that fsspec opens, see `downloaded`.
-    Raises FileNotFoundError, PluginError for a plugin that cannot be used, OSError for a
-    download that fails.
+    name: path of a checkpoint or of a run folder with one; or else PLUGIN/NAME of a model that an
+    installed plugin ships (see `qgs list`), or a URL that fsspec opens (see `downloaded`). A path
+    that exists wins. Raises FileNotFoundError, PluginError for a plugin that cannot be used, and
+    OSError for a failed download.
     """
     text = os.fspath(name)
     path = Path(text).expanduser()
@@ -68,28 +68,29 @@ def _shipped(plugin: str, name: str) -> Path:
 
 
 def card_of(file: Path) -> str:
-    """Return the card of a model, NAME.md beside NAME.safetensors; "" without one."""
+    """Return the text of a model's card, NAME.md beside NAME.safetensors; "" if it has no card."""
     card = file.with_suffix(".md")
     return card.read_text(encoding="utf-8") if card.is_file() else ""
 
 
 def about(file: Path) -> str:
-    """Return the first paragraph of the card of the model in `file`; "" without one."""
+    """Return the first paragraph of the model card of `file`; "" if it has no card."""
     paragraphs = (part for part in card_of(file).split("\n\n") if not part.startswith("#"))
     return " ".join(next(paragraphs, "").split())
 
 
 def downloaded(url: str) -> Path:
-    """Return the local file of `url`; download it if that was not done before.
+    """Return the local copy of the safetensors file at `url`; download it at first use.
 
-    Only whole safetensors files are kept, in the environment's QGS_CACHE or ~/.cache/qgs; one that
-    is damaged there is downloaded again. Raises OSError with the cause of a failure.
+    Copies are kept in the folder that the environment variable QGS_CACHE names, by default in
+    ~/.cache/qgs. A damaged copy is downloaded again. Raises OSError if the download fails or is not
+    a complete safetensors file.
     """
     name = without_secrets(url)
     try:
         last = PurePosixPath(urlsplit(url).path).name
     except ValueError as error:
-        raise OSError(f"{name} is no URL: {error}") from None
+        raise OSError(f"{name} is not a valid URL: {error}") from None
     cache = Path(os.environ.get("QGS_CACHE") or "~/.cache/qgs").expanduser()
     # By the whole URL: two servers may have files of one name.
     key = hashlib.sha256(url.encode()).hexdigest()[:16]
@@ -100,7 +101,7 @@ def downloaded(url: str) -> Path:
         file.unlink()
     if not file.is_file():
         _download(url, file)
-    warn_once(f"{name} is kept as {file} (delete it to download again)")
+    warn_once(f"{name} is kept as {file} (delete this file to download it again)")
     return file
 
 
@@ -119,13 +120,13 @@ def _download(url: str, file: Path) -> None:
             with _opened(url) as stream, temporary.open("wb") as local:
                 _copy(stream, local, file.parent)
             if not _is_whole(temporary):
-                raise ValueError("what came is no whole safetensors file, or a web page")
+                raise ValueError("the download is a web page or no complete safetensors file")
     # The file system of the URL may raise anything.
     except Exception as error:
         cause = str(getattr(error, "reason", error)) or type(error).__name__
         if isinstance(error, HTTPError):
             cause = f"the server answers {error.code} ({error.reason})"
-        text = f"{url} could not be downloaded, nothing was kept: {cause}"
+        text = f"{url} could not be downloaded; nothing was kept: {cause}"
         # `from None`: the error itself may show a password.
         raise OSError(without_secrets(text)) from None
 
@@ -144,7 +145,7 @@ def _copy(stream: Any, local: IO[bytes], folder: Path) -> None:
 
 
 def _opened(url: str) -> Any:
-    """Open `url` for reading; a user and password in it are sent as HTTP's Basic login."""
+    """Open `url` for reading. A user and password in it are sent by HTTP basic authentication."""
     place = urlsplit(url)
     if place.scheme not in ("http", "https"):
         path = opened_path(url)

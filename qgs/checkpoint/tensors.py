@@ -1,4 +1,4 @@
-"""Safetensors files: opened once, read as possibly hostile data, written atomically."""
+"""Safetensors files: read safely even if they are hostile, and written atomically."""
 
 import json
 import os
@@ -21,22 +21,23 @@ from qgs.wording import name_shown
 Weights: TypeAlias = Mapping[str, Tensor]
 """Parameters and buffers of a model, by name."""
 Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
-"""Name of a tensor to its shape."""
+"""Shapes of tensors by name."""
 SEAL = "qgs.seal"
-"""Metadata entry with the checksum of all others."""
+"""Name of the metadata entry with the checksum of all other entries."""
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
 
 
 class CheckpointError(ValueError):
-    """Error: a file has no usable weights; the message names the file, the fault and the remedy."""
+    """Error for a file without usable weights; the message says what is wrong and what helps."""
 
 
 class TensorFile:
-    """A safetensors file, open for reading; a context manager.
+    """A safetensors file that is open for reading; a context manager.
 
-    path: of the file. metadata: its text entries.
-    Before it maps anything, safetensors compares the sizes in the header with the size of the file.
-    Raises OSError and MemoryError of the system, and CheckpointError for any but a whole file.
+    metadata: the text entries in the header of the file.
+    Raises CheckpointError for a file that is incomplete or of another kind, and the system's
+    OSError and MemoryError. safetensors compares the sizes in the header with the size of the file
+    before it maps the file into memory.
     """
 
     def __init__(self, path: AnyPath) -> None:
@@ -47,7 +48,7 @@ class TensorFile:
             self._file: Any = safe_open(self.path, "pt")
         self.metadata: Mapping[str, str] = self._file.metadata() or {}
         if SEAL in self.metadata and self.metadata[SEAL] != seal(self.metadata):
-            raise self.damaged("its metadata are not those that were written")
+            raise self.damaged("its metadata do not match their checksum")
 
     def __enter__(self) -> Self:
         return self
@@ -56,7 +57,7 @@ class TensorFile:
         self._file.__exit__(*exception)
 
     def read(self) -> dict[str, Tensor]:
-        """Return all tensors, memory-mapped; they outlive the open file."""
+        """Return all tensors, memory-mapped. They stay valid after the file is closed."""
         with self._whole():
             return {name: self._file.get_tensor(name) for name in self._file.keys()}  # noqa: SIM118
 
@@ -80,7 +81,7 @@ class TensorFile:
             ) from error
 
     def damaged(self, what: str) -> CheckpointError:
-        """Return the error for a file that is not as it was written. what: part and reason."""
+        """Return the error for a damaged file. what: damaged part and reason, for the message."""
         return CheckpointError(
             f"{self.path} is damaged: {name_shown(what, 5000)}. Copy the file again from where it "
             "came, or take another checkpoint of the run"
@@ -99,7 +100,7 @@ class TensorFile:
             raise self.damaged(what) from error
 
     def mapping(self, key: str) -> dict[str, Any]:
-        """Return the JSON mapping in the entry `key`. Raises CheckpointError."""
+        """Return the JSON mapping in the metadata entry `key`. Raises CheckpointError."""
         with self.entry(key) as text:
             found = json.loads(text)
             if not isinstance(found, dict):
@@ -107,19 +108,20 @@ class TensorFile:
             return found
 
     def stored_recipe(self, key: str) -> Recipe:
-        """Return the resolved recipe in the entry `key`; no file that it names is followed.
+        """Return the resolved recipe in the metadata entry `key`, without reading any other file.
 
-        Raises CheckpointError, and RecipeError where components here do not fit the recipe.
+        Raises CheckpointError for a damaged entry, and RecipeError if the installed components do
+        not fit the recipe.
         """
         tree = self.mapping(key)
         if unresolved := [name for name in ("extends", "swap") if name in tree]:
-            raise self.damaged(f"its recipe has `{unresolved[0]}`, and qgs writes resolved recipes")
+            raise self.damaged(f"its recipe has `{unresolved[0]}`, but qgs writes resolved recipes")
         with self.entry(key):
             return resolve(tree)
 
 
 def write_tensors(path: AnyPath, tensors: Weights, metadata: Mapping[str, str]) -> None:
-    """Write `tensors`, contiguous and on the CPU, to `path`; see `replacing`. Raises OSError."""
+    """Write contiguous CPU `tensors` to `path`, atomically as by `replacing`. Raises OSError."""
     with replacing(path) as temporary:
         try:
             save_file(dict(tensors), temporary, {**metadata, SEAL: seal(metadata)})
@@ -131,7 +133,7 @@ def write_tensors(path: AnyPath, tensors: Weights, metadata: Mapping[str, str]) 
 
 
 def seal(metadata: Mapping[str, str]) -> str:
-    """Return a checksum of all metadata entries but SEAL."""
+    """Return the checksum of all metadata entries except SEAL."""
     entries = sorted((key, text) for key, text in metadata.items() if key != SEAL)
     return blake2b(json.dumps(entries).encode(), digest_size=16).hexdigest()
 
@@ -147,12 +149,12 @@ def pickle_kind(path: AnyPath) -> str:
 
 
 def shapes_of(tensors: Weights) -> dict[str, tuple[int, ...]]:
-    """Map names to shapes."""
+    """Return the shapes of tensors by name."""
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
 def nonfinite(tensors: Weights) -> list[str]:
-    """Return the names of the tensors, all on one device, that hold NaN or infinity."""
+    """Return the names of tensors that hold NaN or infinity. All must be on one device."""
     finite = {name: tensor.isfinite().all() for name, tensor in tensors.items()}
     # One read for all: each read would make the host wait for the device.
     flags = torch.stack([*finite.values()]).tolist() if finite else []
@@ -160,7 +162,10 @@ def nonfinite(tensors: Weights) -> list[str]:
 
 
 def differing_tensors(file: Shapes, recipe: Shapes) -> list[str]:
-    """List differences in names and shapes between a file and a recipe's model, one line each."""
+    """List differences in names and shapes between tensors of a file and of a recipe's model.
+
+    Each difference is one line.
+    """
     found = [f"missing: {name}" for name in recipe if name not in file]
     found += [f"unexpected: {name}" for name in file if name not in recipe]
     return found + [
@@ -171,9 +176,9 @@ def differing_tensors(file: Shapes, recipe: Shapes) -> list[str]:
 
 
 def differing_types(file: Weights, recipe: Weights) -> list[str]:
-    """List differences in dtypes, one line each, of the tensors that both have.
+    """List differences in dtypes of the tensors that both a file and a recipe's model have.
 
-    Half precision in the file fits float32 in the recipe.
+    Each difference is one line. Half precision in the file fits float32 in the model.
     """
     allowed = {torch.float32: (torch.float32, torch.float16, torch.bfloat16)}
     return [

@@ -1,1 +1,1 @@
-"""Evaluation: which views are judged, by which protocol, and the scores."""
+"""Evaluation of a model: which views are scored, the protocol, the scores and their tables."""

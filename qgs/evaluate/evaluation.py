@@ -1,4 +1,4 @@
-"""Scores of a model on the test views of a recipe, and of two baselines without a model."""
+"""Scores of a model, and of two baselines without a model, on the test views of a recipe."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,14 +33,17 @@ def evaluate(
     sampler: ViewSampler | None = None,
     show: Callable[[Sample, Rendering], None] | None = None,
 ) -> Evaluation:
-    """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
+    """Score `model` with the metrics of `recipe` on the recipe's test views.
 
-    A scene that fails is named in the result with the reason, and the others go on. Restores the
-    model's mode. step: optimiser steps behind the weights. observe: called with (scenes done, all
-    scenes). views_of: see `EvaluationPlan`. sampler: of views, by default the recipe's. show:
-    called with each sample and the rendering of its targets.
+    Computes on the device of the model, and restores its training or evaluation mode. A scene that
+    fails gets no score; the result names it with the reason.
 
-    Raises what opening the data source or the index and `Measures` raise, and ValueError when no
+    step: optimiser steps after which the weights were saved. observe: called after each scene with
+    the number of finished scenes and of all scenes. views_of: see `EvaluationPlan`. sampler: view
+    sampler, by default the recipe's. show: called with each sample and the rendering of its
+    targets.
+
+    Raises the errors of the data source, of `read_index` and of `Measures`, and ValueError if no
     scene could be scored.
     """
     measures = Measures(recipe)
@@ -72,7 +75,7 @@ def evaluate(
     if not scores:
         name, reason = next(iter(missing.items()))
         raise ValueError(
-            f"none of {len(missing)} scenes could be judged; the first, {name}: {reason}"
+            f"none of {len(missing)} scenes could be scored; the first, {name}: {reason}"
         )
     evaluation = Evaluation(
         protocol=protocol_of(recipe, plan.index, plan.wanted, model.renderer.followed),
@@ -89,7 +92,7 @@ def evaluate(
 def _remarks(
     evaluation: Evaluation, model: QueryGaussianModel, recipe: Recipe, seen: Domain
 ) -> list[str]:
-    """Return remarks on the views' distance from the training's range and on the result."""
+    """Return remarks: test views unlike the training views, and scores below a baseline."""
     remarks: list[str] = []
     if model.trained_on is not None:
         remarks.append(verdict(model.trained_on, seen))
@@ -105,10 +108,10 @@ def _remarks(
 
 
 class Measures:
-    """Metrics of a recipe. columns: name of every value to its display.
+    """All metrics of a recipe, called together.
 
-    Making one finds what is wrong with the metrics before any scene is scored: raises ValueError
-    when two values have one name.
+    columns: how each value is displayed, by name of the value.
+    The constructor raises ValueError if two metrics have a value of the same name.
     """
 
     def __init__(self, recipe: Recipe) -> None:
@@ -122,12 +125,15 @@ class Measures:
             for key, column in metric.columns().items():
                 name = _name(label, key)
                 if name in self.columns:
-                    raise ValueError(f"two values of the metrics are called {name}; rename one")
+                    raise ValueError(f"two metrics have a value called {name}; rename one of them")
                 self.columns[name] = column
                 self._owners[name] = metric
 
     def __call__(self, method: str, given: MetricInput) -> dict[str, float]:
-        """Return a sample's values by METHOD_NAME, without those that lack what they need."""
+        """Return the metrics of a sample, named METHOD_NAME. Skips metrics whose input is missing.
+
+        method: "model" or a baseline. Raises ValueError that names a metric which fails.
+        """
         values: dict[str, float] = {}
         for label, metric in self.metrics.items():
             # A baseline has no Gaussians and no depth: it has a dash in that column.
@@ -144,14 +150,14 @@ class Measures:
         return values
 
     def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
-        """Return why values are missing from `scores`, by name."""
+        """Return the reason for each value that scenes in `scores` lack, by name of the value."""
         found: dict[str, str] = {}
         for name, metric in self._owners.items():
             if metric.unavailable:
                 found[name] = metric.unavailable
             elif lacking := sum(f"model_{name}" not in score.values for score in scores):
                 needs = " and ".join(metric.needs).replace("_", " ")
-                found[name] = f"it needs {needs}, not known for {lacking} of {len(scores)} scenes"
+                found[name] = f"it needs {needs}, which {lacking} of {len(scores)} scenes lack"
         return found
 
 
@@ -161,7 +167,10 @@ def _name(metric: str, key: str) -> str:
 
 @dataclass
 class _Scorer:
-    """Scores samples; `seen` are their cameras, `gaussians` the most Gaussians of a scene."""
+    """Scorer of samples.
+
+    seen: ranges of all cameras so far. gaussians: largest number of Gaussians of a scene so far.
+    """
 
     model: QueryGaussianModel
     measures: Measures
@@ -177,7 +186,7 @@ class _Scorer:
 
     @torch.no_grad()
     def score(self, scene: str, samples: Iterable[Sample]) -> SceneScore:
-        """Return the score of a scene; one failed sample fails it. ValueError for NaN."""
+        """Return the score of a scene: means over its samples. Raises ValueError for NaN."""
         found: list[dict[str, float]] = []
         views: list[Window] = []
         names: dict[int, str] = {}

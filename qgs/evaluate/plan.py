@@ -1,4 +1,4 @@
-"""Views that an evaluation compares: drawn by seed, or named by an index file."""
+"""Views that an evaluation scores: drawn with a seed, or named by an index file."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -18,32 +18,32 @@ FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field
 
 
 class IndexEntry(BaseModel):
-    """Frames of one scene, as positions in its list of frames.
+    """Frames of one scene in an index file, as positions in the scene's list of frames.
 
-    Other keys of the file are ignored.
+    Unknown keys in the file are ignored.
     """
 
     model_config = ConfigDict(frozen=True)
 
     context: FrameList
-    """The input frames; the first sets the model's frame."""
+    """Input frames. The camera of the first one defines the model's coordinate frame."""
     target: FrameList
-    """The target frames."""
+    """Target frames, which are rendered and scored."""
 
 
 EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
-"""Scene name to its frames; None for a scene that is listed but not judged."""
+"""Frames by scene name; None for a scene that is listed but not scored."""
 
 ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
-"""Function of a scene, input and target frames; it returns the settings of their sample."""
+"""Function of a scene, its input frames and its target frames that returns view settings."""
 
 _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
 
 
 def read_index(path: str | None) -> EvaluationIndex | None:
-    """Read the index in the JSON file `path`, which may be an fsspec URL; None for no path.
+    """Read the index file `path`: JSON, local or at a URL of fsspec. None if `path` is None.
 
-    Raises FileNotFoundError, and ValueError for another form and for no scene to judge.
+    Raises FileNotFoundError; ValueError if the file has another form or names no scene to score.
     """
     if path is None:
         return None
@@ -59,24 +59,31 @@ def read_index(path: str | None) -> EvaluationIndex | None:
     except ValidationError as error:
         wrong = [f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors()]
         reason = listed(wrong, between="; ")
-        raise ValueError(f"{path} is no evaluation index {_FORM}: {reason}") from error
+        raise ValueError(f"{path} is no evaluation index of the form {_FORM}: {reason}") from error
     if not any(index.values()):
-        raise ValueError(f"the evaluation index {path} names no scene to judge")
+        raise ValueError(f"the evaluation index {path} names no scene to score")
     return index
 
 
 @dataclass
 class EvaluationPlan:
-    """Scenes of a test split to judge, with their views; never mirrored.
+    """Samples that an evaluation scores: scenes of the test split and their views.
 
-    With `evaluation.index`, its scenes and frames. Without one, of the first `evaluation.scenes`
-    scenes: the windows of `sampler`, else of a scene with held-out frames `held_out_windows`,
-    evenly thinned to `evaluation.scenes`; else `evaluation.samples` samples, inputs drawn by
-    `sampler` as at the end of training with `evaluation.seed`, targets the other frames of the
-    span, or of one time. Targets of T times are T samples. views_of: makes the settings of a
-    sample, such as its scale. depths: targets have true depth where scenes do.
+    With `evaluation.index`, the index names scenes and frames. Without one, the first
+    `evaluation.scenes` scenes are scored. Their samples are, in this order of preference:
 
-    wanted: names of the scenes. Raises ValueError without scenes, and as `read_index`.
+    1. the windows of `sampler`, if it has any,
+    2. `held_out_windows`, if the scene has held-out frames,
+    3. `evaluation.samples` samples, drawn by `sampler` with `evaluation.seed` as at the end of
+       training. Targets are all frames of the span that are not inputs; in a scene with times, the
+       sampler's targets.
+
+    1 and 2 are thinned evenly to `evaluation.scenes` windows. Targets at several times become one
+    sample for each time. No sample is mirrored.
+
+    views_of: function that returns the view settings of a sample, such as its scale; None uses
+    `views`. depths: load true depth for targets if the scene has it. wanted: names of the scenes.
+    Raises ValueError without test scenes, and the errors of `read_index`.
     """
 
     source: SceneSource
@@ -98,12 +105,12 @@ class EvaluationPlan:
             self.wanted = tuple(name for name, entry in self.index.items() if entry)
 
     def samples(self, name: str) -> Iterator[Sample]:
-        """Yield the samples of a wanted scene, one decoded at a time. Raises what a reader raises.
+        """Yield the samples of the scene `name`; images are decoded for one sample at a time.
 
-        ValueError for a scene that is not there.
+        Raises ValueError for an unknown scene, and the errors of the scene's reader.
         """
         if name not in self._places:
-            raise ValueError("not among the test scenes of the data")
+            raise ValueError("this is not one of the test scenes of the data")
         place = self._places[name]
         scene = self._scenes[place]
         # a generator for each scene: a failing one changes no noise of the others
@@ -114,7 +121,7 @@ class EvaluationPlan:
                 yield make_sample(scene, inputs, part, views, False, noise, self.depths)
 
     def _choices(self, scene: Scene, place: int) -> Iterator[Window]:
-        """Yield input and target frames of each sample."""
+        """Yield input and target frames of each sample. place: number of the scene in the split."""
         sampler = self.sampler
         # What somebody chose comes first: an index, then windows of the sampler's own. Held-out
         # photos are scarce, so all of them are compared before any frame is drawn by chance.
@@ -134,10 +141,12 @@ class EvaluationPlan:
 
 
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[Window]:
-    """Return input and target frames such that every held-out frame is a target once.
+    """Return windows (input frames, target frames) in which each held-out frame is a target once.
 
-    A window of the largest gap (in training frames, or times) is centred on the first such frame
-    not yet covered and shifted into the scene, inputs evenly spaced; all within are targets.
+    Each window is as long as the largest `views.gap`, counted in training frames or, in a scene
+    with times, in times. It is centred on the first held-out frame that no window has yet, and
+    shifted to lie inside the scene. Its inputs are evenly spaced training frames; its targets are
+    all remaining held-out frames between the first and the last input.
     """
     usable = moments(scene)
     gap = gap_range(len(usable), views, scene)[1]
@@ -162,17 +171,17 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[Window]:
 
 
 def _named(scene: Scene, index: EvaluationIndex) -> Window:
-    """Return the frames of `scene` that `index` names. Raises ValueError if one is missing."""
+    """Return input and target frames of `scene` from `index`; ValueError if frames are missing."""
     entry = index[scene.name]
     assert entry is not None
     # frames are positions, which a missing image moves
     if scene.missing:
         raise ValueError(
-            f"{len(scene.missing)} of its listed images do not exist, so that positions "
-            f"of the index would mean other frames: {listed(scene.missing, 3)}"
+            f"{len(scene.missing)} of its listed images do not exist, so positions in the "
+            f"index would mean other frames: {listed(scene.missing, 3)}"
         )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:
         ends = f"{scene.label(0)} to {scene.label(len(scene) - 1)}"
-        raise ValueError(f"the index names frames {listed(outside)}, the scene has {ends}")
+        raise ValueError(f"the index names frames {listed(outside)}, but the scene has only {ends}")
     return tuple(entry.context), tuple(entry.target)

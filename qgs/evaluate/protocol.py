@@ -1,4 +1,4 @@
-"""Evaluation protocols: all settings that decide the scores, named and hashed."""
+"""Evaluation protocols: all settings that influence scores, with a name and a hash."""
 
 import hashlib
 import json
@@ -16,10 +16,11 @@ from qgs.recipe import Recipe
 
 @dataclass(frozen=True)
 class Protocol:
-    """Settings of an evaluation under a name; results with one hash are comparable.
+    """Settings of an evaluation. Results are comparable if the hashes of their protocols are equal.
 
-    content: everything that decides a score of given Gaussians, and nothing else: no path, and not
-    the renderer's type or device, since all renderers give the same image.
+    name: for people, not hashed. content: all settings that influence the scores of given
+    Gaussians. Paths, device and the renderer's type are left out: all renderers give the same
+    image.
     """
 
     name: str
@@ -27,7 +28,7 @@ class Protocol:
 
     @property
     def canonical(self) -> str:
-        """`content` as JSON with sorted keys and no spaces, which is hashed."""
+        """`content` as JSON with sorted keys and no spaces, the text that is hashed."""
         # Sorted and without spaces: the hash must not depend on who wrote the mapping.
         return json.dumps(
             self.content, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
@@ -35,7 +36,7 @@ class Protocol:
 
     @property
     def sha256(self) -> str:
-        """Hash of `canonical` in UTF-8, hexadecimal."""
+        """SHA-256 of `canonical` in UTF-8, as hexadecimal digits."""
         return hashlib.sha256(self.canonical.encode()).hexdigest()
 
 
@@ -45,9 +46,9 @@ def protocol_of(
     scenes: Sequence[str] = (),
     step: int = END,
 ) -> Protocol:
-    """Return the protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
+    """Return the protocol of `recipe` on the views of `index`; None draws views from `scenes`.
 
-    Scheduled options of the renderer are those after `step` steps.
+    step: optimiser steps at which scheduled options of the renderer are read.
     """
     evaluation = recipe.evaluation
     data, views = _data_and_views(recipe, index, scenes)
@@ -94,10 +95,10 @@ def protocol_of(
 def _data_and_views(
     recipe: Recipe, index: EvaluationIndex | None, scenes: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the settings that decide the photos, and which of them are compared.
+    """Return the settings of the data, and those of the views that are scored.
 
-    With an index the kind of data, its split, and options at their defaults are left out, so that
-    one data set in two formats has one protocol.
+    With an index, the type of the data source, its split, and options at their defaults are left
+    out, so that a data set stored in two formats has the same protocol.
     """
     part = recipe.parts["data",]
     source = part.component

@@ -1,4 +1,4 @@
-"""Scores of an evaluation: by scene, their means, files and tables."""
+"""Scores of an evaluation: scores of scenes, their means, and the files and tables of both."""
 
 import csv
 import io
@@ -25,10 +25,11 @@ METHODS = ("model", *BASELINES)
 
 @dataclass(frozen=True)
 class SceneScore:
-    """Scores of one scene. views: input and target frames per sample; names: as in `Sample`.
+    """Scores of one scene.
 
-    values: means over the samples of METHOD_METRIC and "gaussians_used", less those whose metric
-    needs what the method or the scene lacks.
+    views: input and target frames of each sample. values: means over the samples, by
+    METHOD_METRIC, and "gaussians_used"; without metrics that need something that the method or the
+    scene lacks. names: names of frames, see `Sample`.
     """
 
     scene: str
@@ -38,9 +39,9 @@ class SceneScore:
 
     @property
     def given(self) -> list[int]:
-        """Frames that one of the samples has as input and as target.
+        """Frames that are input and target of the same sample.
 
-        Their scores mean nothing: the nearest input view is the target itself.
+        Their scores mean nothing, because the model has seen the target.
         """
         both = [{*inputs}.intersection(targets) for inputs, targets in self.views]
         return sorted(set().union(*both))
@@ -50,10 +51,11 @@ class SceneScore:
 class Evaluation:
     """Scores of all scenes and their means. The same weights and recipe give the same numbers.
 
-    columns: by name of the value. scores: of the judged scenes. missing: the other scenes of the
-    protocol, and why they have none. gaussians: of a scene, the most of any. incomplete: values
-    that scenes lack, and why. step: optimiser steps behind the weights.
-    remarks: sentences on what was judged and what came of it.
+    columns: how each value is displayed, by name of the value. scores: scores of the scenes.
+    gaussians: largest number of Gaussians of a scene. missing: reason for each scene of the
+    protocol without a score. incomplete: reason for each value that scenes lack, by name. step:
+    optimiser steps after which the weights were saved; None if unknown. remarks: sentences on the
+    views and on the scores.
     """
 
     protocol: Protocol
@@ -66,18 +68,21 @@ class Evaluation:
     remarks: Sequence[str] = ()
 
     def mean(self, value: str) -> float | None:
-        """Return the mean over scenes of one of their values; None if none has it."""
+        """Return the mean of a value over the scenes that have it; None if no scene has it.
+
+        value: METHOD_METRIC, such as "model_psnr", or "gaussians_used".
+        """
         found = self._values(value)
         return sum(found) / len(found) if found else None
 
     def means(self, method: str = "model") -> dict[str, float | None]:
-        """Return the `mean` of all `columns`."""
+        """Return the mean over scenes of each value in `columns`. method: "model" or a baseline."""
         return {name: self.mean(f"{method}_{name}") for name in self.columns}
 
     def summary(self) -> dict[str, Any]:
         """Return everything but the scores of single scenes, as plain values for JSON.
 
-        over_scenes: of each value of the model the mean, variance (of the population) and median.
+        The entry "over_scenes" has mean, population variance and median of the model's values.
         """
         values = {name: self._values(f"model_{name}") for name in self.columns}
         return {
@@ -108,9 +113,9 @@ class Evaluation:
         }
 
     def write(self, folder: str | Path) -> None:
-        """Write scenes.csv, summary.json, table.md and protocol.json, each whole or not at all.
+        """Write scenes.csv, summary.json, table.md and protocol.json, each atomically.
 
-        protocol.json is `Protocol.canonical`: its SHA-256 is the protocol's hash.
+        protocol.json holds `Protocol.canonical`; the SHA-256 of the file is the protocol's hash.
         """
         table = io.StringIO()
         # As wide as the lines are; without the colours that the environment may ask for.
@@ -129,7 +134,7 @@ class Evaluation:
             write_text(Path(folder, name), text)
 
     def show(self, console: Console) -> None:
-        """Print the table and the notes as Markdown."""
+        """Print the table of means and the notes below it as Markdown."""
         print_table(console, self.protocol.name, self._rows(), box=MARKDOWN)
         print_lines(console, (f"- {note}" for note in self._notes()))
 
@@ -141,7 +146,7 @@ class Evaluation:
         return len(self.scores) + len(self.missing)
 
     def _rows(self) -> list[list[str]]:
-        """Return the means of all methods, and their numbers of scenes."""
+        """Return the rows of the table: means of all methods, and the number of scenes."""
         judged = f"{len(self.scores)} of {self._wanted}" if self.missing else str(self._wanted)
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
@@ -174,7 +179,7 @@ class Evaluation:
         return text.getvalue()
 
     def _notes(self) -> Iterator[str]:
-        """Yield the lines below the table in table.md."""
+        """Yield the notes below the table: protocol, missing scores, Gaussians, tuning, remarks."""
         content = self.protocol.content
         height, width = content["image_size"]
         counts = set[int]()
@@ -198,16 +203,16 @@ class Evaluation:
             yield f"{self.columns[name].heading} is not complete: {why}"
         used = self.mean("gaussians_used")
         yield (
-            f"{self.gaussians:,} Gaussians a scene, {used:,.0f} of them used (opacity above "
+            f"at most {self.gaussians:,} Gaussians per scene, {used:,.0f} of them used (opacity > "
             f"{OPACITY_USED:.4f}; mean over scenes)"
         )
         if tuning := content["tuning"]:
-            yield "{what} tuned on the input views: {steps} steps of Adam at {rate}".format_map(
+            yield "{what} tuned on the input views: {steps} steps of Adam at learning rate {rate}".format_map(
                 tuning
             )
         yield from self.remarks
 
 
 def as_json(value: Mapping[str, Any]) -> str:
-    """Return a file's text. Raises ValueError for NaN and infinities."""
+    """Return JSON text for a file. Raises ValueError for NaN and infinity."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

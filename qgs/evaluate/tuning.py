@@ -1,4 +1,4 @@
-"""Tuning at test time: the queries or latents of a scene, fitted to its input views (TokenGS)."""
+"""Tuning at test time: fit queries or latents of a scene to its input views (TokenGS)."""
 
 import re
 from typing import Any
@@ -15,23 +15,24 @@ from qgs.types import Gaussians, Prediction, Views
 
 
 def tuning_settings(tune: str | None) -> list[str]:
-    """Return the settings of "STEPS", "WHAT:STEPS" or "WHAT", which takes 50 steps (TokenGS).
+    """Return recipe overrides for the value of --tune: "STEPS", "WHAT:STEPS" or "WHAT".
 
-    WHAT: queries or latents. Raises ValueError for any other text.
+    WHAT: queries or latents, for 50 steps by default (TokenGS). Raises ValueError for other text.
     """
     if tune is None:
         return []
     match = re.fullmatch(r"(?:(queries|latents)(?::|$))?(\d*)", tune)
     if match is None or not tune:
-        raise ValueError(f"tuning is STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
+        raise ValueError(f"tuning must be STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
     what = [f"evaluation.tuning={match[1]}"] if match[1] else []
     return [f"evaluation.tuning_steps={match[2] or 50}", *what]
 
 
 def tuning_loss(recipe: Recipe) -> Photometric:
-    """Return the first `qgs/photometric` loss of `recipe`, which tuning minimises, else a default.
+    """Return the loss that tuning minimises: the first `qgs/photometric` of `recipe`, or a default.
 
-    Weights that follow the training are those of its end, so that a protocol means one thing.
+    Scheduled weights have their values at the end of training, so that equal protocols mean the
+    same loss.
     """
     # The photometric loss reads no weights of others, which may be large.
     losses = recipe.build_losses(pretrained=False).values()
@@ -45,15 +46,15 @@ def tuning_loss(recipe: Recipe) -> Photometric:
 def tune(
     model: QueryGaussianModel, views: Views, recipe: Recipe
 ) -> tuple[Gaussians, dict[str, Any]]:
-    """Fit the queries or latents of scenes to their `views` (B, V). The weights stay.
+    """Fit queries or latents of scenes to their input `views` (B, V). The weights do not change.
 
-    evaluation.tuning of the recipe: "queries", all features and floating fields of the initial
-    state, so LocusGS's anchors too; or "latents", the features of the image memory; the encoder
-    makes keys and values of them anew in every step. `tuning_loss` compares the last layer with the
-    photos; the optimiser is Adam. TokenGS takes 50 steps, at a rate of 1e-4 of queries and 1e-2 of
-    latents.
+    `evaluation.tuning` of the recipe decides what is fitted: "queries" are all features and
+    floating-point fields of the initial state, including LocusGS's anchors; "latents" are the
+    features of the image memory, from which the encoder recomputes keys and values in every step.
+    Adam minimises `tuning_loss` between renderings of the last layer and the photos. TokenGS takes
+    50 steps, with a learning rate of 1e-4 for queries and 1e-2 for latents.
 
-    Returns the Gaussians of what was tuned, and a record of the tuning.
+    Returns the Gaussians after tuning, and a record of settings and losses.
     """
     settings = recipe.evaluation
     loss = tuning_loss(recipe)

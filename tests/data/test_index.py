@@ -56,7 +56,7 @@ REFUSED = """
 {"a": {"context": ["0"], "target": [1]}} | a.context.0: Input should be a valid int
 {"a": {"context": [0.5], "target": [1]}} | a.context.0: Input should be a valid int
 ["a"] | file: Input should be a valid dictionary
-{"a": null} | names no scene to judge
+{"a": null} | names no scene to score
 {"a": | Expecting value
 """
 

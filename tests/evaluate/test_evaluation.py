@@ -159,7 +159,7 @@ def test_evaluations_write_the_same_files(judged, tmp_path):
     assert protocol["name"] == "rooms-2view"
     assert hashlib.sha256(files["protocol.json"]).hexdigest() == protocol["sha256"]
     assert " MAE ↓ |" in files["table.md"].decode()
-    told = "masked is not complete: it needs masks, not known for 1 of 2 scenes"
+    told = "masked is not complete: it needs masks, which 1 of 2 scenes lack"
     for text in ("MAE ↓", f" {summary['model']['mae']:.5f} ", told):
         assert text in shown(evaluation)
 
@@ -171,8 +171,8 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(tmp_path):
     evaluation = evaluate(recipe.build_model(), recipe)
     summary = evaluation.summary()
     assert summary["missing"] == {
-        "test/000001": "the index names frames 99, -1, the scene has 0 to 7",
-        "gone": "not among the test scenes of the data",
+        "test/000001": "the index names frames 99, -1, but the scene has only 0 to 7",
+        "gone": "this is not one of the test scenes of the data",
     }
     evaluation.write(tmp_path)
     table = (tmp_path / "table.md").read_text()
@@ -229,7 +229,9 @@ def test_tuned_evaluations_say_so_and_score_the_tuned_tokens():
     told = second.summary()["tuning"]
     assert (told["what"], told["steps"]) == ("queries", 2)
     assert first.scores[0].values["model_psnr"] != second.scores[0].values["model_psnr"]
-    assert "queries tuned on the input views: 2 steps of Adam at 0.0001" in shown(second)
+    assert "queries tuned on the input views: 2 steps of Adam at learning rate 0.0001" in shown(
+        second
+    )
 
 
 def test_a_protocol_has_a_metrics_definition_and_options():
