@@ -1,4 +1,4 @@
-"""The `qgs` command; heavy imports wait until one of its commands runs."""
+"""The program `qgs`. Heavy packages are imported only when one of its commands runs."""
 
 import os
 import sys
@@ -14,11 +14,11 @@ from qgs.terminal import show_safely
 from qgs.wording import did_you_mean, listed
 
 GROUP = "qgs.commands"
-"""Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
+"""Entry-point group for commands of plug-ins: NAME = "module:app", with a `typer.Typer` `app`."""
 
 
 class CommandGroup(TyperGroup):
-    """Commands of the core, then those of plug-ins, which cannot replace a core command."""
+    """Commands of the core and of plug-ins. A plug-in cannot replace a core command."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of all commands, core commands first."""
@@ -27,7 +27,7 @@ class CommandGroup(TyperGroup):
         return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command of the core or of a plug-in. Raises ValueError if neither has it."""
+        """Return the command `cmd_name` of the core or a plug-in; raise ValueError without one."""
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own
@@ -35,14 +35,17 @@ class CommandGroup(TyperGroup):
         if not offers:
             hint = did_you_mean(cmd_name, self.list_commands(ctx), "commands")
             raise ValueError(
-                f"there is no command `qgs {cmd_name}` here. If a plug-in has it, {INSTALL_ALL}; "
+                f"there is no command `qgs {cmd_name}`. If it belongs to a plug-in, {INSTALL_ALL}; "
                 f"{hint}"
             )
         return offered_command(cmd_name, offers)
 
 
 def offered_command(name: str, offers: list[EntryPoint]) -> Any:
-    """Import the command `name` of a plug-in. If that fails, calling the command says why."""
+    """Import the command `name` of a plug-in. If the import fails, the command raises ValueError.
+
+    offers: entry points with this name; several are an error.
+    """
     try:
         (entry,) = offers
         offered = entry.load()
@@ -52,7 +55,7 @@ def offered_command(name: str, offers: list[EntryPoint]) -> Any:
         releases = [f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist]
         reason = (
             f"the command `qgs {name}` of {listed(sorted(releases))} cannot be used: "
-            f"{type(error).__name__}: {error}; update it, or uninstall all of these but one"
+            f"{type(error).__name__}: {error}; update it, or keep only one of several"
         )
 
         def refuse() -> None:
@@ -89,7 +92,7 @@ for _name, _command in COMMANDS.items():
 
 
 def main() -> None:
-    """Run the command line. A user's mistake gives a message without traceback, and exit code 2.
+    """Run the program. A mistake of the user prints a message without traceback; exit code 2.
 
     The environment variable QGS_DEBUG=1 shows the traceback.
     """
@@ -102,7 +105,7 @@ def main() -> None:
         from qgs.machine import is_out_of_memory
 
         if is_out_of_memory(error):
-            error.add_note("Out of memory: take fewer or smaller images, a smaller batch or model")
+            error.add_note("Out of memory: use fewer or smaller images, a smaller batch or model")
         theirs = not isinstance(error, RuntimeError)
         theirs |= isinstance(error, MissingExtraError) or is_out_of_memory(error)
         if os.environ.get("QGS_DEBUG") or not theirs:
@@ -110,6 +113,6 @@ def main() -> None:
         # A note of several lines is the traceback of another process.
         notes = [note for note in getattr(error, "__notes__", ()) if "\n" not in note]
         message = f"error: {str(error) or type(error).__name__}"
-        for line in (message, *notes, "(QGS_DEBUG=1 shows where it was raised)"):
+        for line in (message, *notes, "(set QGS_DEBUG=1 to see the traceback)"):
             print(line, file=sys.stderr)
         raise SystemExit(2) from None

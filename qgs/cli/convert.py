@@ -7,19 +7,19 @@ import typer
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="PLY file of any 3DGS program.")],
+    source: Annotated[Path, typer.Argument(metavar="IN", help="PLY file in the format of 3DGS.")],
     out: Annotated[
         Path,
         typer.Argument(
-            metavar="OUT", help="New file: .ply, .splat or a plugin's format. Never overwrites."
+            metavar="OUT", help="New file: .ply, .splat or a plug-in's format. Must not exist yet."
         ),
     ],
     count: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of Gaussians to keep, most opaque first. Default: all."),
+        typer.Option(min=1, help="Number of Gaussians to keep: the most opaque. Default: all."),
     ] = None,
 ) -> None:
-    """Write Gaussians to another file: PLY, .splat or a plugin's format.
+    """Convert a PLY file of Gaussians to PLY, .splat or a plug-in's format.
 
     --count keeps only the most opaque Gaussians.
     """

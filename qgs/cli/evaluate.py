@@ -24,14 +24,14 @@ def evaluate(
     overrides: Overrides = None,
     index: Annotated[
         str | None,
-        typer.Option(help="JSON file of scenes and frames. Sets evaluation.index."),
+        typer.Option(help="JSON file with the scenes and frames to score. Sets evaluation.index."),
     ] = None,
     tune: Tune = None,
     out: Annotated[
         Path | None,
         typer.Option(
             help="Folder for the results. Default: RUN/evaluation; RUN/evaluation-N if settings "
-            "change; evaluation_NAME for a shipped model or a URL."
+            "differ from the run's; ./evaluation_NAME for a shipped model or a URL."
         ),
     ] = None,
     strict: Annotated[
@@ -40,9 +40,10 @@ def evaluate(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Evaluate a checkpoint on unseen views.
+    """Score a checkpoint on views that it has not seen.
 
-    Two baselines are scored too: the nearest input view and the mean colour.
+    Two baselines without a model are scored too: the nearest input view and the mean
+    colour of the inputs.
     """
     console = Console()
     settings = list(overrides or ())
@@ -82,10 +83,11 @@ def evaluate(
 
 
 def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:
-    """Return RUN/evaluation for RUN/checkpoint.safetensors, RUN/evaluation_ema for checkpoint_ema.
+    """Return the default folder for results, such as RUN/evaluation beside RUN/checkpoint.
 
-    other: settings differ from the recipe; return the first unused of RUN/evaluation-2, -3, ...
-    own: the checkpoint is the user's; otherwise return a new folder in the working directory.
+    RUN/checkpoint_ema gets RUN/evaluation_ema. other: settings differ from the recipe; return the
+    first unused of RUN/evaluation-2, RUN/evaluation-3, ... own: the checkpoint is a file of the
+    user. Otherwise return an unused folder in the working directory.
     """
     checkpoint = checkpoint if own else Path(checkpoint.name)
     label = checkpoint.stem.removeprefix("checkpoint").removeprefix("_")
@@ -103,13 +105,13 @@ def evaluate_into(
     folder: Path,
     console: Console,
 ) -> Evaluation:
-    """Evaluate `model` by `recipe`, write the results into `folder` and print them."""
+    """Evaluate `model` as `recipe` says, write the results into `folder` and print them."""
     from rich.progress import Progress
 
     from qgs.evaluate.evaluation import evaluate as judge
 
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("judging scenes", total=None)
+        task = progress.add_task("scoring scenes", total=None)
         evaluation = judge(
             model,
             recipe,
@@ -118,5 +120,5 @@ def evaluate_into(
         )
     evaluation.write(folder)
     evaluation.show(console)
-    console.print(f"written to {folder}", soft_wrap=True)
+    console.print(f"results are in {folder}", soft_wrap=True)
     return evaluation

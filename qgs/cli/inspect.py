@@ -9,13 +9,16 @@ from rich.console import Console
 
 from qgs.cli.options import Overrides
 
-RecipeFile: TypeAlias = Annotated[Path, typer.Argument(help="Recipe file.")]
+RecipeFile: TypeAlias = Annotated[
+    Path, typer.Argument(help="Recipe file, or the name of a recipe that comes with qgs.")
+]
 
 
 def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
-    """Print the resolved recipe, the origin of each value, and parameters per component.
+    """Print the recipe with all defaults, the origin of each value, and parameter counts.
 
-    The recipe goes to standard output and is valid YAML; the parameters go to standard error.
+    The recipe is printed as YAML to standard output, the parameter counts of components
+    to standard error.
     """
     from qgs.model_text import parameter_counts, slot_rows
     from qgs.recipe import resolve
@@ -36,16 +39,19 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
 
 def recipes(
     name: Annotated[
-        str | None, typer.Argument(help="Recipe to show, such as tiny/locus.yaml.")
+        str | None, typer.Argument(help="Recipe to print, such as tiny/locus.yaml.")
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder to copy the recipe and its bases to. Never overwrites."),
+        typer.Option(
+            help="Folder for a copy of the recipe and the files it extends. Never overwrites files."
+        ),
     ] = None,
 ) -> None:
-    """List the recipes that come with qgs, or show one. Every command takes their names.
+    """List the recipes that come with qgs, or print one of them.
 
-    Commands prefer a file of that name in the working directory.
+    All commands accept the names of these recipes. A file of the same name in the working
+    directory comes first.
     """
     from qgs.files import refuse_existing, write_text
     from qgs.recipe.files import files_of, recipe_folder
@@ -56,7 +62,7 @@ def recipes(
     known = {path.relative_to(home).as_posix(): path for path in sorted(files)}
     if name is None:
         if out:
-            raise ValueError("give the name of a recipe before --out")
+            raise ValueError("--out needs a recipe to copy: qgs recipes NAME --out FOLDER")
         for label, path in known.items():
             lines = path.read_text(encoding="utf-8").splitlines()
             comment = takewhile(lambda line: line.startswith("#"), lines)

@@ -6,35 +6,43 @@ from typing import Annotated, TypeAlias
 import typer
 
 Checkpoint: TypeAlias = Annotated[
-    str, typer.Argument(help="Run folder, checkpoint, its URL, or a shipped model: PLUGIN/NAME.")
+    str,
+    typer.Argument(
+        help="Run folder, checkpoint file, URL of a checkpoint, or model of a plug-in: PLUGIN/NAME."
+    ),
 ]
 Overrides: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change an option of the recipe, such as model.queries.count=128."),
+    typer.Option(
+        "--set", help="Change an option of the recipe: model.queries.count=128. Repeatable."
+    ),
 ]
 Threads: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="CPU threads. Default: all cores.")
+    int | None, typer.Option(min=1, help="Number of CPU threads. Default: all cores.")
 ]
 Device: TypeAlias = Annotated[
-    str, typer.Option(help="auto, cpu or cuda. auto uses CUDA if gsplat is installed.")
+    str,
+    typer.Option(
+        help="auto, cpu or cuda. auto uses CUDA if there is a GPU and gsplat is installed."
+    ),
 ]
 Size: TypeAlias = Annotated[
     str | None,
     typer.Option(
         metavar="HxW",
-        help="Height and width of the photos. Default: whole photos, the shorter side from the "
-        "recipe's data.image_size.",
+        help="Height and width to which photos are cropped and resized. Default: no cropping; the "
+        "shorter side of the recipe's data.image_size.",
     ),
 ]
 Inputs: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Number of input views. Default: the recipe's.")
+    int | None, typer.Option(min=1, help="Number of input views. Default: as in the recipe.")
 ]
 Frames: TypeAlias = Annotated[
     str | None,
-    typer.Option(help="Input photos by number or name: 0,8,x.jpg. Default: chosen by qgs."),
+    typer.Option(help="Input photos by number or file name: 0,8,x.jpg. Default: qgs chooses."),
 ]
 SceneName: TypeAlias = Annotated[
-    str | None, typer.Option("--scene", help="Scene to use, if there are several.")
+    str | None, typer.Option("--scene", help="Name of the scene to use, if the data has several.")
 ]
 ViewsSettings: TypeAlias = Annotated[
     list[str] | None,
@@ -43,7 +51,7 @@ ViewsSettings: TypeAlias = Annotated[
 Scale: TypeAlias = Annotated[
     float | None,
     typer.Option(
-        help="Scale of the cameras' positions. Default: search for the scale at which the model "
+        help="Factor for all camera positions. Default: search for the factor with which the model "
         "renders your photos best."
     ),
 ]
@@ -51,23 +59,23 @@ Tune: TypeAlias = Annotated[
     str | None,
     typer.Option(
         metavar="[WHAT:]STEPS",
-        help="Fit the queries to the input photos first, for STEPS steps; latents:STEPS fits the "
-        "photos' features instead. 0: no fitting.",
+        help="Fit the queries to the input photos for STEPS steps before rendering. latents:STEPS "
+        "fits the features of the photos, not the queries. 0: no fitting.",
     ),
 ]
 
 
 def scale_settings(scale: float | None) -> list[str]:
-    """Return the settings of --scale. Raises ValueError for a factor that is not above 0."""
+    """Return recipe overrides for the value of --scale; raise ValueError unless it is positive."""
     if scale is None:
         return []
     if not 0 < scale < float("inf"):
-        raise ValueError(f"--scale must be a factor above 0, such as 0.4, got {scale:g}")
+        raise ValueError(f"--scale must be a positive factor, such as 0.4, got {scale:g}")
     return ["views.scale=constant", f"views.scale_factor={scale}"]
 
 
 def use_threads(threads: int | None) -> None:
-    """Compute on that many CPU threads; None leaves torch's choice."""
+    """Let torch use this number of CPU threads; None keeps torch's default."""
     if threads is not None:
         import torch
 
@@ -75,7 +83,7 @@ def use_threads(threads: int | None) -> None:
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
-    """Return (H, W) of "HxW"; raises ValueError for anything else."""
+    """Return (H, W) in pixels for the text "HxW"; raise ValueError for other text."""
     if text is None:
         return None
     # Height first, as in recipes and tensors.

@@ -30,15 +30,20 @@ if TYPE_CHECKING:
 def reconstruct(
     checkpoint: Checkpoint,
     photos: Annotated[
-        str, typer.Argument(help="Folder of photos, chunks or archives, its URL, or a video.")
+        str, typer.Argument(help="Folder or URL of photos or of a data set, or a video file.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the results, or .ply/.splat file.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder for all results, or .ply or .splat file for the Gaussians alone."
+        ),
+    ],
     inputs: Inputs = None,
     frames: Frames = None,
     holdout: Annotated[
         str | None,
         typer.Option(
-            help="Photos to score, or none. Default: held-out photos (every eighth) near inputs."
+            help="Photos to score, or `none`. Default: held-out (every eighth) near the inputs."
         ),
     ] = None,
     tune: Tune = None,
@@ -46,17 +51,20 @@ def reconstruct(
     overrides: ViewsSettings = None,
     overwrite: Annotated[
         bool,
-        typer.Option("--overwrite", help="Write into a folder with files, or over a file."),
+        typer.Option(
+            "--overwrite", help="Write into a folder that is not empty, or over an existing file."
+        ),
     ] = False,
     size: Size = None,
     scene_name: SceneName = None,
     threads: options.Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Reconstruct a scene from photos: PLY, renders beside photos, depth, an orbit, cameras.
+    """Reconstruct a scene from photos.
 
-    Held-out photos are rendered and scored. For your own photos, qgs searches
-    the scale of the world.
+    Writes Gaussians (PLY), renderings beside the photos, depth maps, renderings of an
+    orbit, and the cameras. Held-out photos are rendered and scored. For your own photos,
+    qgs searches for the best scale of the camera positions.
 
     Afterwards, `qgs refine OUT PHOTOS` fits the Gaussians to all photos, and
     `qgs video OUT` makes a video of them.
@@ -88,10 +96,10 @@ def reconstruct(
 
 
 def _refuse_unusable(out: Path, overwrite: bool) -> None:
-    """Raise an error before any work if `out` cannot be written."""
+    """Raise an error before any work if `out` exists and is not empty, or cannot be written."""
     # This comes before heavy imports, so that the user need not wait.
     if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
-        raise FileExistsError(f"{out} is not empty: choose another --out, or add --overwrite")
+        raise FileExistsError(f"{out} already exists: choose another --out, or add --overwrite")
 
     from qgs.reconstruction.scene_formats import scene_writers
 
@@ -101,7 +109,7 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
 
 
 def show(result: Reconstruction, console: Console) -> None:
-    """Print PSNR of all views and of the baselines, means by kind, and the remarks."""
+    """Print the PSNR of all views and of the baselines, means by kind of view, and remarks."""
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
     from qgs.reconstruction.result import KINDS
@@ -119,11 +127,11 @@ def show(result: Reconstruction, console: Console) -> None:
             table.append([kind, numbered(score.frame, file), *map(shown, row)])
         if rows:
             means = [shown(sum(values) / len(rows)) for values in zip(*rows, strict=True)]
-            table.append([f"{kind}, mean", str(len(rows)), *means])
+            table.append([f"mean of {kind}", str(len(rows)), *means])
     print_table(console, title, table)
     if tuning := result.tuning:
         text = (
-            "{steps} steps of tuning the {what}: photometric loss of the inputs "
+            "{steps} steps of tuning the {what}: photometric loss of the input views "
             "{loss_before:.5f} -> {loss_after:.5f}"
         )
         print_lines(console, [text.format(**tuning)])

@@ -21,20 +21,22 @@ if TYPE_CHECKING:
 
 def train(
     recipe: RecipeFile,
-    out: Annotated[Path, typer.Option(help="New folder for the run. Never overwrites.")],
+    out: Annotated[Path, typer.Option(help="New folder for the run. Must be empty or not exist.")],
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Continue the run in --out; start it if there is none."),
+        typer.Option(
+            "--resume", help="Continue the run in the folder --out; start a run if there is none."
+        ),
     ] = False,
     overrides: Overrides = None,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Train a model, then evaluate it on views it never saw.
+    """Train a model, then evaluate it on views that it has not seen.
 
-    Ctrl-C or SIGTERM finishes the step, saves, and exits with code 128 + signal.
-    To continue, run the same command with --resume. A killed process continues
-    from its last save. The result equals that of a run without a stop.
+    Ctrl-C or SIGTERM finishes the step, saves the run, and exits with code 128 + signal.
+    To continue, run the same command with --resume. A killed process continues from the
+    last save. The result is the same as without interruption.
 
     On 8 GPUs:
 
@@ -64,7 +66,7 @@ def train(
         folder = result.folder.evaluation
         # The protocol is written last, so the evaluation is complete.
         if finished and (folder / "protocol.json").exists():
-            console.print(f"evaluated before, see {folder}")
+            console.print(f"already evaluated, see {folder}")
         elif not result.stopped_by:
             evaluate_into(result.model, resolved, result.steps, folder, console)
     if result.stopped_by:
@@ -72,8 +74,8 @@ def train(
 
 
 def _report(result: TrainingResult, console: Console) -> None:
-    """Print what the training wrote, and how to continue."""
-    before = "was already finished: " if result.resumed_at == result.steps else ""
+    """Print the result of training and, if it was stopped, how to continue."""
+    before = "already finished: " if result.resumed_at == result.steps else ""
     made = f"{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}"
     console.print(f"{before}{made}")
     if result.stopped_by:
@@ -82,7 +84,7 @@ def _report(result: TrainingResult, console: Console) -> None:
 
 
 def with_absolute_path(recipe: Recipe) -> Recipe:
-    """Make paths of data and index absolute, so that the run can be evaluated from anywhere."""
+    """Make paths of data and index absolute, so that `qgs eval` works in every directory."""
     from qgs.paths import is_local, opened_path
 
     def absolute(section: dict[str, Any], *keys: str) -> dict[str, Any]:

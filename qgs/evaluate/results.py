@@ -207,7 +207,7 @@ class Evaluation:
             f"{OPACITY_USED:.4f}; mean over scenes)"
         )
         if tuning := content["tuning"]:
-            yield "{what} tuned on the input views: {steps} steps of Adam at learning rate {rate}".format_map(
+            yield "{what} tuned on the inputs: {steps} Adam steps, learning rate {rate}".format_map(
                 tuning
             )
         yield from self.remarks

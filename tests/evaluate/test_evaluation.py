@@ -229,9 +229,7 @@ def test_tuned_evaluations_say_so_and_score_the_tuned_tokens():
     told = second.summary()["tuning"]
     assert (told["what"], told["steps"]) == ("queries", 2)
     assert first.scores[0].values["model_psnr"] != second.scores[0].values["model_psnr"]
-    assert "queries tuned on the input views: 2 steps of Adam at learning rate 0.0001" in shown(
-        second
-    )
+    assert "queries tuned on the inputs: 2 Adam steps, learning rate 0.0001" in shown(second)
 
 
 def test_a_protocol_has_a_metrics_definition_and_options():
