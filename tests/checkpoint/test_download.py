@@ -79,7 +79,7 @@ FAILURES = yaml.safe_load("""
 401: "401"
 500: "500"
 page: web page
-short: whole safetensors
+short: complete safetensors
 huge: larger than
 endless: larger than
 silent: timed out
