@@ -1,4 +1,4 @@
-"""Sources of scenes, and how views are drawn from them."""
+"""Sources of scenes, and samplers that draw input and target views from scenes."""
 
 from qgs.contracts import Component
 from qgs.data.photos.source import PhotosSource

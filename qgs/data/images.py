@@ -1,4 +1,4 @@
-"""Image, mask and depth files as arrays, and crops with their intrinsics."""
+"""Decoding of images, masks and depth maps, and crops that adapt camera intrinsics."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ from qgs.paths import LARGEST, open_file
 from qgs.types import Size
 from qgs.wording import name_shown
 
-TURNED = "have an EXIF orientation, which is ignored: they are read as stored"
+TURNED = "have an EXIF orientation, which is ignored: their pixels are read as stored"
 TURN = "poses must belong to the stored pixels; `mogrify -auto-orient` rotates the stored pixels"
 
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV")
@@ -39,9 +39,10 @@ Decoded = TypeVar("Decoded")
 
 @dataclass(frozen=True)
 class CropResize:
-    """Centre crop to the target's aspect ratio, then resize; sizes are (H, W) in pixels.
+    """Centre crop to the aspect ratio of a target size, then resize to it.
 
-    zoom: factor by which the crop is smaller than the largest possible one.
+    Sizes are (H, W) in pixels. zoom: factor by which the crop is smaller than the largest possible
+    crop.
     """
 
     source: Size
@@ -50,7 +51,7 @@ class CropResize:
 
     @property
     def scale(self) -> float:
-        """Target pixels per source pixel, the same along both axes."""
+        """Ratio of target pixels to source pixels, the same along both axes."""
         return self.zoom * max(self.target[0] / self.source[0], self.target[1] / self.source[1])
 
     @property
@@ -65,7 +66,10 @@ class CropResize:
         return max(left, 0.0), max(top, 0.0), min(left + across, width), min(top + down, height)
 
     def intrinsics(self, source: Tensor) -> Tensor:
-        """Return fx, fy, cx, cy (..., 4) after the crop (shift), then the resize (scale)."""
+        """Return intrinsics fx, fy, cx, cy (..., 4) in pixels of the resized crop.
+
+        source: intrinsics (..., 4) in pixels of the whole image.
+        """
         left, top, _, _ = self.box
         return (source - source.new_tensor([0.0, 0.0, left, top])) * self.scale
 
@@ -77,7 +81,7 @@ class CropResize:
 
 
 def read_image(path: Path | UPath, decode: Callable[[IO[bytes]], Decoded]) -> Decoded:
-    """Return the result of `decode` for the file at `path`; raises ValueError if that fails."""
+    """Return the result of `decode` for the file at `path`; raise ValueError if it fails."""
     try:
         with open_file(path) as file:
             return decode(file)
@@ -99,7 +103,7 @@ def image_size(file: IO[bytes]) -> Size:
 
 
 def orientation(image: Image.Image) -> int:
-    """Return the EXIF orientation of an image; 1 means not turned."""
+    """Return the EXIF orientation of an image, 1 to 8; 1 means not turned."""
     try:
         return image.getexif().get(_ORIENTATION, 1)
     # Pillow raises any kind of error for damaged EXIF, which is ignored.
@@ -108,20 +112,20 @@ def orientation(image: Image.Image) -> int:
 
 
 def decode_alpha(file: IO[bytes]) -> np.ndarray:
-    """Decode the alpha channel of a photo as (H, W) uint8; 255 if it has none. Raises OSError."""
+    """Decode the alpha channel of a photo as (H, W) uint8; all 255 without one. Raises OSError."""
     return np.array(eight_bits(_decoded(file)).convert("RGBA").getchannel("A"))
 
 
 def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
     """Decode a depth map, an image or .npy file, as (H, W) float32; 0 means unknown.
 
-    unit: world units per number in the file. Raises OSError and ValueError.
+    unit: depth in world units that the value 1 in the file means. Raises OSError and ValueError.
     """
     plain = file.read(len(_NPY)) == _NPY
     file.seek(0)
     depth = load_array(file).squeeze() if plain else np.array(_decoded(file))
     if depth.ndim != 2 or depth.dtype.kind not in "fiu":
-        wanted = "a depth map must have one number per pixel, such as a 16-bit image"
+        wanted = "a depth map must have one channel, as 16-bit images have"
         raise OSError(f"{wanted}, got {depth.dtype} {depth.shape}")
     with np.errstate(over="ignore", invalid="ignore"):
         metric = (depth * unit).astype(np.float32)
@@ -129,7 +133,7 @@ def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
 
 
 def load_array(file: IO[bytes]) -> np.ndarray:
-    """Read the array of a .npy file; raises ValueError for objects and for too large arrays."""
+    """Read a .npy file; raise ValueError for Python objects and for arrays that are too large."""
     # NumPy allocates the size in the header, so a tiny damaged file could ask for all memory.
     if np.lib.format.read_magic(file) == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
@@ -137,7 +141,7 @@ def load_array(file: IO[bytes]) -> np.ndarray:
         shape, _, dtype = np.lib.format.read_array_header_2_0(file)
     size = math.prod(shape) * dtype.itemsize
     if size > LARGEST:
-        raise ValueError(f"it has {decimal(size)}: scale it down")
+        raise ValueError(f"the array has {decimal(size)}: scale it down")
     file.seek(0)
     return np.load(file, allow_pickle=False)
 
@@ -145,9 +149,10 @@ def load_array(file: IO[bytes]) -> np.ndarray:
 def decode_rgb(
     file: IO[bytes], background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> Image.Image:
-    """Decode as RGB, over `background` in [0, 1]; raises OSError if the image cannot be read.
+    """Decode an image as RGB, (H, W, 3) uint8; raise OSError if it cannot be read.
 
-    Pixels stay where they are stored. `PhotoScene` applies the EXIF orientation.
+    background: colour in [0, 1] behind transparent pixels. The EXIF orientation is not applied;
+    `PhotoScene` does that.
     """
     image = eight_bits(_decoded(file))
     if image.has_transparency_data:
@@ -158,28 +163,28 @@ def decode_rgb(
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """Return `image` with 8 bits per channel.
+    """Convert `image` to 8 bits per channel.
 
-    Raises OSError for kinds without a known value of white: float, 32-bit and LAB files.
+    Raises OSError for images whose value of white is unknown: float, 32-bit and LAB.
     """
     if image.mode.startswith("I;16"):
         numbers = np.array(image).astype(np.uint32)
         # Rounded, so that 65535 becomes 255.
         return Image.fromarray(((numbers + 128) // 257).astype(np.uint8))
     if image.mode not in _EIGHT_BITS:
-        raise OSError(f"its pixels have the mode {image.mode!r}: use 8 or 16 bits per channel")
+        raise OSError(f"pixels have the mode {image.mode!r}: use 8 or 16 bits per channel")
     return image
 
 
 def decode_mask(file: IO[bytes]) -> np.ndarray:
-    """Decode a mask as (H, W) uint8, 255 for pixels to model; files of 0 and 1 work too.
+    """Decode a mask as (H, W) uint8, 255 for pixels to model. Files may have 1 in place of 255.
 
     Raises OSError if the file is not an image, or has colours or transparency.
     """
     rgba = np.array(eight_bits(_decoded(file)).convert("RGBA"))
     grey = rgba[..., 0]
     if (rgba[..., 1:3] != rgba[..., :1]).any() or (rgba[..., 3] != 255).any():
-        raise OSError("it has colours or transparency: use a grey image, white on the object")
+        raise OSError("the mask has colours or transparency: use a grey image, white on the object")
     # Some tools write 0 and 1.
     return grey * np.uint8(255) if grey.max() == 1 else grey
 
@@ -192,7 +197,7 @@ def _decoded(file: IO[bytes]) -> Image.Image:
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Return _FORMATS, plus HEIC if pillow-heif is installed."""
+    """Return the names of readable image formats; HEIC only if pillow-heif is installed."""
     try:
         import_module("pillow_heif").register_heif_opener()
     except ImportError:
@@ -202,15 +207,18 @@ def _formats() -> tuple[str, ...]:
 
 @contextmanager
 def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
-    """Open an image in a photo format without decoding it; raises OSError, also in the block."""
+    """Open an image file without decoding its pixels.
+
+    Errors of Pillow, also those in the block, become OSError.
+    """
     try:
         with Image.open(file, formats=_formats()) as image:
             if image.width * image.height > _MOST_PIXELS:
-                raise OSError(f"it has {image.width} x {image.height} pixels: scale it down")
+                raise OSError(f"the image has {image.width} x {image.height} pixels: scale it down")
             yield image
     except UnidentifiedImageError as error:
         raise OSError(
-            "its header has no known image format; HEIC needs `pip install pillow-heif`"
+            "the file has no known image format; HEIC needs `pip install pillow-heif`"
         ) from error
     except (OSError, MemoryError):
         raise

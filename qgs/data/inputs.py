@@ -1,8 +1,8 @@
-"""Choice of input photos: photos that overlap, as far apart as in training.
+"""Choice of input photos: they overlap, and are about as far apart as inputs in training.
 
-Distances are divided by the depth of the scene, which comes from the cameras alone or from matching
-photos. Source of the matching: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996),
-with planes parallel to each photo.
+Distances between cameras are divided by the depth of the scene. The depth comes from the cameras
+alone, or from matching photos. Source of the matching: A Space-Sweep Approach to True Multi-Image
+Matching (Collins 1996), with planes parallel to each photo.
 """
 
 import math
@@ -23,13 +23,13 @@ from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
 
 NOVEL = 6
-"""Most views to compare with by default."""
+"""Default limit on the number of photos that renderings are compared with."""
 BASELINE = (0.06, 0.25)
-"""Range of baselines per depth if those of training are unknown."""
+"""Range of baseline / scene depth of inputs, if the range of training is unknown."""
 TURN = 20.0
-"""Largest turn in degrees if that of training is unknown."""
+"""Largest angle in degrees between input cameras, if that of training is unknown."""
 VARIED = 20.0
-"""Factor between largest and least baseline of training above which its range is ignored."""
+"""Ratio of largest to least baseline of training, above which BASELINE replaces this range."""
 
 # Most frames to consider, because time grows with the square of their number.
 _MOST = 300
@@ -57,19 +57,19 @@ _MARGIN = 0.03
 def ranked_windows(
     frusta: "Frusta", inputs: int, held_out: Sequence[int] | None = None
 ) -> list[tuple[float, Frames, int]]:
-    """Return (cost, input frames, compared frame) for each window of a scene, the best first.
+    """Return (cost, input frames, target frame) of windows of a scene, the lowest cost first.
 
-    Each photo to compare with gets one window; these are the held-out photos if there are any. Its
-    `inputs` photos are near it, see most of it together, overlap, and are as far apart as in
-    training. The list is empty if all photos are inputs. The result is deterministic and does not
-    depend on the order of the frames. held_out: default is the scene's. Raises ValueError if there
-    are fewer photos than inputs.
+    Each target has one window. Targets are the held-out photos; without any, all photos. The
+    `inputs` input photos of a window are near the target, see most of it together, overlap, and are
+    as far apart as in training. The list is empty if all photos are inputs. The result is
+    deterministic and does not depend on the order of the frames. held_out: held-out frames, by
+    default the scene's. Raises ValueError if there are fewer photos than inputs.
     """
     scene = frusta.scene
     held = sorted(scene.held_out if held_out is None else held_out)
     usable = [frame for frame in range(len(scene)) if frame not in held]
     if inputs > len(usable):
-        besides = f" beside {len(held)} held-out ones" if held else ""
+        besides = f" besides {len(held)} held-out photos" if held else ""
         raise ValueError(
             f"there are {len(usable)} photos{besides}, too few for {inputs} input views: add "
             "photos, use fewer inputs, or hold out no photos"
@@ -80,7 +80,7 @@ def ranked_windows(
 
 
 def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
-    """Return training's least and largest baseline per depth, and its largest turn in degrees."""
+    """Return least and largest baseline / depth of training, and the largest angle in degrees."""
     ranges = trained_on.ranges
     least, most = ranges.get("baseline", (0.0, math.inf))
     if most > VARIED * least:
@@ -92,9 +92,9 @@ def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
 
 
 class Frusta:
-    """Cameras of a scene in units of a depth, and the overlap of their views.
+    """Cameras of a scene, in units of the scene's depth, and the overlap of their views.
 
-    depth: default is `scene_depth`.
+    depth: scene depth in the scene's unit, by default `scene_depth`.
     """
 
     def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:
@@ -112,7 +112,10 @@ class Frusta:
         self.far = self.apart / self.high + self.turns / max(self.most_turn, 1.0)
 
     def seen(self, frame: int, others: Sequence[int]) -> np.ndarray:
-        """Return which points of a frame's view at depth 1 the others see, (points, others)."""
+        """Return which points at depth 1 in the view of `frame` are in view of `others`.
+
+        The result is a bool array (points, others).
+        """
         height, width = self.cameras.size
         own = self.cameras[frame]
         scale = own.intrinsics.new_tensor([_POINTS / width, _POINTS / height] * 2)
@@ -127,10 +130,10 @@ class Frusta:
         return inside.all(-1).T.numpy()
 
     def window(self, target: int, usable: Sequence[int], inputs: int) -> tuple[float, Frames]:
-        """Return the cost and the frames of the best `inputs` of `usable` for a target.
+        """Choose `inputs` input frames among `usable` for a target; return their cost and frames.
 
-        The weights come from a regression of novel-view PSNR on 580 windows of three scenes, in
-        units of 2 dB.
+        The weights in the cost come from a regression of novel-view PSNR on 580 windows of three
+        scenes. A cost of 1 is about 2 dB.
         """
         near = self._near(target, usable)
         seen = self.seen(target, near)
@@ -156,20 +159,20 @@ class Frusta:
         return float(cost[best]), self._filled(start, end, near, inputs)
 
     def _near(self, target: int, usable: Sequence[int]) -> list[int]:
-        """Return _NEAR frames around a target: the nearest, or evenly spaced in a slow video."""
+        """Return up to _NEAR frames around a target: the nearest; in a dense video, every nth."""
         others = sorted((f for f in usable if f != target), key=lambda f: self.far[target, f])
         inside = [f for f in others if self.apart[target, f] <= 2 * self.high]
         return evenly(inside, _NEAR) if len(inside) > _NEAR else others[:_NEAR]
 
     def _beside(self, frame: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the distances (n,) of a camera from the segments between cameras a and b."""
+        """Return the distances (n,) of a camera from the segments between cameras a and b (n,)."""
         start = self.centres[frame] - self.centres[a]
         way = self.centres[b] - self.centres[a]
         along = (start * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-12)
         return np.linalg.norm(start - along.clip(0, 1)[:, None] * way, axis=-1)
 
     def _filled(self, first: int, last: int, near: Sequence[int], inputs: int) -> Frames:
-        """Return both ends, then the frames nearest to even steps between them."""
+        """Return `first`, frames of `near` at even steps between both ends, and `last`."""
         if inputs == 1:
             return (first,)
         chosen = [first]
@@ -180,10 +183,10 @@ class Frusta:
         return (*chosen, last)
 
     def compared(self, window: Frames, target: int | None = None) -> Frames:
-        """Return frames to compare with: the target and the nearest frames that the inputs see.
+        """Return up to NOVEL frames to score: the target, and near frames in view of the inputs.
 
-        Without a target, the frames nearest to the inputs. At most NOVEL frames, and only held-out
-        ones besides the target if there are any.
+        Frames are near to the target, or without a target to the inputs. Besides the target, only
+        held-out frames are chosen if the scene has any.
         """
         inputs = list(window)
         first = [] if target is None else [target]
@@ -200,16 +203,16 @@ class Frusta:
 
 
 def _excess(value: np.ndarray | float, limit: np.ndarray | float) -> np.ndarray:
-    """Return the logarithm of value / limit; 0 if the value is below its limit."""
+    """Return the natural logarithm of value / limit; 0 if the value is below its limit."""
     return np.log(np.maximum(value / np.maximum(limit, 1e-9), 1))
 
 
 def scene_depth(scene: Scene) -> float:
-    """Return the depth of the scene in front of its cameras, in the scene's unit; above 0.
+    """Return the depth of the scene in front of its cameras, positive, in the scene's unit.
 
-    The first of these that exists: the depth of the point that all cameras look at
-    (`look_at_depth`), the median of a plane sweep over some photos, the largest distance of the
-    cameras, 1. Deterministic.
+    It is the first of these that exists: the depth of the point that all cameras look at
+    (`look_at_depth`), the median depth of a plane sweep over some photos, the largest distance
+    between cameras, 1. The result is deterministic.
     """
     c2w = scene.cameras.c2w.double()
     extent = float(largest_distance(c2w))
@@ -223,7 +226,10 @@ def scene_depth(scene: Scene) -> float:
 
 
 def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
-    """Return the depths (n,) of pixels of a photo for which one of the planes is clearly best."""
+    """Return the depths (n,) of those pixels of a photo that match other photos best at one plane.
+
+    planes: depths to try. extent: largest distance between cameras. Both are in scene units.
+    """
     others = _matched(scene, frame, extent)
     if not others:
         return planes[:0]
@@ -250,7 +256,7 @@ def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
 
 
 def _matched(scene: Scene, frame: int, extent: float) -> list[int]:
-    """Return frames to match a photo with: near, little turned, and neither ahead nor behind."""
+    """Return frames to match with `frame`: near it, similar direction, neither ahead nor behind."""
     c2w = scene.cameras.c2w.double()
     axes = c2w[:, :3, 2]
     ways = c2w[:, :3, 3] - c2w[frame, :3, 3]

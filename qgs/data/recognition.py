@@ -1,4 +1,4 @@
-"""Choice of the source that opens a path, and opening of data for a trained model."""
+"""Choice of the data source for a path, and opening of data for a trained model."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,9 +13,10 @@ from qgs.wording import one_line, warn_once
 
 
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
-    """Return PLUGIN/NAME of the first source that recognises `path`; otherwise qgs/photos.
+    """Return the name PLUGIN/NAME of the first source that recognises `path`, else qgs/photos.
 
-    If several do, a warning names all. Raises FileNotFoundError if `path` does not exist.
+    If several sources recognise it, a warning names all. Raises FileNotFoundError if `path` does
+    not exist.
     """
     if not path.exists():
         raise FileNotFoundError(
@@ -31,18 +32,18 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
                 found.append(kind)
         # A failing plug-in must not stop the others.
         except Exception as error:
-            warn_once(f"{kind} cannot tell whether it reads {path}: {one_line(error)}")
+            warn_once(f"{kind} failed to check whether it can read {path}: {one_line(error)}")
     if len(found) > 1:
         warn_once(
             f"{path} looks like data of {' and of '.join(found)}, and is read as {found[0]}; to "
-            "choose another one, set `data.type` in a recipe"
+            "choose another type, set `data.type` in a recipe"
         )
     # The errors of `qgs/photos` explain best what a folder lacks.
     return found[0] if found else "qgs/photos"
 
 
 def is_training_data(path: str, trained: SceneSourceConfig | None) -> bool:
-    """Return whether a model with the data `trained` was trained on the data at `path`."""
+    """Return whether the data at `path` was training data. trained: data options of the model."""
     root = getattr(trained, "path", None)
     if trained is None or not isinstance(root, str):
         return False
@@ -56,12 +57,12 @@ def open_for(
     trained: SceneSourceConfig | None,
     sources: Mapping[str, type[Component]],
 ) -> tuple[SceneSource, bool]:
-    """Open the data at `path`; also return whether a model with data `trained` was trained on it.
+    """Open the data at `path` for a model; return the source and whether the model trained on it.
 
-    Data of the training opens with the same options, including held-out frames. Other data opens
-    with the source from `recognised`, and `with_cameras` adds cameras to photos without them.
-    image_size: (H, W); default is that of `trained`. Raises the errors of `recognised` and of the
-    source.
+    Training data opens with the options of the training, including held-out frames. Other data
+    opens with the source from `recognised`; `with_cameras` adds cameras to photos without cameras.
+    trained: data options of the model. image_size: (H, W), by default that of `trained`. Raises
+    the errors of `recognised` and of the source.
     """
     size = image_size or (trained or SceneSourceConfig()).image_size
     source: Any

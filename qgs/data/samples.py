@@ -1,8 +1,8 @@
-"""Samples of scenes as a model sees them: views, coordinates, mirroring.
+"""Samples of scenes: the views in a model's coordinates, mirrored if asked.
 
 Source: TokenGS release (pose normalisation, mirroring).
 Everything here is a pure function of its arguments, including the random generator. NumPy copies
-the images on one thread, because threads of torch would wait for cores that training uses.
+images on one thread, because threads of torch would wait for cores that training uses.
 """
 
 import math
@@ -31,10 +31,10 @@ from qgs.wording import listed, numbered, warn_once
 
 @dataclass(frozen=True)
 class Sample:
-    """Input and target Views (1, V) of one scene, in the frame of the inputs.
+    """Input and target Views (1, V) of one scene, in the model's coordinate frame.
 
-    world: reference pose (4, 4) and scale of that frame, from `own_world`. names: names of frames
-    that have one besides their number, such as a file.
+    world: reference pose (4, 4) and scale of this frame, see `own_world`. names: names of frames,
+    such as file names, by number; frames without a name are absent.
     """
 
     scene: str
@@ -46,13 +46,13 @@ class Sample:
     names: Mapping[int, str] = field(default_factory=dict)
 
     def label(self, frame: int) -> str:
-        """See `Scene`."""
+        """Return the number of a frame and its name, if any, for messages."""
         return numbered(frame, self.names.get(frame, ""))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Batch of B samples: inputs (B, V_in), targets (B, V_out), their scenes and frames.
+    """Batch of B samples: inputs (B, V_in), targets (B, V_out), names of scenes, and frames.
 
     Tensors are float32 and contiguous.
     """
@@ -63,7 +63,7 @@ class Batch:
     input_frames: tuple[Frames, ...]
     target_frames: tuple[Frames, ...]
     left_out: tuple[str, ...] = ()
-    """Samples that could not be made: scene, frame and reason."""
+    """Messages about samples that could not be made: scene, frame and reason."""
 
 
 def make_sample(
@@ -75,11 +75,11 @@ def make_sample(
     noise: np.random.Generator | None = None,
     depths: bool = False,
 ) -> Sample:
-    """Decode frames, normalise their poses, and mirror them if asked; returns float32.
+    """Decode the frames of a sample, normalise their poses, and mirror them if asked.
 
-    Poses are normalised in the scene's precision. noise: generator for `views.pose_noise`; None
-    adds no noise. depths: read depth maps if the scene has them; they are 0 in views with noisy
-    poses, because the noisy camera did not see that surface.
+    Poses are normalised in the scene's precision and returned in float32. noise: random generator
+    for `views.pose_noise`; None adds no noise. depths: read depth maps if the scene has them. They
+    are 0 (unknown) in views with noisy poses, because the moved camera did not see that surface.
     """
     world = own_world(scene, input_frames, views)
     both = views_in(world, scene, (*input_frames, *target_frames), depths)
@@ -105,9 +105,10 @@ def make_sample(
 
 
 def _asked(times: Tensor, inputs: int) -> Tensor | None:
-    """Return the time (1, 1) of the targets, or the median of the inputs without targets.
+    """Return the time (1, 1) of the targets; None if they have several times.
 
-    times: of inputs and targets, (1, V). None if the targets have several times.
+    Without targets, return the median time of the inputs. times: times (1, V) of inputs, then
+    targets. inputs: number of inputs.
     """
     asked = times[:, inputs:].unique() if times.shape[1] > inputs else times.median()
     return asked.reshape(1, 1) if asked.numel() == 1 else None
@@ -116,10 +117,10 @@ def _asked(times: Tensor, inputs: int) -> Tensor | None:
 def with_noise(
     cameras: Cameras, inputs: int, views: ViewsConfig, rng: np.random.Generator
 ) -> Cameras:
-    """Return cameras (1, F) with noise on the poses of all inputs but the first.
+    """Add noise to the poses of all input cameras but the first.
 
-    The first `inputs` cameras are the inputs. They turn and move by `ViewsConfig.pose_noise`. If it
-    is 0, no random numbers are drawn.
+    cameras: (1, F), of which the first `inputs` are the input cameras. They turn and move as
+    `ViewsConfig.pose_noise` says. If it is 0, no random numbers are drawn.
     """
     if not views.pose_noise:
         return cameras
@@ -139,7 +140,10 @@ def with_noise(
 def views_in(
     world: tuple[Tensor, Tensor], scene: Scene, frames: Frames, depths: bool = False
 ) -> Views:
-    """Read float32 views (1, F) of these frames in a world of `own_world`; times are 0 to 1."""
+    """Read frames as float32 views (1, F) in the coordinates `world`, the result of `own_world`.
+
+    Times are scaled to [0, 1]. depths: read depth maps if the scene has them.
+    """
     refuse_too_many(len(frames), scene)
     wanted = list(frames)
     masks = scene.masks(wanted)
@@ -156,7 +160,10 @@ def views_in(
 
 
 def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Cameras:
-    """Return cameras (1, F) of these frames in a world of `own_world`; decodes no image."""
+    """Return cameras (1, F) of frames in the coordinates `world`, the result of `own_world`.
+
+    No image is decoded.
+    """
     reference, scale = world
     cameras = scene.cameras[list(frames)]
     # float32 only now, because map coordinates have seven digits before the point.
@@ -165,24 +172,24 @@ def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Ca
 
 
 def from_0_to_1(times: Tensor) -> Tensor:
-    """Return times (F,) scaled to [0, 1] (TokenGS 2026.6); 0 if all are equal."""
+    """Return times (F,) scaled to [0, 1] (TokenGS 2026.6), or zeros if all are equal."""
     first, last = times.aminmax()
     return (times - first) / (last - first) if last > first else torch.zeros_like(times)
 
 
 def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[Tensor, Tensor]:
-    """Return the world in which a model sees these inputs of `scene`: reference pose and scale.
+    """Return the model's coordinate frame for given inputs: reference pose (4, 4) and 0-d scale.
 
-    A point p of this world is at reference (4, 4) applied to p / scale (0-d) in the scene's world.
-    `scale: auto` puts the point that all cameras of the scene look at to depth 1. Without such a
-    point (see `look_at_depth`) it warns, and makes the largest distance from the first camera 1.
-    Raises ValueError if a scale is needed but the cameras are at one point, and for `search`, which
-    needs a model.
+    A point p in the model's coordinates is the point reference @ (p / scale) of the scene. With
+    `scale: auto`, the point that all cameras of the scene look at gets depth 1. Without such a
+    point (see `look_at_depth`), a warning is logged, and the largest distance from the first camera
+    becomes 1. Raises ValueError if a scale is needed but the cameras are at one point, and for
+    `scale: search`, which needs a model.
     """
     if views.scale == "search":
         raise ValueError(
-            "views.scale: search needs a trained model, so it works only for a user's own photos; "
-            "write auto, distance or constant"
+            "views.scale: search needs a trained model, so it works only for the reconstruction of "
+            "a user's photos; write auto, distance or constant"
         )
     # From all cameras, so that a scene's scale does not depend on the drawn inputs.
     every = scene.cameras.c2w
@@ -212,7 +219,7 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
 
 
 def mirrored_views(views: Views) -> Views:
-    """Return the views mirrored in x: images, masks, depths, poses and principal point."""
+    """Mirror views in x: images, masks, depth maps, poses and principal points."""
     cameras = views.cameras
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
@@ -225,13 +232,16 @@ def mirrored_views(views: Views) -> Views:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Stack samples of equal view counts and image size; ValueError if only some have times."""
+    """Stack samples with equal numbers of views and equal image sizes.
+
+    Raises ValueError if some samples have times and others do not.
+    """
     # Models that read times need them in every sample of a batch.
     still = [sample.scene for sample in samples if sample.inputs.times is None]
     if 0 < len(still) < len(samples):
         raise ValueError(
-            f"a batch mixes scenes with times and scenes without ({listed(still)}): write 'time' "
-            "for the frames of all scenes, or of none"
+            f"a batch mixes scenes with times and scenes without times ({listed(still)}): write "
+            "'time' for the frames of all scenes, or of no scene"
         )
     return Batch(
         inputs=stack_views([sample.inputs for sample in samples]),
@@ -243,9 +253,10 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 
 def stack_views(views: Sequence[Views]) -> Views:
-    """Join views (b, V) to (B, V), on the CPU. Raises ValueError if only some have times.
+    """Join views (b, V) on the CPU to views (B, V).
 
-    If only some have masks or depths, the others get masks of 1 and depths of 0 (unknown).
+    If only some have masks or depths, masks of 1 and depths of 0 (unknown) are added. Raises
+    ValueError if only some have times.
     """
     others: list[dict[str, Any]] = [
         {"cameras": v.cameras, "times": v.times, "target_time": v.target_time} for v in views
@@ -259,7 +270,10 @@ def stack_views(views: Sequence[Views]) -> Views:
 def _stacked(
     maps: Sequence[Tensor | None], views: Sequence[Views], missing: Callable[[Tensor], Tensor]
 ) -> Tensor | None:
-    """Join maps (b, V, 1, H, W); `missing` replaces None. Return None if all are None."""
+    """Join maps (b, V, 1, H, W); return None if all are None.
+
+    missing: makes the map in place of a None, from one channel of the images.
+    """
     if all(part is None for part in maps):
         return None
     whole = [

@@ -1,4 +1,4 @@
-"""Parts that sources of scenes share: lists opened on demand, a cache."""
+"""Helpers for sources of scenes: a cache, and lists of scenes that open on demand."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -11,9 +11,10 @@ Value = TypeVar("Value")
 
 
 class BoundedCache(Generic[Value]):
-    """Thread-safe LRU cache, empty after pickling.
+    """Thread-safe cache that drops the least recently used values; empty after pickling.
 
-    limit: largest sum of the values' costs. cost: cost of a value; default is 1 each.
+    limit: largest sum of the costs of kept values. cost: function that returns the cost of a value;
+    by default each value costs 1.
     """
 
     def __init__(self, limit: int, cost: Callable[[Value], int] | None = None) -> None:
@@ -28,7 +29,7 @@ class BoundedCache(Generic[Value]):
         return type(self), (self._limit, self._cost)
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """Return the value kept for `key`; otherwise call `make` and keep its value if it fits."""
+        """Return the cached value of `key`; or call `make`, and cache the result if it fits."""
         with self._lock:
             if key in self._kept:
                 # The front is the least recently used.
@@ -48,7 +49,10 @@ class BoundedCache(Generic[Value]):
 
 
 class LazyScenes(Sequence[Scene]):
-    """Sequence of scenes, opened when indexed; at most 64 stay open. places: by scene name."""
+    """Sequence of scenes that open when they are indexed; at most 64 stay open.
+
+    places: what `open` needs besides the name to open a scene, by name of the scene.
+    """
 
     def __init__(self, places: Mapping[str, Any], open: Callable[[str, Any], Scene]) -> None:
         self.names = list(places)
@@ -69,7 +73,10 @@ class LazyScenes(Sequence[Scene]):
 
 
 class LazySource(SceneSource):
-    """Source of `LazyScenes`. splits: scenes of both splits, which `__init__` must set."""
+    """Base of sources whose scenes are `LazyScenes`. Their `__init__` must set `splits`.
+
+    splits: the scenes of "train" and "test".
+    """
 
     splits: Mapping[Split, LazyScenes]
 

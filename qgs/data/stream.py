@@ -1,4 +1,4 @@
-"""Endless numbered training batches: order of scenes, samples, decoding processes."""
+"""Endless training batches: order of scenes, random samples, and processes that decode."""
 
 import atexit
 import hashlib
@@ -29,17 +29,17 @@ from qgs.types import Cameras
 from qgs.wording import one_line
 
 MEASURED = 512
-"""Number of samples whose cameras `trained_domain` measures."""
+"""Number of training samples whose cameras `trained_domain` measures."""
 MAX_REPLACED = 10
-"""Most scenes to try in place of a failing one before training stops."""
+"""Number of replacements to try for a failing sample before training stops."""
 
 
 class SampleError(ValueError):
-    """Error: a training sample cannot be made; the message names the scene."""
+    """Error for a training sample that cannot be made; the message names the scene."""
 
 
 class WorkerError(ChildProcessError):
-    """Error: a process that decodes data was killed."""
+    """Error for a data-decoding process that ended suddenly."""
 
 
 def training_batches(
@@ -57,15 +57,17 @@ def training_batches(
     accumulate: int = 1,
     depths: bool = False,
 ) -> Generator[Batch, None, None]:
-    """Return batches start, start + 1, ... of an endless sequence, `batch_size` samples each.
+    """Return a generator of training batches without end, each with `batch_size` samples.
 
-    Sample k depends only on (seed, k). Global batch n has the samples from n * batch_size *
-    processes on, and every process gets the slice of its `rank`. `start` resumes exactly. The
-    numbers of processes and workers do not change the samples.
+    Samples are numbered, and sample k depends only on (seed, k). Batch n consists of the samples
+    from n * batch_size * processes on, split among the processes by `rank`. Numbers of processes
+    and workers therefore do not change the samples. start: number n of the first batch, to resume a
+    run exactly.
 
     workers: number of decoding processes; 0 decodes in a thread. Closing the generator ends them.
     skips, sampler, depths: see `SampleStream`. accumulate: batches per optimiser step.
-    Raises ValueError for no training scenes or too few frames, SampleError, and WorkerError.
+    Raises ValueError if there are no training scenes or too few frames, SampleError, and
+    WorkerError.
     """
     every = batch_size * processes
     stream = SampleStream(source, views, seed, skips, sampler, every * accumulate, depths)
@@ -81,11 +83,11 @@ def trained_domain(
     sampler: ViewSampler,
     steps: int,
 ) -> Domain:
-    """Measure the cameras of MEASURED training samples; no image is decoded.
+    """Measure the cameras of the first MEASURED training samples, without decoding images.
 
-    The samples are the first ones of training, drawn as at steps spread evenly from 0 to `steps`,
-    because the options of `sampler` may depend on the step. A scene that fails is left out here;
-    training itself reports it.
+    Since options of `sampler` may depend on the step, the samples are drawn at steps spread evenly
+    from 0 to `steps`, the length of training. Scenes that fail are left out here; training itself
+    reports them.
     """
     stream = SampleStream(source, views, seed, sampler=sampler)
     domain = Domain()
@@ -97,7 +99,7 @@ def trained_domain(
 
 
 def scenes_fingerprint(source: SceneSource) -> str:
-    """Return a hash of the indices of training scenes in their groups."""
+    """Return a hash of the training scenes' indices, grouped as by `SceneSource.groups`."""
     digest = hashlib.sha256()
     for group in filter(len, source.groups("train")):
         digest.update(len(group).to_bytes(8, "little") + np.asarray(group, "<i8").tobytes())
@@ -106,15 +108,15 @@ def scenes_fingerprint(source: SceneSource) -> str:
 
 @dataclass(eq=False)
 class SampleStream(Dataset[Batch | Exception]):
-    """Samples by number, each a function of (seed, number) alone.
+    """Endless stream of training samples. Each depends only on the seed and its number.
 
-    Each epoch visits the groups (see `SceneSource.groups`) in random order, and the scenes of a
-    group in random order. A copy in a worker opens the data itself on first use. Raises ValueError
-    without training scenes.
+    Each epoch visits the groups of scenes (see `SceneSource.groups`) in random order, and the
+    scenes of a group in random order. A copy in a worker process opens the data at first use.
+    Raises ValueError if there are no training scenes.
 
-    skips: replace a failing sample by one of the next scene, at most MAX_REPLACED times. sampler:
-    default is `Span`. per_step: samples per optimiser step, which give the step of a sample to the
-    sampler. depths: read depth maps, see `make_sample`.
+    skips: replace a failing sample by a sample of the next scene, up to MAX_REPLACED times.
+    sampler: view sampler, by default `Span`. per_step: number of samples per optimiser step, from
+    which the step of each sample is computed for the sampler. depths: see `make_sample`.
     """
 
     source: InitVar[SceneSource]
@@ -155,13 +157,16 @@ class SampleStream(Dataset[Batch | Exception]):
         return np.concatenate([rng.permutation(groups[index]) for index in shuffled])
 
     def batch(self, numbers: Sequence[int]) -> Batch:
-        """Make samples by number; raises ValueError for too few frames, else SampleError."""
+        """Make a batch of the samples with these numbers.
+
+        Raises ValueError if a scene has too few frames, and SampleError for other failures.
+        """
         left_out: list[str] = []
         batch = collate([self._sample(number, left_out) for number in numbers])
         return replace(batch, left_out=tuple(left_out))
 
     def __getitem__(self, numbers: Sequence[int]) -> Batch | Exception:
-        """Return `batch(numbers)` in a worker, or the failure as an exception."""
+        """Return `batch(numbers)` in a worker process; if it fails, return the exception."""
         try:
             return self.batch(numbers)
         except Exception as error:
@@ -180,12 +185,10 @@ class SampleStream(Dataset[Batch | Exception]):
                 if not self.skips or is_out_of_memory(error):
                     raise
                 left_out.append(one_line(error))
-        raise SampleError(
-            f"{MAX_REPLACED + 1} samples in a row failed, the last one: {left_out[-1]}"
-        )
+        raise SampleError(f"{MAX_REPLACED + 1} samples in a row failed; the last: {left_out[-1]}")
 
     def cameras(self, number: int, step: int) -> tuple[Cameras, Cameras]:
-        """Return drawn cameras (1, V) of inputs and targets as after `step` optimiser steps."""
+        """Return the cameras (1, V) of a sample's inputs and targets at an optimiser step."""
         rng = np.random.default_rng([self.seed, 1, number])
         scene = self._scene(number)
         _, inputs, targets = self._drawn(scene, rng, step)
@@ -197,7 +200,7 @@ class SampleStream(Dataset[Batch | Exception]):
     def _drawn(
         self, scene: Scene, rng: np.random.Generator, step: int
     ) -> tuple[bool, Frames, Frames]:
-        """Return whether a sample is mirrored, and its input and target frames, at random."""
+        """Draw at random whether a sample is mirrored, its input frames and its target frames."""
         mirror = bool(rng.random() < self.views.mirror)
         return mirror, *self._sampler.draw(scene, self.views, rng, step)
 
@@ -219,7 +222,7 @@ class SampleStream(Dataset[Batch | Exception]):
 def _from_thread(
     stream: SampleStream, numbers: Iterator[Sequence[int]]
 ) -> Generator[Batch, None, None]:
-    """Yield batches of these samples; make each one while the previous one is in use."""
+    """Yield a batch for each list of sample numbers, made in a thread while the last is in use."""
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
         pending = pool.submit(stream.batch, next(numbers))
         for following in numbers:
@@ -232,7 +235,10 @@ def _from_thread(
 def _from_workers(
     stream: SampleStream, numbers: Iterator[Sequence[int]], workers: int
 ) -> Generator[Batch, None, None]:
-    """Yield batches of these samples from processes, spawned as numba and torch survive no fork."""
+    """Yield a batch for each list of sample numbers, made in `workers` processes.
+
+    Processes are spawned, because numba and torch do not survive a fork.
+    """
     loader = DataLoader(
         stream,
         batch_size=None,

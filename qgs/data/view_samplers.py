@@ -1,6 +1,6 @@
 """Held-out frames of a scene, and the sampler `qgs/span` of training views.
 
-Source: TokenGS release (gap, targets from the span of the inputs).
+Source: TokenGS release (gap between inputs, targets from the span of the inputs).
 """
 
 from collections import defaultdict
@@ -21,23 +21,23 @@ _T = TypeVar("_T")
 
 
 def held_out_frames(total: int, every: int) -> Frames:
-    """Return every n-th frame, from n // 2 on, for n = `every`; with fewer frames, the middle one.
+    """Return every nth of `total` frames, starting at n // 2, with n = `every`.
 
-    Empty if `every` is 0 or `total` is at most 2.
+    With fewer than n frames, return the middle frame; none if `every` is 0 or `total` is at most 2.
     """
     every = min(every, total)
     return tuple(range(every // 2, total, every)) if every and total > 2 else ()
 
 
 def training_frames(scene: Scene) -> list[int]:
-    """Return the frames that training may see: all but the held-out ones."""
+    """Return all frames but the held-out frames, which training must not see."""
     return sorted({*range(len(scene))} - {*scene.held_out})
 
 
 def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
-    """Group frames by time; a static scene gives groups of one.
+    """Group frames by time, in ascending order; without times, each frame is a group.
 
-    frames: default is the frames of training.
+    frames: by default `training_frames`.
     """
     frames = training_frames(scene) if frames is None else frames
     if scene.times is None:
@@ -49,25 +49,28 @@ def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
 
 
 def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
-    """Return the least and largest gap for `count` moments; raises ValueError for too few."""
+    """Return least and largest gap between first and last input, in moments of a scene.
+
+    count: number of moments in the scene, see `moments`. Raises ValueError if they are too few.
+    """
     low, high = views.gap
     what = "frames" if scene.times is None else "times"
     if views.inputs - 1 > high:
         raise ValueError(
             f"views.inputs is {views.inputs}, but views.gap [{low}, {high}] spans only {high + 1} "
-            f"{what}: raise the upper gap to {views.inputs - 1} or more, or ask for fewer inputs"
+            f"{what}: raise the upper gap to {views.inputs - 1} or more, or use fewer inputs"
         )
     needed = max(views.inputs, 2)
     if count < needed:
         raise ValueError(
             f"scene {scene.name!r} has {count} {what} for inputs, but views.inputs is "
             f"{views.inputs} and at least {needed} are needed: use fewer inputs, hold out fewer "
-            "frames, or drop the scene"
+            "frames, or remove the scene"
         )
     if count - 1 < low:
         warn_once(
             f"scene {scene.name!r} has {count} {what} for inputs, fewer than views.gap "
-            f"[{low}, {high}] asks for: its gap is {count - 1}"
+            f"[{low}, {high}] needs: the gap is {count - 1} in this scene"
         )
     high = min(high, count - 1)
     # Each input needs its own frame.
@@ -75,7 +78,7 @@ def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
 
 
 def refuse_too_many(frames: int, scene: Scene) -> None:
-    """Raise TooLargeError if that many images of `scene` do not fit into memory."""
+    """Raise TooLargeError if `frames` images of `scene` do not fit into memory."""
     height, width = scene.cameras.size
     refuse_more_than_memory(
         f"a sample of {frames} images of {height} x {width}",
@@ -85,13 +88,16 @@ def refuse_too_many(frames: int, scene: Scene) -> None:
 
 
 def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
-    """Return one frame per moment, cycling through the cameras."""
+    """Return one frame of each moment in `chosen`, taking the numbers in `cameras` in turn."""
     turns = zip(chosen, cycle(cameras), strict=False)
     return tuple(moment[camera % len(moment)] for moment, camera in turns)
 
 
 def evenly(items: Sequence[_T], count: int) -> list[_T]:
-    """Return at most `count` of `items`, evenly spaced from first to last; one is the middle."""
+    """Return `count` items, evenly spaced from first to last; for a count of 1, the middle item.
+
+    With fewer than `count` items, return all.
+    """
     last = len(items) - 1
     count = min(count, len(items))
     places = np.linspace(0, last, count) if count > 1 else np.full(count, last // 2)
@@ -99,17 +105,19 @@ def evenly(items: Sequence[_T], count: int) -> list[_T]:
 
 
 def spread(span: Sequence[Frames], count: int) -> Frames:
-    """Return frames of `count` moments, spaced by `evenly`."""
+    """Return one frame from each of `count` evenly spaced moments of `span`."""
     return one_of_each(evenly(span, count), range(count))
 
 
 class Span(ViewSampler):
-    """Sampler of inputs at both ends of a random span and in it, and targets from the span.
+    """Sampler of views from a random span of frames (TokenGS release).
 
-    Source: TokenGS release. The last frame of the span is min_gap to max_gap frames after the
-    first. Targets are frames other than the inputs. If there are too few, inputs are added, and
-    then frames repeat. If times are known, the span counts times. Each input then has its own time,
-    and its own camera if there are enough. All targets have one time (TokenGS 2026.6).
+    The last frame of the span is min_gap to max_gap frames after the first. Inputs are both ends
+    and random frames between. Targets are random frames of the span that are not inputs. If there
+    are too few, inputs are used as targets, and then frames repeat.
+
+    In scenes with times, the span and the gap count times. Each input has a different time, and a
+    different camera if there are enough cameras. All targets have the same time (TokenGS 2026.6).
     """
 
     name = "span"
@@ -117,20 +125,21 @@ class Span(ViewSampler):
 
     class Config(ComponentConfig):
         min_gap: int | None = Field(default=None, ge=1)
-        """Least gap from the first to the last input, in frames. null uses `views.gap`."""
+        """Least distance in frames from the first to the last input. null uses `views.gap`."""
         max_gap: int | None = Field(default=None, ge=1)
-        """Largest gap, in frames. null uses `views.gap`. A schedule lets it grow with training."""
+        """Largest distance in frames from the first to the last input. null uses `views.gap`. A
+        schedule lets it grow during training."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """See `Component`."""
+        """Yield a problem if the gaps contradict each other."""
         if config.min_gap and config.max_gap and config.min_gap > config.max_gap:
-            yield Problem("min_gap", "it is larger than `max_gap`", "raise `max_gap`")
+            yield Problem("min_gap", "`min_gap` is larger than `max_gap`", "raise `max_gap`")
 
     def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
-        """See `ViewSampler`."""
+        """Draw input and target frames from a random span of `scene`."""
         options = self.options(step)
         high = options.max_gap or views.gap[1]
         # A schedule may lower the largest gap below the least one of the recipe.
