@@ -101,7 +101,7 @@ def test_failures(server, cache, capsys):
 def test_no_server_and_no_url():
     for url, reason in (
         ("http://127.0.0.1:9/a.safetensors", "nothing was kept: .*refused"),
-        ("https://[::1/a.safetensors", "no URL"),
+        ("https://[::1/a.safetensors", "not a valid URL"),
     ):
         must_refuse(reason, checkpoint_path, url, kind=OSError)
 
