@@ -127,7 +127,7 @@ def test_a_url_is_downloaded_once_and_where_it_is_kept_is_told(cache, caplog):
     first = checkpoint_path(str(remote))
     remote.unlink()
     assert checkpoint_path(str(remote)) == first
-    assert f"kept as {first} (delete it to download again)" in caplog.text
+    assert f"kept as {first} (delete this file to download it again)" in caplog.text
     assert files(cache) == ["a.safetensors"]
 
 
