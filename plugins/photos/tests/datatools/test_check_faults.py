@@ -93,7 +93,7 @@ def test_faults_that_several_frames_show_together(planted, shots):
     cut.camera["w"] -= 45
     black = planted("error: frame 2 (images/2.jpg): the image is black*")
     plain = planted(
-        "warning: *: the poses are not judged against the photos: too few matches, below 24 in "
+        "warning: *: the poses are not checked against the photos: too few matches, below 24 in "
         "every pair that was tried: look at the cameras yourself"
     )
 
@@ -180,11 +180,11 @@ def test_faults_of_chunks_and_their_index(chunks):
         "error: test/2.torch: *",
         "error: test/3.torch: 0 of its 2 entries are mappings with a 'key'*",
         "error: test/4.torch: 0 of its 0 entries *: pack the data set again*",
-        "error: test/1.torch: index.json places there 1 scene not in it: c: get the chunk again*",
-        "error: test/0.torch: index.json places there 1 scene not in it: d: *",
-        "error: test/2.torch: index.json places there 1 scene not in it: e: *",
-        "error: test/3.torch: index.json places there 1 scene not in it: f: *",
-        "warning: test/index.json: it does not name b, so that nothing reads *",
+        "error: test/1.torch: index.json lists for this file 1 scene *: c: copy the chunk again*",
+        "error: test/0.torch: index.json lists for this file 1 scene that it does not hold: d: *",
+        "error: test/2.torch: index.json lists for this file 1 scene that it does not hold: e: *",
+        "error: test/3.torch: index.json lists for this file 1 scene that it does not hold: f: *",
+        "warning: test/index.json: the index does not name b, so that no reader *",
     )
     assert_told(chunks, expected, geometry=0)
 
@@ -200,8 +200,8 @@ def test_an_index_is_checked_where_it_is_given_and_where_it_lies_with_the_chunks
         line
         for name in ("given", "evaluation")
         for line in (
-            f"error: nowhere: the index {name}.json *not there*",
-            f"error: b: the index {name}.json has frames 3, but the scene's are 0 to 2*",
+            f"error: nowhere: the index {name}.json *does not exist*",
+            f"error: b: the index {name}.json has frames 3, but the scene has 0 to 2*",
         )
     ]
     assert_told(chunks, expected, [given], geometry=0)

@@ -18,7 +18,7 @@ def test_a_sound_set_has_exit_code_0_and_a_table(good):
     columns = "scene  format  frames  decodable  missing  bad poses  epipolar px"
     assert re.sub("  +", "  ", header) == columns
     assert re.fullmatch(r"room +nerfstudio +6 +6 +0 +0 +0\.\d\d", row)
-    assert note == "note: views.scale: auto finds no common point that the cameras look at"
+    assert note == "note: `views.scale: auto` finds no common point that the cameras look at"
     assert last == f"{good}/room: 1 scene, 0 errors, 0 warnings"
 
 
@@ -28,7 +28,7 @@ def test_errors_have_exit_code_1_and_a_line_each(room, tmp_path):
     assert code == 1
     line = "error: bad, images/1.jpg: the image does not exist: add it, or remove its frame\n"
     assert line in output
-    assert "note: poses were judged by photos in 1 of 2 scenes" in output
+    assert "note: poses were checked by photos in 1 of 2 scenes" in output
     assert output.endswith(f"{tmp_path}: 2 scenes, 1 error, 0 warnings\n")
 
 

@@ -152,7 +152,7 @@ def test_chunks_are_bounded_in_size_and_order_is_kept(six, tmp_path):
 def test_named_scenes_are_for_testing(six):
     train, test = packing.chosen_splits(six, ["s4", "s1"]).values()
     assert ([*train], [*test]) == (["s0", "s2", "s3", "s5"], ["s1", "s4"])
-    absent = "1 of 2 test scenes are not there: gone"
+    absent = "1 of 2 test scenes do not exist: gone"
     must_refuse(absent, packing.chosen_splits, six, ["s1", "gone"])
 
 

@@ -44,10 +44,10 @@ def test_missing_images_are_told_and_counted(tapes, monkeypatch):
     output = typed(f"data check {tapes} --quick").output
     assert re.search("a +tapes/tape +8 +6 +2 ", output)
     assert (
-        "error: a: listed images that do not exist: 2.png, 4.png; later frames move up in an "
-        "index: add the files, or take them out of what lists them" in output
+        "error: a: listed images that do not exist: 2.png, 4.png; the numbers of later frames in "
+        "an evaluation index are then lower: add the files, or remove them from the list" in output
     )
-    assert "has frames 6, but the scene's are 0 to 5" in output
+    assert "has frames 6, but the scene has 0 to 5" in output
 
 
 def test_a_source_that_fails_is_told_and_the_others_go_on(tapes, monkeypatch):

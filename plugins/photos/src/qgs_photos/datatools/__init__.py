@@ -1,1 +1,1 @@
-"""Data tools for qgs: what is wrong with a data set, and data sets as chunks."""
+"""Data tools: check data sets (`qgs data check`) and convert them to chunks (`qgs data pack`)."""

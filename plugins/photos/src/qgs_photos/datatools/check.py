@@ -1,4 +1,4 @@
-"""All scenes of a data set, whatever its format, and its evaluation indices."""
+"""Check all scenes of a data set in any format, and its evaluation indices."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -23,14 +23,20 @@ from qgs_photos.datatools.photos import Candidate, DecodedScene, Photo, decode, 
 from qgs_photos.datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
 
 PHOTOS = 400
-"""Photos that are matched in all, half a second each."""
+"""Photos to match in a whole data set. Matching takes about half a second for each photo."""
 FEWEST = 20
-"""Photos that are matched in a scene, at least."""
+"""Least number of photos to match in a scene whose poses are checked."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of `qgs data check`; format may also be PLUGIN/NAME."""
+    """Options of `qgs data check`.
+
+    geometry: number of scenes whose poses are checked by matching photos. headers_only: read only
+    the headers of images. threads: number of threads that decode images. format: name of a format,
+    PLUGIN/NAME of a data source, or auto. images: folder of photos inside each scene; None takes
+    the format's.
+    """
 
     geometry: int = 20
     headers_only: bool = False
@@ -45,10 +51,12 @@ def check(
     indices: Sequence[UPath] = (),
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> CheckReport:
-    """Check the data set at `path`, and evaluation indices: those given and those beside it.
+    """Check the data set at `path`, the evaluation indices in it, and those in `indices`.
 
-    progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError without a
-    data set or an index, MissingExtraError for the format, ValueError for an unknown one.
+    progress: called before each scene with the number of scenes done, the number of all scenes, and
+    the scene's name. Raises FileNotFoundError if a data set or an index does not exist,
+    MissingExtraError if the format needs a package that is not installed, ValueError for an unknown
+    format.
     """
     _refuse_unknown(options.format)
     # a listing stands for its folder
@@ -60,15 +68,17 @@ def check(
     if not items:
         # raises: what is missing for a photo folder
         read_listing(path, _photo_format(options))
-        raise FileNotFoundError(f"{path} holds no {options.format}: leave --format out")
+        raise FileNotFoundError(
+            f"{path} holds no {options.format}: leave --format out to check any format"
+        )
     count = len(candidates)
     # over the whole data set: faults come in batches of scenes
     wanted = 0 if options.headers_only else min(options.geometry, count)
     judged = {*np.linspace(0, max(count - 1, 0), wanted).round().astype(int).tolist()}
     notes = left_out(options.format)
     if len(judged) < count:
-        some = f"poses were judged by photos in {len(judged)} of {count} scenes"
-        notes.append(f"{some}; --geometry {count} judges all")
+        some = f"poses were checked by photos in {len(judged)} of {count} scenes"
+        notes.append(f"{some}; --geometry {count} checks all")
     held = defaultdict[str, list[SceneReport]](list)
     scenes: list[SceneReport] = []
     for number, candidate in enumerate(candidates):
@@ -82,9 +92,10 @@ def check(
         notes.append(f"compared with the index {file}")
     if factors := [1 / scene.depth for scene in scenes if scene.depth]:
         ends = f"{min(factors):.4g} to {max(factors):.4g}"
-        notes.append(f"views.scale: auto is a factor of {np.median(factors):.4g} ({ends})")
+        median = f"{np.median(factors):.4g}"
+        notes.append(f"`views.scale: auto` scales by {median} (median of scenes; range {ends})")
     else:
-        notes.append("views.scale: auto finds no common point that the cameras look at")
+        notes.append("`views.scale: auto` finds no common point that the cameras look at")
     return CheckReport(scenes=scenes, general=general, notes=notes)
 
 
@@ -92,12 +103,12 @@ def _refuse_unknown(format: str) -> None:
     of_plugins = [kind for kind in sources(format) if kind.partition("/")[0] not in OF_FILES]
     known = ["auto", *readers(), "dl3dv", "chunks", *of_plugins]
     if format not in known:
-        usable = f"{', '.join(known)}, or PLUGIN/NAME of a source that reads a path"
+        usable = f"{', '.join(known)}, or PLUGIN/NAME of a data source with an option `path`"
         raise ValueError(f"there is no format {format!r}: use one of {usable}")
 
 
 def _items(path: UPath, options: Options) -> Iterator[Candidate | Finding]:
-    """Yield scenes, and findings about files."""
+    """Yield the scenes to check, and findings about files of the data set."""
     kind = options.format
     if kind == "auto":
         is_chunk = path.is_file() and path.suffix == ".torch"
@@ -118,9 +129,10 @@ def _photo_format(options: Options) -> str:
 
 
 def check_scene(candidate: Candidate, options: Options, most_photos: int) -> SceneReport:
-    """Check one scene; every fault becomes a finding. Raises as `check`.
+    """Check one scene; every fault becomes a finding of the report.
 
-    most_photos: that are matched with each other, to judge its cameras.
+    most_photos: largest number of photos to match with each other to check the cameras; 0 matches
+    none.
     """
     report = SceneReport(candidate.name, candidate.kind, candidate.split)
     try:
@@ -150,7 +162,7 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         faulty = _frames([*of_photos, *sharing])
         usable = [f for f in placed if f not in faulty and decoded[f].size is not None]
         geometry = judge_scene(scene, usable, most_photos)
-        epipolar = "not judged" if geometry.unjudged else f"{geometry.pixels:.2f}"
+        epipolar = "not checked" if geometry.unjudged else f"{geometry.pixels:.2f}"
         # what else is wrong says already why nothing could be judged
         explained = errors_of(findings) and geometry.unjudged not in ("", TOO_FEW)
         if not explained:
@@ -170,15 +182,18 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
 
 
 def _absent(name: str, photos: Sequence[Photo], missing: Sequence[str]) -> Iterator[Finding]:
-    """Yield what is wrong with the number of photos."""
+    """Yield findings for photos that are listed but missing, and for fewer than two photos."""
     if missing:
         names = listed(missing, 3)
-        reason = f"listed images that do not exist: {names}; later frames move up in an index"
-        yield Finding(name, reason, "add the files, or take them out of what lists them")
+        reason = (
+            f"listed images that do not exist: {names}; the numbers of later frames in an "
+            "evaluation index are then lower"
+        )
+        yield Finding(name, reason, "add the files, or remove them from the list")
     there = sum(photo.exists for photo in photos)
     if there < 2:
-        reason = f"{there} photos are there, and a scene needs 2"
-        yield Finding(name, reason, "add photos, or take the scene out")
+        reason = f"only {there} photos exist, and a scene needs 2"
+        yield Finding(name, reason, "add photos, or remove the scene")
 
 
 def _unreadable(name: str, error: Exception) -> Finding:
@@ -186,7 +201,7 @@ def _unreadable(name: str, error: Exception) -> Finding:
     reason, colon, fix = str(error).rpartition(": ")
     if colon and isinstance(error, OSError | ValueError):
         return Finding(name, reason, fix)
-    return Finding(name, error_text(error), "get the files again, or mend what reads them")
+    return Finding(name, error_text(error), "copy the files again, or repair their reader")
 
 
 def _frames(findings: Sequence[Finding]) -> set[int]:

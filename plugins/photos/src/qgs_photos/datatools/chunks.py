@@ -1,4 +1,4 @@
-"""Chunks of a data set: their scenes, to be checked, and what is wrong with the files."""
+"""List the scenes to check in data sets of chunks, and find faults of the chunk files."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
@@ -30,20 +30,26 @@ _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
 
 
 def chunk_scenes(path: UPath) -> Iterator[Candidate | Finding]:
-    """Yield scenes and faults of a data set of chunks: train and test, or `path`; or one file."""
+    """Yield the scenes of a data set of chunks, and faults of its files.
+
+    path: folder with train/ and test/, folder of chunks, or one chunk.
+    """
     parts = {split: path / split for split in ("train", "test") if has_chunks(path / split)}
     found = {split: dict[str, str]() for split in ("train", "test", "")}
     for split, part in (parts or {"": path}).items():
         yield from _folder_scenes(split, part, found[split])
     for key in sorted(found["train"].keys() & found["test"].keys()):
-        reason = "the scene is in train and in test, so that models are judged on training data"
-        yield Finding(key, reason, "remove it from one of the two", severity="warning")
+        reason = "the scene is in train and in test, so that models are tested on training data"
+        yield Finding(key, reason, "remove it from train or from test", severity="warning")
 
 
 def _folder_scenes(
     split: str, folder: UPath, found: dict[str, str]
 ) -> Iterator[Candidate | Finding]:
-    """Yield what a folder of chunks, or one file, holds. found: gets file names by scene."""
+    """Yield the scenes and faults of one folder of chunks, or of one chunk.
+
+    found: receives the chunk's file name by scene name.
+    """
     if folder.is_file():
         files = [folder]
     else:
@@ -56,20 +62,21 @@ def _folder_scenes(
     try:
         index = read_chunk_index(folder / INDEX)
     except (OSError, ValueError) as error:
-        yield Finding(label, str(error), "write it anew: scene to file, in JSON")
+        yield Finding(label, str(error), "write it again: a JSON mapping from scene to chunk file")
         return
     lost = defaultdict[str, list[str]](list)
     for key, name in index.items():
         if found.get(key) != name:
             lost[name].append(key)
     for name, keys in lost.items():
-        reason = f"{INDEX} places there {counted(len(keys), 'scene')} not in it: {listed(keys)}"
-        fix = f"get the chunk again, or take its scenes out of {INDEX}"
+        missing = f"{counted(len(keys), 'scene')} that it does not hold: {listed(keys)}"
+        reason = f"{INDEX} lists for this file {missing}"
+        fix = f"copy the chunk again, or remove these scenes from {INDEX}"
         yield Finding(_label(split, name), reason, fix)
     if unnamed := sorted(found.keys() - index.keys()):
-        reason = f"it does not name {listed(unnamed)}, so that nothing reads what chunks hold"
+        reason = f"the index does not name {listed(unnamed)}, so that no reader finds these scenes"
         severity: Severity = "warning" if index else "error"
-        yield Finding(label, reason, "add the scenes to it", severity=severity)
+        yield Finding(label, reason, "add the scenes to the index", severity=severity)
 
 
 def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Iterator[Candidate | Finding]:
@@ -85,15 +92,15 @@ def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Iterator[Can
     for place, entry in enumerate(entries):
         key = entry.get("key") if isinstance(entry, Mapping) else None
         if isinstance(key, str) and key in found:
-            reason = f"the scene is in {label}, and was in this split before"
-            yield Finding(key, reason, f"remove one of the two, or {_REPACK}")
+            reason = f"the scene in {label} is in this split twice"
+            yield Finding(key, reason, f"remove one of the two scenes, or {_REPACK}")
         elif isinstance(key, str):
             found[key] = file.name
             scenes += 1
             photos = partial(_photos, file, place)
             yield Candidate(key, "chunks", photos, split)
     if scenes < len(entries) or not entries:
-        reason = f"{scenes} of its {len(entries)} entries are mappings with a 'key' of their own"
+        reason = f"{scenes} of its {len(entries)} entries are mappings with a 'key' not used before"
         yield Finding(label, reason, _REPACK)
 
 
@@ -137,7 +144,11 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
 
 
 def _listed_sizes(record: Record) -> list[Size] | None:
-    """Return (H, W) of every image: as the chunk says, else what most of the headers say."""
+    """Return (H, W) of every image, as the chunk lists it.
+
+    If the chunk lists no sizes, return for all images the most frequent size in their headers; None
+    if no header can be read.
+    """
     if record.sizes is not None:
         return record.image_sizes
     stored: Counter[Size] = Counter()

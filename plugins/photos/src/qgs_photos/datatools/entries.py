@@ -1,4 +1,4 @@
-"""A scene as the entry of a chunk: images keep their bytes where they can."""
+"""Convert a scene to the entry of a chunk; image files are copied unchanged where possible."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -24,35 +24,39 @@ _KEPT_FORMATS = {"JPEG", "MPO", "PNG"}
 
 @dataclass(frozen=True)
 class Encoding:
-    """Settings of rewritten images.
+    """Settings for images that are encoded again.
 
-    resized: rewrite all, as delivered. jpeg: quality; None for PNG.
+    resized: encode all images again, in the size in which the source returns them. jpeg: quality of
+    JPEG files, from 1 to 100; None writes PNG.
     """
 
     resized: bool = False
     jpeg: int | None = None
 
     def image(self, pixels: np.ndarray) -> bytes:
-        """Return (H, W, 3) uint8 as the bytes of a file."""
+        """Encode pixels (H, W, 3), uint8, as the bytes of a JPEG or PNG file."""
         if self.jpeg is None:
             return encoded(pixels)
         return encoded(pixels, "JPEG", quality=self.jpeg, subsampling=0)
 
 
 def encoded(pixels: np.ndarray, format: str = "PNG", **options: int) -> bytes:
-    """Return pixels (H, W, 3) or (H, W), uint8, as the bytes of a file. options: Pillow's."""
+    """Encode pixels (H, W, 3) or (H, W), uint8, as an image file. options: of Pillow's `save`."""
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format, **options)
     return file.getvalue()
 
 
 def bytes_of(image: Tensor) -> np.ndarray:
-    """Return an image (C, H, W) in [0, 1] as (H, W, C) uint8."""
+    """Convert an image (C, H, W) in [0, 1] to pixels (H, W, C), uint8."""
     return np.ascontiguousarray(image.movedim(0, -1).mul(255).round().byte().numpy())
 
 
 def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
-    """Yield the decodable frames, and whether each keeps its bytes. Raises as the scene."""
+    """Yield each frame of a scene with its image file, and whether the file is copied unchanged.
+
+    Raises ValueError for an image that cannot be decoded, and what the scene raises.
+    """
     for index in range(len(scene)):
         if isinstance(scene, PhotoScene | ChunkScene) and not encoding.resized:
             yield _stored(scene, index, encoding)
@@ -83,7 +87,7 @@ def _stored(
 
 
 def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -> EncodedFrame:
-    """Return the frame as a pinhole's, without edges that straightening leaves black."""
+    """Undistort a frame to that of a pinhole camera, and crop the black border."""
     assert frame.lens is not None
     lens = frame.lens
     zoom = lens.whole_zoom(frame.intrinsics, frame.size, frame.size)
@@ -121,7 +125,11 @@ def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
 def chunk_entry(
     key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int], times: Tensor | None
 ) -> ChunkEntry:
-    """Return the entry of a scene; see `qgs_photos.datasets.chunk_files` for its keys."""
+    """Return the entry of a scene in a chunk; `qgs_photos.datasets.chunk_files` explains its keys.
+
+    key: name of the scene. held_out: indices of frames that are left out of training. times: of the
+    frames, (V,); None for a scene that does not move.
+    """
     names = [frame.name for frame in frames]
     entry = {
         "key": key,
@@ -148,7 +156,10 @@ def _bytes(data: bytes) -> Tensor:
 
 
 def _camera(frame: EncodedFrame) -> np.ndarray:
-    """Return (18,) float32: normalised intrinsics, two zeros, rows of world-to-camera."""
+    """Return a camera as (18,) float32: fx, fy, cx, cy, two zeros, three rows of world-to-camera.
+
+    fx and cx are divided by the width of the image, fy and cy by its height.
+    """
     height, width = frame.size
     fx, fy, cx, cy = frame.intrinsics
     w2c = np.linalg.inv(frame.c2w)[:3].flatten()
@@ -157,7 +168,7 @@ def _camera(frame: EncodedFrame) -> np.ndarray:
 
 
 def _timestamps(names: Sequence[str]) -> Tensor:
-    """Return the names where all are whole numbers, as time stamps are; else their order."""
+    """Return the names as integers if all are whole numbers; otherwise the indices 0, 1, ..."""
     # 19 digits may be more than an int64 holds
     stamps = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
     return torch.tensor([int(name) for name in (names if stamps else range(len(names)))]).long()

@@ -1,4 +1,4 @@
-"""Faults of the photos of a scene: each by itself, and poses that photos share."""
+"""Find faults of single photos and poses, and photos that have the same pose or position."""
 
 from collections.abc import Iterator, Sequence
 
@@ -25,7 +25,7 @@ _OF_EXTENT = 1e-4
 
 
 def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
-    """Yield faults of files, of their listed sizes, of intrinsics and of masks."""
+    """Yield faults of image files, listed image sizes, intrinsics and masks."""
     for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
         listed = photo.listed
         for reason, fix in result.errors:
@@ -48,12 +48,12 @@ def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
     if empty:
         every = all(result.empty_mask in (True, None) for result in scene.decoded)
         reason = "the mask is black, so that nothing of the photo is modelled"
-        fix = "make masks white on what is modelled, or list none"
+        fix = "make masks white where the photo is to be modelled, or list no masks"
         yield scene.finding(empty, reason, fix, "error" if every else "warning")
 
 
 def pose_findings(scene: DecodedScene) -> Iterator[Finding]:
-    """Yield faults of poses, each by itself."""
+    """Yield faults of single poses, such as NaN or a mirrored rotation."""
     for frame, photo in enumerate(scene.photos):
         listed = photo.listed
         if not listed.problems or np.isfinite(listed.c2w).all():
@@ -62,7 +62,10 @@ def pose_findings(scene: DecodedScene) -> Iterator[Finding]:
 
 
 def sharing_findings(scene: DecodedScene, usable: Sequence[int]) -> Iterator[Finding]:
-    """Yield frames of `usable` that share a pose or a place."""
+    """Yield findings for frames with the pose or the position of another frame.
+
+    usable: frames that are compared, those without other faults.
+    """
     if len(usable) < 2:
         return
     poses = np.stack([scene.photos[frame].listed.c2w for frame in usable])
@@ -85,7 +88,7 @@ def sharing_findings(scene: DecodedScene, usable: Sequence[int]) -> Iterator[Fin
             yield from _repeated(scene, first, frame)
         else:
             reason = f"the camera stands on the same point as that of {scene.label(first)}"
-            fix = "correct the position, or remove one of the frames: this shows no depth"
+            fix = "correct the position, or remove one of the frames: the two show no depth"
             yield scene.finding([frame], reason, fix)
 
 
@@ -99,5 +102,5 @@ def _repeated(scene: DecodedScene, first: int, frame: int) -> Iterator[Finding]:
         reason = f"the photo and its pose repeat {label}"
         yield scene.finding([frame], reason, "remove one of the two", "warning")
     else:
-        reason = f"the pose repeats that of {label}, whose photo is another one"
+        reason = f"the pose repeats that of {label}, which has a different photo"
         yield scene.finding([frame], reason, "correct the pose, or remove one of the frames")

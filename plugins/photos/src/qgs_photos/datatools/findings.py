@@ -1,4 +1,4 @@
-"""Findings of a check: one line for each fault, one row for each scene."""
+"""Hold and print the findings of a check: one line for each fault, one row for each scene."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -16,9 +16,12 @@ _FEW = 3
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault and its remedy. frames, names: as listed. An error makes results wrong.
+    """A fault of a scene or a file, and its remedy.
 
-    numbers: of the frames, as `DecodedScene.numbers`.
+    scene: name of the scene or of the file. frames, names: indices and file names of the photos
+    with this fault, in the data set's list; empty if the whole scene is meant. severity: an error
+    makes results wrong, a warning may. numbers: numbers of the photos as messages show them, see
+    `DecodedScene.numbers`.
     """
 
     scene: str
@@ -31,7 +34,7 @@ class Finding:
 
     @property
     def place(self) -> str:
-        """The frames as text; empty where the whole scene is meant."""
+        """The photos as text, such as "frames 0-3 (a.jpg to d.jpg)"; empty for the whole scene."""
         names = [name for name in self.names if name]
         numbers = [number for number in self.numbers if number is not None]
         if not numbers:
@@ -53,7 +56,10 @@ def errors_of(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """Return numbers as text, such as 0-3, 7; after eight runs the rest is counted."""
+    """Return numbers as text with runs joined, such as "0-3, 7".
+
+    After eight runs, only the number of further runs is given.
+    """
     # numbers of one run are all equally far ahead of their places
     grouped = groupby(enumerate(sorted(set(numbers))), lambda item: item[1] - item[0])
     runs = [[number for _, number in run] for _, run in grouped]
@@ -61,7 +67,10 @@ def spans(numbers: Iterable[int]) -> str:
 
 
 def merged(findings: Sequence[Finding]) -> list[Finding]:
-    """Join findings of frames with the same fault; where more than three, with the same remedy."""
+    """Join findings that differ only in their frames.
+
+    If more than three findings still have the same remedy, join those too.
+    """
     equal = _joined(findings, attrgetter("reason", "fix", "severity"))
     kinds = Counter(finding.fix for finding in equal)
     few = [finding for finding in equal if kinds[finding.fix] <= _FEW]
@@ -85,12 +94,14 @@ def _joined(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> list[
 
 @dataclass(frozen=True)
 class SceneReport:
-    """Findings and measurements of a scene.
+    """Findings and measurements of one scene.
 
-    split: empty where the format has none. numbered: photos that a reader has as frames.
-    pose_problems: frames whose pose is wrong. epipolar: median distance of matches to epipolar
-    lines in pixels as text, or why there is none. depth: of what the cameras look at, scene units;
-    0 where that is no common point.
+    kind: format. split: train, test, or empty for a format without splits. listed, decodable,
+    missing: numbers of photos. numbered: number of photos that readers return as frames.
+    pose_problems: number of frames with a wrong pose. epipolar: median distance of matches from
+    epipolar lines in pixels, as text; "-" or a reason if it was not measured. depth: median
+    distance from the cameras to the point that they look at, in scene units; 0 if they have no
+    common point.
     """
 
     name: str
@@ -108,7 +119,10 @@ class SceneReport:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """The result of `check`. general: findings about files of the data set."""
+    """Result of a check.
+
+    general: findings about files of the data set, not about a scene. notes: further sentences.
+    """
 
     scenes: Sequence[SceneReport]
     general: Sequence[Finding]
@@ -116,6 +130,6 @@ class CheckReport:
 
     @property
     def findings(self) -> list[Finding]:
-        """All findings, those of files first, then scene by scene; errors before warnings."""
+        """All findings: errors, then warnings; in both first those about files, then by scene."""
         found = [*self.general, *(f for scene in self.scenes for f in scene.findings)]
         return sorted(found, key=lambda finding: finding.severity != "error")

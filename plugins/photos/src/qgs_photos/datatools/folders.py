@@ -1,4 +1,4 @@
-"""Scenes in folders of photos, and DL3DV's, as candidates for a check."""
+"""List the scenes to check in folders of photos and in data sets of DL3DV."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -17,7 +17,11 @@ from qgs_photos.datatools.photos import Candidate, Photo
 
 
 def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
-    """Yield scenes of a format in `root`: itself, its folders, or those in train and test."""
+    """Yield the scenes in `root`: `root` itself, its subfolders, or those in train/ and test/.
+
+    wanted: format, or auto. images: folder of photos inside each scene; None takes the format's. A
+    subfolder beside scenes that lists no cameras yields a warning.
+    """
     if formats_of(root):
         yield from _listed(root, folder_name(root), wanted, images)
         return
@@ -29,7 +33,7 @@ def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Cand
         if folder in scenes or folder.name.startswith("."):
             continue
         if scenes:
-            reason = "the folder lists no cameras, and is not checked with the photos beside it"
+            reason = "the folder lists no cameras, and is not checked"
             fix = f"run `qgs data check {folder}` if it is another data set, else move it away"
             yield Finding(folder.name, reason, fix, severity="warning")
         elif folder.name in ("train", "test"):
@@ -37,7 +41,10 @@ def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Cand
 
 
 def _listed(folder: UPath, name: str, wanted: str, images: str | None) -> Iterator[Candidate]:
-    """Yield the scene that a folder lists in the wanted format, or in the first that it holds."""
+    """Yield the scene of a folder in the format `wanted`; auto takes the first that it holds.
+
+    Yields nothing if the folder does not hold this format.
+    """
     held = formats_of(folder)
     kind = held[0] if wanted == "auto" else wanted
     if kind in held:
@@ -45,7 +52,7 @@ def _listed(folder: UPath, name: str, wanted: str, images: str | None) -> Iterat
 
 
 def dl3dv_scenes(path: UPath, images: str | None) -> Iterator[Candidate]:
-    """Yield the scenes below `path`. Raises FileNotFoundError when there is none."""
+    """Yield the DL3DV scenes in `path`. Raises FileNotFoundError if there is no scene."""
     for name, place in find_scenes(path).items():
         # an archive is opened when its scene's turn comes
         yield Candidate(name, "dl3dv", partial(_archived_photos, place, images))

@@ -1,4 +1,4 @@
-"""Agreement of a scene's cameras with its photos, by points that pairs of neighbours share."""
+"""Check cameras against photos by features that are matched in pairs of neighbouring photos."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -42,17 +42,18 @@ _ADVICE = (
 )
 
 Features: TypeAlias = tuple[np.ndarray, np.ndarray]
-"""Features of one photo: points (P, 2) x, y in pixels, and SIFT's descriptors (P, 128)."""
+"""Features of one photo: points (P, 2), x and y in pixels, and SIFT descriptors (P, 128)."""
 Pairs: TypeAlias = Sequence[tuple[tuple[int, int], float]]
-"""Two frames, and the median distance of their matches from the place that the poses predict, as a
-share of the diagonal."""
+"""Pairs of frames, and for each pair the median distance of matched points from the epipolar lines
+that the poses predict, as a share of the photo's diagonal."""
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Measurement of how well the poses of a scene explain its photos.
+    """Measurement of how well the poses of a scene fit its photos.
 
-    unjudged: why there are no `pairs`. diagonal: of the files, in pixels.
+    unjudged: why nothing could be measured; empty if there are `pairs`. diagonal: length of a
+    photo's diagonal in pixels of the file.
     """
 
     unjudged: str = ""
@@ -61,17 +62,17 @@ class Geometry:
 
     @property
     def fraction(self) -> float:
-        """Median over pairs of their distance, of the diagonal; 0 for none."""
+        """Median of the pairs' distances, as a share of the diagonal; 0 without pairs."""
         return float(np.median([distance for _, distance in self.pairs])) if self.pairs else 0.0
 
     @property
     def pixels(self) -> float:
-        """The same in pixels of the files."""
+        """Median of the pairs' distances in pixels of the files."""
         return self.fraction * self.diagonal
 
 
 def detect(picture: np.ndarray) -> Features:
-    """Find features of a photo (H, W, 3) uint8."""
+    """Find SIFT features of a photo (H, W, 3), uint8; none if it shows no structure."""
     # kornia's SIFT finds as much, and takes one and a half times as long or more
     sift: Any = SIFT()
     try:
@@ -84,7 +85,10 @@ def detect(picture: np.ndarray) -> Features:
 
 
 def match(first: Features, second: Features) -> np.ndarray | None:
-    """Return points (2, P, 2) of one epipolar geometry, found without any pose; None if too few."""
+    """Match two photos without using their poses; return points (2, P, 2) in pixels.
+
+    RANSAC keeps matches that fit one fundamental matrix. None for fewer than MIN_MATCHES.
+    """
     one, two = (torch.from_numpy(descriptors).float() for _, descriptors in (first, second))
     _, found = match_smnn(one, two, _RATIO)
     if len(found) < MIN_MATCHES:
@@ -97,10 +101,11 @@ def match(first: Features, second: Features) -> np.ndarray | None:
 
 
 def off_lines(matches: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Return distances (P,) of the second photo's points from where they may be seen, in pixels.
+    """Return distances (P,) in pixels of points in the second photo from their epipolar half-lines.
 
-    These are half-lines: the parts of epipolar lines before both cameras. matches: (2, P, 2).
-    poses: (2, 4, 4) camera-to-world, OpenCV. intrinsics: (2, 4) fx, fy, cx, cy.
+    A half-line is the part of an epipolar line whose scene points lie before both cameras.
+    matches: (2, P, 2), in pixels. poses: (2, 4, 4), camera-to-world, OpenCV axes. intrinsics:
+    (2, 4), fx, fy, cx, cy.
     """
     # kornia has whole lines; two poses that are exchanged, or inverted ones, leave those as they
     # are where no camera turns
@@ -124,7 +129,11 @@ def off_lines(matches: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray) ->
 
 
 def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geometry:
-    """Match each frame that is `usable`, of runs of at most `most`, with the next and another."""
+    """Measure how well the poses of a scene fit its photos.
+
+    Each frame is matched with the next and with one that is farther away. usable: frames that may
+    be matched. most: largest number of frames to match; of more, some runs of neighbours are taken.
+    """
     if len(usable) < 2:
         return Geometry("fewer than 2 usable frames")
     matcher = _Matcher(scene, [frame for run in _runs(usable, most) for frame in run])
@@ -141,7 +150,7 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
 
 
 def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
-    """Return all frames, or runs of neighbours, spread over them, that together have `most`."""
+    """Return at most `most` frames: all in one run, or several evenly spread runs of neighbours."""
     if len(frames) <= most:
         return [frames]
     length = max(most // _RUNS, 2)
@@ -150,7 +159,10 @@ def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
 
 
 class _Matcher:
-    """Pairs of a scene's frames, by their places in `frames`; features are detected once."""
+    """Match pairs of a scene's frames.
+
+    Methods take indices into `frames`. Features of a photo are detected once.
+    """
 
     def __init__(self, scene: DecodedScene, frames: Sequence[int]) -> None:
         self.scene = scene
@@ -160,7 +172,7 @@ class _Matcher:
         self._known: dict[int, tuple[Features, np.ndarray, float]] = {}
 
     def pairs(self) -> Pairs:
-        """Pair each frame with the next, and with the first of its partners that shares enough."""
+        """Match each frame with the next, and with the first of its partners that has matches."""
         found: dict[tuple[int, int], float | None] = {}
         for start in range(len(self.frames)):
             # the next shares most and says least; a farther one has a baseline
@@ -179,7 +191,10 @@ class _Matcher:
         ]
 
     def distance(self, first: int, second: int) -> float | None:
-        """Match two photos; None where too little is shared."""
+        """Return the median distance of two photos' matches as a share of the diagonal.
+
+        None if the photos have too few matches.
+        """
         one, lens_of_one, diagonal = self._features(first)
         two, lens_of_two, _ = self._features(second)
         matches = match(one, two)
@@ -200,7 +215,7 @@ class _Matcher:
         return self._known[place]
 
     def partners(self, start: int) -> Iterator[int]:
-        """Places of frames that may see the same: along the listing, then near in space."""
+        """Yield frames that may see the same: first near in the list, then near in space."""
         along = [place for gap in _GAPS for place in (start + gap, start - gap)]
         along = [place for place in along if 0 <= place < len(self.frames)]
         forward = [place for place in along if place > start] or along
@@ -213,9 +228,9 @@ class _Matcher:
 
 
 def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Finding]:
-    """Yield what the distances mean for the scene; a warning where there are none."""
+    """Yield findings for poses that do not fit the photos, or a warning if nothing was measured."""
     if geometry.unjudged:
-        reason = f"the poses are not judged against the photos: {geometry.unjudged}"
+        reason = f"the poses are not checked against the photos: {geometry.unjudged}"
         yield Finding(scene.name, reason, "look at the cameras yourself", severity="warning")
         return
     # what moves lies off its lines, however good the poses are
@@ -230,27 +245,28 @@ def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Findi
     # a few wrong frames are in most of the pairs of a short scene: without them it must agree
     if off and rest and np.median(rest) <= TOLERANCE:
         reason = "the pose or the intrinsics do not fit those of the other frames"
-        fix = "check that they belong to the photo, correct them, or remove the frame"
+        fix = "check that both belong to the photo, correct them, or remove the frame"
         yield scene.finding(sorted(off), reason, fix, severity(min(off.values())))
     elif geometry.fraction > TOLERANCE:
         reason = (
-            f"the poses do not fit the photos: matches lie {geometry.pixels:.1f} pixels from where "
-            f"they may be seen, median of {counted(len(geometry.pairs), 'pair')}; good poses leave "
-            f"up to {TOLERANCE * geometry.diagonal:.1f}"
+            f"the poses do not fit the photos: matches lie {geometry.pixels:.1f} pixels from their "
+            f"epipolar lines, median of {counted(len(geometry.pairs), 'pair')}; for good poses it "
+            f"is at most {TOLERANCE * geometry.diagonal:.1f}"
         )
         every = range(len(scene.photos))
         advice = _ADVICE
         height, width = scene.decoded[0].size or (0, 1)
         # of other shapes both readings are understood
         if height == width and any(photo.listed.turns for photo in scene.photos):
-            advice = f"these are square and turned by EXIF: {TURN}"
+            advice = f"these photos are square and turned by EXIF: {TURN}"
         yield scene.finding(every, reason, advice, severity(geometry.fraction))
 
 
 def frames_above(values: Pairs, limit: float) -> dict[int, float]:
-    """Return frames of two pairs or more whose values are all above `limit`, and the least of each.
+    """Return the frames whose pairs all have values above `limit`, with the least of these values.
 
-    The worst goes first with its pairs, so that its partners are not blamed.
+    Frames in fewer than two pairs are left out. The worst frame is found first and its pairs are
+    removed, so that they do not count against the frames paired with it.
     """
     found = dict[int, float]()
     while True:

@@ -1,4 +1,4 @@
-"""Evaluation indices, compared with the scenes that a data set holds."""
+"""Compare evaluation indices with the scenes of a data set."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -25,11 +25,14 @@ def _is_index(file: UPath) -> bool:
 
 
 def index_findings(file: UPath, held: Mapping[str, Sequence[SceneReport]]) -> Iterator[Finding]:
-    """Yield what an index asks for and the data set does not hold. held: scenes by name."""
+    """Yield findings for scenes and frames of an index that the data set does not hold.
+
+    file: the index. held: reports on the scenes of the data set by name; a name may have several.
+    """
     try:
         index = read_index(str(file)) or {}
     except ValueError as error:
-        yield Finding(file.name, str(error), "correct the file, or get it again")
+        yield Finding(file.name, str(error), "correct the file, or download it again")
         return
     for name, entry in index.items():
         # scenes that are never judged have none
@@ -42,18 +45,18 @@ def _entry_findings(
 ) -> Iterator[Finding]:
     of_test = [scene for scene in held if scene.split != "train"]
     if not of_test:
-        where = "in train only" if held else "not there"
-        fix = "add it to the test split, take it out of the index, or correct its name"
-        yield Finding(name, f"{index} names the scene, which is {where}", fix)
+        where = "is in train only" if held else "does not exist"
+        fix = "add it to the test split, remove it from the index, or correct its name"
+        yield Finding(name, f"{index} names the scene, which {where}", fix)
         return
     frames = of_test[0].numbered
     outside = [n for n in (*entry.context, *entry.target) if not 0 <= n < frames]
     # of a scene that cannot be read that is told already
     if frames and outside:
-        reason = f"{index} has frames {spans(outside)}, but the scene's are 0 to {frames - 1}"
+        reason = f"{index} has frames {spans(outside)}, but the scene has 0 to {frames - 1}"
         fix = "correct the index, or add the missing frames to the scene"
         yield Finding(name, reason, fix)
     if given := sorted({*entry.context}.intersection(entry.target)):
         reason = f"{index} has frames as context and as target: {spans(given)}"
-        fix = "judge models on frames that they are not given"
+        fix = "score models on frames that are not inputs"
         yield Finding(name, reason, fix, severity="warning")

@@ -1,4 +1,4 @@
-"""Any source of scenes turned into chunks, which training reads fast."""
+"""Convert any source of scenes to chunks, which training reads fast."""
 
 import json
 import os
@@ -20,10 +20,10 @@ from qgs_photos.datatools.entries import ChunkEntry, Encoding, chunk_entry, enco
 
 CHUNK_BYTES = 100 * 2**20
 SETTINGS = "packing.json"
-"""File with the settings that decide the result of an unfinished packing."""
+"""File in the output folder with the settings of the packing; deleted when it is finished."""
 
 Places: TypeAlias = Mapping[str, tuple[Split, int]]
-"""Scenes by name: the split of the source that has each, and its index there."""
+"""Scenes by name: the split of the source that holds the scene, and the scene's index in it."""
 
 # What is packed into which split.
 Splits: TypeAlias = Mapping[Split, Places]
@@ -32,19 +32,20 @@ Splits: TypeAlias = Mapping[Split, Places]
 def chosen_splits(
     source: SceneSource, test: Collection[str] | None = None, every: int | None = None
 ) -> Splits:
-    """Return the source's own splits; scenes in both are packed once, for training.
+    """Divide the scenes of `source` into train and test.
 
-    test: names of those for testing instead, of all scenes. every: or every n-th of them, beginning
-    with scene n - 1. Raises ValueError for names of no scene.
+    test: names of the test scenes. every: make every Nth of all scenes a test scene, beginning with
+    index N - 1. Without both, the splits of the source are kept, and a scene in both is packed only
+    for training. Raises ValueError if no scene has a name in `test`.
     """
     train = _places(source, "train")
     places = {**train, **_places(source, "test"), **train}
     if test is not None:
         if absent := [name for name in test if name not in places]:
             raise ValueError(
-                f"{len(absent)} of {len(test)} test scenes are not there: {listed(absent)}; the "
-                f"{len(places)} scenes are called {listed(places)}. Correct the list, or take them "
-                "out of it"
+                f"{len(absent)} of {len(test)} test scenes do not exist: {listed(absent)}; the "
+                f"{len(places)} scenes are {listed(places)}. Correct the names in the list, or "
+                "remove them"
             )
         wanted = {*test}
     elif every is not None:
@@ -62,25 +63,26 @@ def _places(source: SceneSource, split: Split) -> dict[str, tuple[Split, int]]:
     for index, name in enumerate(source.names(split)):
         if name in places:
             raise ValueError(
-                f"two scenes are called {name!r}, and chunks identify scenes by name: rename one"
+                f"two scenes are called {name!r}, but chunks identify scenes by name: rename one"
             )
         places[name] = split, index
     return places
 
 
 def _begin(folder: UPath, settings: Mapping[str, Any]) -> None:
-    """Begin a packing in `folder`, or go on with one of the same settings.
+    """Begin a packing in `folder`, or continue an unfinished one with the same settings.
 
-    Raises FileExistsError for other content, ValueError for other settings.
+    Raises ValueError if the unfinished packing has other settings, and FileExistsError if the
+    folder holds anything else.
     """
     settings = json.loads(json.dumps(settings))
     file = folder / SETTINGS
     if file.is_file():
-        before = read_json(file, "move it away if you know it, or give a new folder")
+        before = read_json(file, "move this file away, or give a new folder")
         if before != settings:
             raise ValueError(
-                f"{folder} holds an unfinished packing with other settings ({before}): give those "
-                "again to finish it, or give a new folder"
+                f"{folder} holds an unfinished packing with other settings ({before}): repeat "
+                "these settings to finish it, or give a new folder"
             )
         return
     inside = folder.iterdir() if folder.is_dir() else ()
@@ -93,12 +95,12 @@ def _begin(folder: UPath, settings: Mapping[str, Any]) -> None:
 
 
 def _is_unfinished(path: UPath) -> bool:
-    """Return whether a process was writing `path` by `opened_replacing` when it was killed."""
+    """Return whether `path` is a temporary file of `opened_replacing`, left by a killed process."""
     return path.name.startswith(".") and path.suffix == ".tmp"
 
 
 def _packed_before(folder: UPath) -> dict[str, str]:
-    """Return the file of each scene in the whole chunks of a folder; removes unfinished ones."""
+    """Return the chunk file of each scene that is packed in a folder; delete unfinished files."""
     files: dict[str, str] = {}
     for item in sorted(folder.iterdir(), key=str) if folder.is_dir() else ():
         if _is_unfinished(item):
@@ -110,10 +112,11 @@ def _packed_before(folder: UPath) -> dict[str, str]:
 
 @dataclass
 class Packed:
-    """Result of a packing: scenes by split; `resumed` of them were packed before.
+    """Result of a packing.
 
-    frames, kept: images written now, and those whose bytes stayed. left_out: scenes that could not
-    be read, with the reason.
+    scenes: number of scenes by split. resumed: how many of these scenes an earlier, interrupted run
+    had packed. frames: images written in this run. kept: how many of these images were copied
+    unchanged. left_out: names of scenes that cannot be read, with the reason.
     """
 
     scenes: dict[Split, int] = field(default_factory=dict)
@@ -134,12 +137,15 @@ def pack(
     leave_out_broken: bool = False,
     progress: Callable[[str], None] = lambda scene: None,
 ) -> Packed:
-    """Write the scenes of `splits` to `folder`, as chunks of at most `chunk_bytes` or one scene.
+    """Write the scenes of `splits` to `folder` as chunks.
 
-    An interrupted packing goes on after its last complete chunk, if `settings`, which decide what
-    the source holds, are the same; index.json comes last. leave_out_broken: unreadable scenes are
-    left out, named in the result and tried again. progress: called with each finished scene.
-    Raises FileExistsError for a folder with other content, ValueError and OSError as the scenes do.
+    A chunk has at most `chunk_bytes` bytes, or holds one larger scene. index.json is written last.
+    An interrupted packing continues after its last complete chunk if its settings are the same.
+
+    settings: all that decides which scenes the source has. leave_out_broken: leave out scenes that
+    cannot be read and name them in the result; False raises their error. progress: called with the
+    name of each finished scene. Raises FileExistsError for a folder with other content, ValueError
+    for an unfinished packing with other settings, and ValueError and OSError from reading scenes.
     """
     encoding = encoding or Encoding()
     # chunks of two settings in one folder would be a data set that nobody asked for
@@ -202,9 +208,10 @@ def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEnt
 
 @contextmanager
 def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
-    """Open a file that replaces `path` when the block ends well; makes missing parent folders.
+    """Open a temporary file that replaces `path` if the block ends without an error.
 
-    Moving is as atomic as the file system's: object stores show an object when it is complete.
+    Makes missing parent folders. On a local disk the replacement is atomic; an object store shows
+    an object only when it is complete.
     """
     if is_local(path):
         with replacing(Path(str(path))) as temporary, temporary.open("wb") as file:
@@ -223,6 +230,6 @@ def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
 
 
 def write_bytes(path: UPath, data: bytes) -> None:
-    """Write `data` to `path`, whole or not at all."""
+    """Write `data` to `path` completely or not at all."""
     with opened_replacing(path) as file:
         file.write(data)

@@ -1,4 +1,4 @@
-"""Scenes to check: their photos as they are listed, and what decoding each of them gives."""
+"""Decode the photos of scenes that are checked."""
 
 import hashlib
 import io
@@ -25,9 +25,11 @@ _BLACK = 4
 
 @dataclass(frozen=True)
 class Photo:
-    """A listed photo, what reads its bytes, and whether it exists.
+    """A photo to check.
 
-    maps: by kind, what reads its mask or depth map, (H, W); None for none.
+    listed: its entry in the data set: name, camera, size. read: returns the bytes of its file.
+    maps: functions that return its mask and its depth map, (H, W), by name; they return None if
+    there is no such map. exists: whether the file exists.
     """
 
     listed: PhotoFrame
@@ -36,7 +38,11 @@ class Photo:
     exists: bool = True
 
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return pinhole RGB, at most `side` pixels long, and intrinsics (4,). Raises OSError."""
+        """Return the undistorted photo, (H, W, 3) uint8, and its intrinsics fx, fy, cx, cy.
+
+        size: (H, W) of the file, used if the data set lists none. side: pixels to which a longer
+        side is reduced. Raises OSError if the file cannot be read.
+        """
         frame = self.listed if self.listed.size else replace(self.listed, size=size)
         image = turned(decode_rgb(io.BytesIO(self.read())), frame)
         scale = min(1.0, side / max(image.size))
@@ -50,9 +56,10 @@ class Photo:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene to check. photos: raises ValueError or OSError.
+    """A scene to check, whose photos are listed only when its turn comes.
 
-    missing: names of listed images that do not exist and are none of `photos`; raises the same.
+    kind: format. photos: returns the photos. missing: returns the names of listed images that do
+    not exist and that `photos` leaves out. Both raise ValueError or OSError for unreadable scenes.
     """
 
     name: str
@@ -64,10 +71,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Decoded:
-    """Result of decoding a photo. size: (H, W), None for none. digest: of the bytes.
+    """Result of decoding a photo.
 
-    errors, warnings: reasons with remedies. empty_mask: whether its mask leaves out everything,
-    None without one.
+    size: (H, W); None if it cannot be decoded. digest: hash of the file's bytes, by which equal
+    photos are found. errors, warnings: pairs of reason and remedy. empty_mask: whether the mask
+    leaves out the whole photo; None without a mask.
     """
 
     size: Size | None = None
@@ -79,7 +87,7 @@ class Decoded:
 
 @dataclass(frozen=True)
 class DecodedScene:
-    """The photos of a scene, and what decoding each of them gave."""
+    """The photos of a scene, each with the result of decoding it."""
 
     name: str
     photos: Sequence[Photo]
@@ -88,7 +96,7 @@ class DecodedScene:
     def finding(
         self, frames: Sequence[int], reason: str, fix: str, severity: Severity = "error"
     ) -> Finding:
-        """Return a finding about some of the frames."""
+        """Return a finding about some photos. frames: their indices in `photos`."""
         return Finding(
             scene=self.name,
             reason=reason,
@@ -101,12 +109,15 @@ class DecodedScene:
 
     @cached_property
     def numbers(self) -> Sequence[int | None]:
-        """The number that readers give each photo; None for those that they leave out."""
+        """Frame number of each photo in the loaded scene; None for photos that are left out."""
         count = itertools.count()
         return [next(count) if _is_read(photo) else None for photo in self.photos]
 
     def label(self, frame: int) -> str:
-        """Return what messages call a photo: its number and name, or its name alone."""
+        """Return a photo's name in messages: frame number and file name, or the file name alone.
+
+        frame: index in `photos`.
+        """
         name = self.photos[frame].listed.name
         number = self.numbers[frame]
         return name if number is None else f"frame {numbered(number, name)}"
@@ -118,7 +129,10 @@ def _is_read(photo: Photo) -> bool:
 
 
 def decode(photo: Photo, headers_only: bool) -> Decoded:
-    """Try a photo, or its header alone, then its mask and depth map."""
+    """Decode a photo, its mask and its depth map, and report what fails.
+
+    headers_only: read only the header of the photo, and no maps.
+    """
     if not photo.listed.name:
         return Decoded()
     if not photo.exists:
@@ -157,11 +171,11 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
 
 
 def _is_black(image: Image.Image) -> bool:
-    """Return whether nothing of it is brighter than _BLACK, or transparent."""
+    """Return whether the image is opaque and no pixel is brighter than _BLACK."""
     rgba = np.array(image.resize((96, 96)).convert("RGBA"))
     return bool(rgba[..., :3].max() <= _BLACK and rgba[..., 3].min() == 255)
 
 
 def error_text(error: Exception) -> str:
-    """Return the message of an exception, with its type unless it is one of reading a file."""
+    """Return the message of an exception; unless it is an error of reading files, with its type."""
     return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)

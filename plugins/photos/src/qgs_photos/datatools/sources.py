@@ -1,4 +1,4 @@
-"""Data sources of installed plugins: which of them reads a path, and its scenes to check."""
+"""Find the data source of an installed plugin that reads a path, and list its scenes to check."""
 
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
@@ -15,7 +15,7 @@ from qgs_photos.datatools.entries import bytes_of, encoded
 from qgs_photos.datatools.photos import Candidate, Photo
 
 OF_FILES = ("qgs", "datasets")
-"""Plugins whose sources are checked by their files, not by what they deliver."""
+"""Plugins whose data sets are checked file by file; of other plugins, loaded scenes are checked."""
 
 # Of the images that a source is asked for.
 _SIZE = (256, 256)
@@ -23,7 +23,10 @@ _SIZE = (256, 256)
 
 @cache
 def _imported(format: str) -> tuple[Registry, list[str]]:
-    """Import all plugins for "auto"; else OF_FILES, and that of a `format` PLUGIN/NAME."""
+    """Import the plugins in OF_FILES and the one that `format` names; all plugins for "auto".
+
+    Returns their components, and a note on each plugin that cannot be imported.
+    """
     if format == "auto":
         return load_usable_plugins()
     plugin, slash, _ = format.partition("/")
@@ -31,30 +34,32 @@ def _imported(format: str) -> tuple[Registry, list[str]]:
 
 
 def sources(format: str = "auto") -> dict[str, type[Component]]:
-    """Return the sources that read a path, by PLUGIN/NAME: of OF_FILES and those for `format`.
+    """Return the data sources that have an option `path`, by PLUGIN/NAME.
 
-    Raises PluginError where the one that `format` names cannot be used.
+    format: "auto" for those of all plugins; PLUGIN/NAME for those of OF_FILES and of PLUGIN.
+    Raises PluginError if that plugin cannot be imported.
     """
     found = _imported(format)[0].components("data")
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}
 
 
 def left_out(format: str = "auto") -> list[str]:
-    """Return a note on each plugin that cannot be used."""
+    """Return a note on each plugin that cannot be imported (see `sources`)."""
     return [f"left out: {problem}" for problem in _imported(format)[1]]
 
 
 def kind_of(path: UPath) -> str:
-    """Return PLUGIN/NAME of the source that reads `path`, or NAME for one of OF_FILES."""
+    """Return PLUGIN/NAME of the data source that reads `path`, or NAME for plugins in OF_FILES."""
     kind = recognised(path, sources())
     plugin, _, name = kind.partition("/")
     return name if plugin in OF_FILES else kind
 
 
 def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candidate]:
-    """Yield the scenes of a plugin's source, as it delivers them. Raises as the source does.
+    """Yield the scenes of a plugin's data source to check, with images as the source returns them.
 
-    images: for its option of that name. Raises ValueError where it has none.
+    kind: PLUGIN/NAME. images: value of the source's option `images`; None keeps its default. Raises
+    ValueError if the source has no such option, and what the source raises.
     """
     source = sources(kind)[kind]
     assert issubclass(source, SceneSource)
