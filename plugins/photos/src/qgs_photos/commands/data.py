@@ -34,6 +34,41 @@ Quality: TypeAlias = Annotated[
 EveryNth: TypeAlias = Annotated[
     int | None, typer.Option(help="Make every Nth scene a test scene.", min=2)
 ]
+Geometry: TypeAlias = Annotated[
+    int,
+    typer.Option(help="Number of scenes whose poses are checked by matching photos.", min=0),
+]
+Format: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        help="Check only scenes in this format, such as colmap or chunks. auto: any format."
+    ),
+]
+SourceOptions: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Option of the data source, such as images=images_4. Repeatable."),
+]
+ImageSize: TypeAlias = Annotated[
+    tuple[int, int] | None,
+    typer.Option(
+        help="Height and width to which all images are resized. Default: no resizing.", min=1
+    ),
+]
+TestScenes: TypeAlias = Annotated[
+    str | None,
+    typer.Option(help="File that names the test scenes: an evaluation index or a list."),
+]
+LeaveOutBroken: TypeAlias = Annotated[
+    bool,
+    typer.Option(
+        help="Leave out scenes that cannot be read, and list them at the end. Default: stop at "
+        "the first."
+    ),
+]
+Quick: TypeAlias = Annotated[
+    bool,
+    typer.Option("--quick", help="Read only image headers: decode and match no images."),
+]
 
 
 @app.command("check")
@@ -45,26 +80,15 @@ def check(
         list[str] | None,
         typer.Option(help="Evaluation index to compare with the scenes. Repeatable."),
     ] = None,
-    format: Annotated[
-        str,
-        typer.Option(
-            help="Check only scenes in this format, such as colmap or chunks. auto: any format."
-        ),
-    ] = "auto",
+    format: Format = "auto",
     images: Annotated[
         str | None,
         typer.Option(
             help="Folder of photos inside each scene, such as images_4. Default: the format's."
         ),
     ] = None,
-    quick: Annotated[
-        bool,
-        typer.Option("--quick", help="Read only image headers: decode and match no images."),
-    ] = False,
-    geometry: Annotated[
-        int,
-        typer.Option(help="Number of scenes whose poses are checked by matching photos.", min=0),
-    ] = 20,
+    quick: Quick = False,
+    geometry: Geometry = 20,
     threads: Annotated[int, typer.Option(help="Threads that decode images.", min=1)] = 8,
 ) -> None:
     """Find faults of a data set: one line for each fault, with scene, frame and remedy.
@@ -125,34 +149,15 @@ def pack(
         str, typer.Argument(help="Data set, or a recipe (.yaml) whose data set is packed.")
     ],
     out: Annotated[str, typer.Option(help="New folder for the chunks, or its URL.")],
-    options: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="Option of the data source, such as images=images_4. Repeatable."
-        ),
-    ] = None,
-    image_size: Annotated[
-        tuple[int, int] | None,
-        typer.Option(
-            help="Height and width to which all images are resized. Default: no resizing.", min=1
-        ),
-    ] = None,
+    options: SourceOptions = None,
+    image_size: ImageSize = None,
     jpeg: Quality = None,
     chunk_mb: Annotated[
         int, typer.Option(help="Largest size of a chunk in mebibytes (2^20 bytes).", min=1)
     ] = 100,
-    test_scenes: Annotated[
-        str | None,
-        typer.Option(help="File that names the test scenes: an evaluation index or a list."),
-    ] = None,
+    test_scenes: TestScenes = None,
     test_every: EveryNth = None,
-    leave_out_broken: Annotated[
-        bool,
-        typer.Option(
-            help="Leave out scenes that cannot be read, and list them at the end. Default: stop at "
-            "the first."
-        ),
-    ] = False,
+    leave_out_broken: LeaveOutBroken = False,
 ) -> None:
     """Convert any data set into chunks, the format that training reads fastest.
 

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import typer
 
@@ -10,6 +10,31 @@ from qgs.cli.options import Threads
 from qgs_photos.printing import say
 
 app = typer.Typer(help="Find camera poses of photos or a video.")
+
+VideoFrames: TypeAlias = Annotated[
+    int | None,
+    typer.Option(
+        min=3,
+        help="Number of frames taken from a video. Default: two a second, more for fast "
+        "motion, between 40 and 240.",
+    ),
+]
+Matching: TypeAlias = Annotated[
+    Literal["auto", "exhaustive", "sequential"],
+    typer.Option(
+        help="exhaustive: match all pairs of photos. sequential: match neighbours in the order "
+        "of names. auto: sequential for videos and for more than 80 photos, else exhaustive."
+    ),
+]
+Side: TypeAlias = Annotated[
+    int,
+    typer.Option(
+        min=200, help="Longer side in pixels to which photos are reduced to find features."
+    ),
+]
+Features: TypeAlias = Annotated[
+    int, typer.Option(min=100, help="Largest number of features in a photo.")
+]
 
 
 @app.command()
@@ -24,30 +49,10 @@ def poses(
             "video."
         ),
     ] = None,
-    frames: Annotated[
-        int | None,
-        typer.Option(
-            min=3,
-            help="Number of frames taken from a video. Default: two a second, more for fast "
-            "motion, between 40 and 240.",
-        ),
-    ] = None,
-    side: Annotated[
-        int,
-        typer.Option(
-            min=200, help="Longer side in pixels to which photos are reduced to find features."
-        ),
-    ] = 1600,
-    matching: Annotated[
-        Literal["auto", "exhaustive", "sequential"],
-        typer.Option(
-            help="exhaustive: match all pairs of photos. sequential: match neighbours in the order "
-            "of names. auto: sequential for videos and for more than 80 photos, else exhaustive."
-        ),
-    ] = "auto",
-    features: Annotated[
-        int, typer.Option(min=100, help="Largest number of features in a photo.")
-    ] = 4096,
+    frames: VideoFrames = None,
+    side: Side = 1600,
+    matching: Matching = "auto",
+    features: Features = 4096,
     seed: Annotated[
         int,
         typer.Option(

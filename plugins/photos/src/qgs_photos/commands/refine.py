@@ -17,6 +17,21 @@ Count: TypeAlias = Annotated[
         min=1, help="Number of Gaussians in the result. Default: that of the reconstruction."
     ),
 ]
+PhotoSize: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HxW",
+        help="Height and width of the photos in the optimisation. Default: the size with which "
+        "the reconstruction was made.",
+    ),
+]
+InputsOnly: TypeAlias = Annotated[
+    bool,
+    typer.Option(
+        "--inputs-only",
+        help="Optimise only on the input photos of the reconstruction, not on further photos.",
+    ),
+]
 
 
 @app.command()
@@ -37,21 +52,8 @@ def refine(
     ] = None,
     seconds: Annotated[float, typer.Option(help="Time of the optimisation in seconds.")] = 30.0,
     gaussians: Count = None,
-    size: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HxW",
-            help="Height and width of the photos in the optimisation. Default: the size with which "
-            "the reconstruction was made.",
-        ),
-    ] = None,
-    inputs_only: Annotated[
-        bool,
-        typer.Option(
-            "--inputs-only",
-            help="Optimise only on the input photos of the reconstruction, not on further photos.",
-        ),
-    ] = False,
+    size: PhotoSize = None,
+    inputs_only: InputsOnly = False,
     scene_name: SceneName = None,
     device: Device = "auto",
 ) -> None:
