@@ -94,8 +94,8 @@ def check(
     """Find faults of a data set: one line for each fault, with scene, frame and remedy.
 
     Every image is decoded. Poses are checked by points that neighbouring photos share. The exit
-    code is 1 for errors, and 0 for no faults or only warnings. To find the reader of PATH, every
-    installed plugin is imported; --format PLUGIN/NAME imports only that plugin, other formats none.
+    code is 1 for errors, and 0 for no faults or only warnings. The command imports every installed
+    plugin to find the reader of PATH. --format PLUGIN/NAME imports only PLUGIN, other formats none.
     """
     from qgs.paths import opened_path
     from qgs_photos.datatools.check import Options, check
@@ -162,8 +162,9 @@ def pack(
     """Convert any data set into chunks, the format that training reads fastest.
 
     JPEG and PNG photos of pinhole cameras are copied unchanged. Other photos are undistorted and
-    written as PNG. The same command again finishes an interrupted conversion. To find the reader of
-    a data set, every installed plugin is imported; for a recipe, only the plugins that it names.
+    written as PNG. The same command again finishes an interrupted conversion. The command imports
+    every installed plugin to find the reader of a data set; for a recipe, only the plugins that the
+    recipe names.
     """
     from qgs.paths import opened_path
     from qgs_photos.datasets.dl3dv import read_scene_list

@@ -1,4 +1,4 @@
-"""Published data sets as `qgs` reads them: chunks in pixelSplat's format, and DL3DV's archives."""
+"""Readers of published data sets: chunks in pixelSplat's format, and DL3DV's archives."""
 
 from qgs.contracts import Plugin
 from qgs_photos.datasets.chunks import ChunksSource

@@ -1,4 +1,4 @@
-"""NeRF's synthetic scenes, rendered by Blender (Mildenhall et al., 2020)."""
+"""Read NeRF's synthetic scenes, which were rendered by Blender (Mildenhall et al., 2020)."""
 
 from dataclasses import replace
 
@@ -11,18 +11,24 @@ _SPLITS = {"train": "train", "val": "test", "test": "test"}
 
 
 class Blender(PhotoReader):
-    """NeRF's synthetic scenes: a transforms file for each split; the alpha channel is the mask."""
+    """Reader of NeRF's synthetic scenes.
+
+    Each split has a transforms file. The alpha channel of a photo is its mask.
+    """
 
     listing = "transforms_train.json"
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
-        """See `PhotoReader`: any of the files is enough."""
+        """Return whether `folder` holds the transforms file of at least one split."""
         return any((folder / f"transforms_{part}.json").is_file() for part in _SPLITS)
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`: training frames first, others held out. `images`: ValueError."""
+        """See `PhotoReader`. Training frames come first; those of val and test are held out.
+
+        Raises ValueError if `images` is given, since transforms files name the folders of photos.
+        """
         if images is not None:
             raise ValueError(
                 f"`images` is {images!r}, but the transforms files of {folder} name a folder for "

@@ -1,6 +1,6 @@
-"""`cameras.json`, as feed-forward projects ship with their demos: poses, intrinsics, photos beside.
+"""Read `cameras.json` as demos of feed-forward projects have it: poses, intrinsics, photos.
 
-What its numbers mean is read off their names; a name that leaves it open is refused.
+Names of values decide what they mean; an ambiguous name is refused.
 """
 
 import math
@@ -43,22 +43,30 @@ _FORM = '{"frames": [{"image": "0.png", "c2w": 4 x 4, "K": 3 x 3}, ...]}'
 
 
 class CamerasJson(PhotoReader):
-    """A list of cameras, or one under `frames`, `cameras` or `views`, or lists of their values.
+    """Reader of `cameras.json`.
 
-    A camera has a pose: `c2w` or one of its other names, OpenCV camera-to-world (3 or 4, 4); `w2c`,
-    its inverse; `transform_matrix`, OpenGL as nerfstudio writes it; or `position` and `rotation`
-    (3, 3), camera-to-world as 3DGS writes them. And intrinsics: `K` or one of its other names,
-    (3, 3), or fx, fy, cx, cy, in a list or by these names, in pixels of `w` by `h`, or of the file
-    without these; where none is above 3, in parts of width and height. What all share may stand at
-    the top. Images are named by one of `_NAMES`, or are those beside the file, or in images, by
-    name.
+    The file is a list of cameras, has such a list under `frames`, `cameras` or `views`, or has a
+    list for each value. Values that all cameras share may stand at the top level.
+
+    - Pose: `c2w` or a synonym, OpenCV camera-to-world (3 or 4, 4); `w2c`, its inverse;
+      `transform_matrix`, camera-to-world with OpenGL axes, as nerfstudio writes it; or `position`
+      (3,) and `rotation` (3, 3), camera-to-world, as 3DGS writes them.
+    - Intrinsics: `K` or a synonym, (3, 3); or fx, fy, cx, cy, as a list or under these names. Their
+      unit is pixels of an image of `w` by `h`, by default the size of the image file. If no value
+      is above 3, they are fractions of width and height.
+    - Photo: a file name under one of `_NAMES`. Without names, the photos beside the file or in
+      images/, in the order of their names.
     """
 
     listing = "cameras.json"
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
-        """See `PhotoReader`: other programs give other files this name, without photos beside."""
+        """See `PhotoReader`. False for files of other programs with this name.
+
+        A file is recognised if it has both `c2w` and `K`, or if photos lie beside it. A file that
+        `qgs reconstruct` wrote is not.
+        """
         file = folder / cls.listing
         if not file.is_file():
             return False
@@ -72,7 +80,7 @@ class CamerasJson(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`. Raises ValueError for unnamed images of another number."""
+        """See `PhotoReader`. Raises ValueError if no photo is named and their number differs."""
         file = folder / cls.listing
         cameras = _cameras(file, read_json(file, f"write {_FORM}"))
         names: list[str] = []
@@ -94,23 +102,26 @@ class CamerasJson(PhotoReader):
             if len(names) != len(cameras):
                 raise ValueError(
                     f"{file} lists {len(cameras)} cameras without names of images, but {place} has "
-                    f"{len(names)} images: name them, as in {_FORM}"
+                    f"{len(names)} images: name the images, as in {_FORM}"
                 )
         pairs = zip(cameras, names, strict=True)
         read = [_Camera(camera, place, name) for camera, name in pairs]
         if any(camera.in_parts for camera in read):
-            warn_once(f"intrinsics in {file} are read as parts of width and height")
+            warn_once(f"intrinsics in {file} are read as fractions of width and height")
         return Listing(file, [camera.frame(folder) for camera in read])
 
 
 def _with_suffixes(names: list[str], folders: list[UPath]) -> list[str]:
-    """Return `names`, of which those without a suffix get that of the photo of the name."""
+    """Return `names`; a name without a suffix gets that of the photo with this name."""
     known = {photo.stem: photo.name for folder in folders for photo in image_files(folder)}
     return [name if "." in name else known.get(name, name) for name in names]
 
 
 def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
-    """Return the entry of each camera, with defaults from the top level. Raises ValueError."""
+    """Return the values of each camera; shared values come from the top level.
+
+    Raises ValueError if the numbers of poses and intrinsics differ.
+    """
     top = data if isinstance(data, Mapping) else {}
     given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)
     if not isinstance(given, list):
@@ -129,7 +140,7 @@ def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
         matrices = matrices if isinstance(matrices, list) else []
         if (count := len(matrices)) != len(poses):
             raise ValueError(
-                f"{file} has {len(poses)} matrices {pose} and {count} {matrix or 'K'}: write "
+                f"{file} has {len(poses)} matrices {pose}, but {count} of {matrix or 'K'}: write "
                 f"{_FORM}"
             )
         rows = zip(poses, matrices, names, strict=True)
@@ -138,12 +149,16 @@ def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
 
 
 def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
-    """Return the first of `keys` that is given; "" for none."""
+    """Return the first of `keys` that has a value in `values`; "" if none has."""
     return next((key for key in keys if values.get(key) is not None), "")
 
 
 class _Camera:
-    """An entry of the file. name: of its photo, below `place`; "" for none."""
+    """A camera of the file.
+
+    values: its entry. place: folder of the photos. name: file name of the photo in that folder;
+    "" if none is named.
+    """
 
     def __init__(self, values: Mapping[str, Any], place: UPath, name: str) -> None:
         self.values = values
@@ -166,7 +181,7 @@ class _Camera:
         self.problems.append(FrameProblem(reason, f"write {_FORM}"))
 
     def _pose(self) -> np.ndarray:
-        """Return OpenCV camera-to-world (4, 4), NaN for none."""
+        """Return OpenCV camera-to-world (4, 4); NaN if the pose is missing or invalid."""
         values = self.values
         key = _first(values, (*_C2W, *_W2C, *_OPENGL))
         pose = numbers(values.get(key))
@@ -176,7 +191,8 @@ class _Camera:
                 pose = np.c_[rotation, position]
         elif not key:
             unclear = _first(values, _OPEN)
-            reason = f"{unclear!r} may map from or to the world" if unclear else "it has no pose"
+            ambiguous = f"{unclear!r} may be camera-to-world or world-to-camera"
+            reason = ambiguous if unclear else "it has no pose"
             self._wrong(f"{reason}: expected {_C2W[0]} or {_W2C[0]}")
             return np.full((4, 4), np.nan)
         if pose.shape == (3, 4):
@@ -190,7 +206,7 @@ class _Camera:
         return pose * [1, -1, -1, 1] if key in _OPENGL else pose
 
     def _intrinsics(self) -> np.ndarray:
-        """Return fx, fy, cx, cy in pixels, NaN for none."""
+        """Return fx, fy, cx, cy in pixels; NaN if intrinsics are missing or invalid."""
         key = _first(self.values, _K)
         matrix = numbers(self.values.get(key))
         names = [_first(self.values, names) for names in _FOCAL]
@@ -214,14 +230,14 @@ class _Camera:
         return matrix
 
     def _photo_size(self) -> Size | None:
-        """Return (H, W) as listed, else that of the file; None of one that cannot be read."""
+        """Return (H, W) as listed, or else that of the image file; None if it cannot be read."""
         if self.size is None and self.name:
             with suppress(ValueError):
                 self.size = read_image(self.place / self.name, image_size)
         return self.size
 
     def frame(self, folder: UPath) -> PhotoFrame:
-        """Return the photo, with its name below `folder`."""
+        """Return the photo and its camera. folder: the scene's, to which the name is relative."""
         inside = self.name
         if self.place != folder and inside:
             inside = f"{self.place.name}/{inside}"

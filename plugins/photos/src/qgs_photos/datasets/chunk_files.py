@@ -1,15 +1,19 @@
-"""Files of RealEstate10K-style chunks: reading, checking, and which scenes a folder holds.
+"""Read and check chunk files in RealEstate10K's format, and list the scenes of a folder.
 
-The format is pixelSplat's (data release of RealEstate10K and ACID, and DepthSplat's of DL3DV):
-PATH/{train,test}/index.json maps a scene's key to a file such as 000000.torch, which is a list of
-mappings, one a scene, with `key`, `url`, `timestamps` (V,), `cameras` (V, 18) float32 and `images`,
-a list of V uint8 tensors with the bytes of JPEG or PNG files. A row of `cameras` is fx, fy, cx, cy
-divided by the image's width and height, two numbers without use, and the rows of the 3 x 4 OpenCV
-world-to-camera matrix.
+pixelSplat published RealEstate10K and ACID in this format, DepthSplat published DL3DV in it.
+PATH/{train,test}/index.json maps the key of a scene to a file such as 000000.torch. The file is a
+list with a mapping for each scene of V frames:
 
-`qgs` adds keys that other readers ignore: `names` (V strings), `sizes` (V, 2), the height and width
-of every image, `masks`, a list of V uint8 tensors with the bytes of PNG files, empty where a frame
-has none, `held_out`, the frames that training is not to see, and `times` (V,) float64, see `Scene`.
+- `key`: name of the scene. `url`: of its video. `timestamps`: (V,).
+- `cameras`: (V, 18) float32. A row is fx, fy, cx, cy divided by the image's width and height, two
+  unused numbers, and the rows of the 3 x 4 OpenCV world-to-camera matrix.
+- `images`: a list of V uint8 tensors with the bytes of JPEG or PNG files.
+
+`qgs data pack` adds keys that other readers ignore:
+
+- `names`: V strings. `sizes`: (V, 2), height and width of every image.
+- `masks`: a list of V uint8 tensors with the bytes of PNG files, empty for frames without a mask.
+- `held_out`: indices of frames that training must not use. `times`: (V,) float64, see `Scene`.
 """
 
 import io
@@ -50,7 +54,10 @@ _DIVIDED_TWICE = 0.02
 
 @dataclass(frozen=True)
 class Record:
-    """A scene as a chunk holds it (see the top of this file), undecoded; where: for messages."""
+    """A scene as a chunk holds it, with encoded images.
+
+    where: chunk and scene for messages. The other fields are described at the top of this file.
+    """
 
     where: str
     key: str
@@ -66,31 +73,31 @@ class Record:
         return len(self.images)
 
     def place(self, frame: int) -> str:
-        """Return file, key, frame number and name, for messages."""
+        """Return chunk, scene, frame number and name of a frame as text for messages."""
         return f"{self.where}, frame {frame} ({self.names[frame]})"
 
     @cached_property
     def w2c(self) -> Tensor:
-        """(V, 4, 4) float64 world-to-camera, OpenCV axes, as stored."""
+        """World-to-camera matrices (V, 4, 4) as stored, float64, OpenCV axes."""
         matrix = torch.eye(4, dtype=torch.float64).repeat(len(self), 1, 1)
         matrix[:, :3] = self.cameras[:, 6:].double().reshape(-1, 3, 4)
         return matrix
 
     @cached_property
     def image_sizes(self) -> list[Size]:
-        """(H, W) of every image: as the chunk says, else all as `stored_size` of the first."""
+        """(H, W) of every image, as the chunk lists it; without a list, that of the first image."""
         if self.sizes is not None:
             return [(int(height), int(width)) for height, width in self.sizes.tolist()]
         return [self.stored_size(0)] * len(self)
 
     def stored_size(self, frame: int) -> Size:
-        """Return (H, W) in the header of an image. Raises ValueError for no readable image."""
+        """Return (H, W) from the header of an image. Raises ValueError if it cannot be read."""
         try:
             return image_size(io.BytesIO(self.images[frame].numpy().tobytes()))
         except OSError as error:
             raise ValueError(
-                f"{self.place(frame)}: the bytes are no readable image ({error}): pack the data "
-                "set again with `qgs data pack`, or remove the scene from index.json"
+                f"{self.place(frame)}: the image cannot be read ({error}): pack the data set "
+                "again with `qgs data pack`, or remove the scene from index.json"
             ) from error
 
     def intrinsics(self, frame: int, size: Size) -> Intrinsics:
@@ -100,7 +107,10 @@ class Record:
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """Return the scene in an entry of the chunk `file`. Raises ValueError for another structure."""
+    """Check an entry of a chunk and return its scene.
+
+    file: name of the chunk for messages. data: the entry. Raises ValueError for another structure.
+    """
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
             f"{file} holds {a_type(data)}, expected a mapping with 'key', 'cameras' and 'images': "
@@ -111,7 +121,7 @@ def parse_record(file: str, data: Any) -> Record:
         value = data.get(name)
         for item in value if isinstance(value, list | tuple) else [value]:
             plain = not isinstance(item, Tensor) or _is_plain(item)
-            _expect(plain, where, f"{name!r} holds a tensor whose numbers are not all stored")
+            _expect(plain, where, f"{name!r} holds a tensor that does not store all its numbers")
     images = _files(where, "images", data.get("images"))
     count = len(images)
     _expect(count > 0, where, "there are no frames")
@@ -130,7 +140,7 @@ def parse_record(file: str, data: Any) -> Record:
         stamps = data.get("timestamps")
         names = stamps.flatten().tolist() if isinstance(stamps, Tensor) else range(count)
     fits = isinstance(names, list | range) and len(names) == count
-    _expect(fits, where, f"'names', or 'timestamps', must be {count}")
+    _expect(fits, where, f"'names' or 'timestamps' must have {count} entries, one for each image")
     held_out = data.get("held_out", ())
     held_out = held_out.flatten().tolist() if isinstance(held_out, Tensor) else held_out
     fits = isinstance(held_out, list | tuple) and {*held_out} <= {*range(count)}
@@ -155,9 +165,9 @@ def a_type(value: object) -> str:
 
 
 def _is_plain(data: Tensor) -> bool:
-    """Return whether all numbers are stored: an expanded tensor can fill the memory.
+    """Return whether a tensor is dense, on the CPU, and stores every number.
 
-    Sparse, quantised and nested tensors and those of other devices are refused too.
+    A tensor that was expanded stores fewer, and would fill the memory when it is copied.
     """
     strided = data.layout == torch.strided and data.device.type == "cpu"
     if not strided or data.is_quantized or data.is_nested:
@@ -185,7 +195,10 @@ def _files(where: str, name: str, data: Any) -> Sequence[Tensor]:
 
 
 def read_mask(record: Record, frame: int) -> np.ndarray | None:
-    """Read the mask of a frame, (H, W) uint8 as its image; None without. Raises ValueError."""
+    """Decode the mask of a frame, (H, W) uint8; None if the frame has no mask.
+
+    Raises ValueError for a mask that cannot be read or has another size than its image.
+    """
     data = None if record.masks is None else record.masks[frame].numpy().tobytes()
     if not data:
         return None
@@ -194,7 +207,7 @@ def read_mask(record: Record, frame: int) -> np.ndarray | None:
     except OSError as error:
         fix = "pack the chunk again, or remove the scene from index.json"
         raise ValueError(
-            f"the mask of {record.place(frame)} is unusable ({error}): {fix}"
+            f"the mask of {record.place(frame)} cannot be read ({error}): {fix}"
         ) from error
     for problem in size_problems(mask.shape[:2], record.image_sizes[frame]):
         raise ValueError(f"the mask of {record.place(frame)}: {problem}")
@@ -202,7 +215,7 @@ def read_mask(record: Record, frame: int) -> np.ndarray | None:
 
 
 def require_usable(record: Record) -> None:
-    """Raise ValueError for the first camera with a fatal problem, naming its frame."""
+    """Raise ValueError that names the first frame with an invalid pose or invalid intrinsics."""
     rotation = record.w2c[:, :3, :3]
     error = rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)
     focal = record.cameras[:, :2]
@@ -220,7 +233,7 @@ def require_usable(record: Record) -> None:
 
 
 def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
-    """Yield what is wrong with the camera of a frame."""
+    """Yield the problems of the pose and the intrinsics of a frame."""
     yield from pose_problems(record.w2c[frame].numpy())
     of_unit = list(unit_problems(record, frame))
     yield from of_unit
@@ -230,7 +243,10 @@ def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
-    """Yield problems of the unit of a frame's intrinsics, fractions of the image's sides."""
+    """Yield a problem if intrinsics are not fractions of the image's width and height.
+
+    They look as if they were in pixels, or divided twice.
+    """
     values = record.cameras[frame, :4].tolist()
     focal = max(values[:2])
     divided_twice = 0 < focal < _DIVIDED_TWICE
@@ -244,13 +260,14 @@ def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def load_chunk(path: UPath) -> list[Any]:
-    """Load the entries of a chunk, tensors and plain containers; a local zip file is memory-mapped.
+    """Load the entries of a chunk, one for each scene.
 
-    Raises FileNotFoundError, and ValueError for a file that is no list.
+    A local file is memory-mapped if it has torch's zip format. Python objects are refused. Raises
+    FileNotFoundError, and ValueError for a file that is damaged or is not a list.
     """
     if not path.is_file():
         raise FileNotFoundError(
-            f"chunk {path} does not exist: download it, or take its scenes out of index.json"
+            f"chunk {path} does not exist: download it, or remove its scenes from index.json"
         )
     try:
         file = str(path) if is_local(path) else open_file(path)
@@ -259,7 +276,7 @@ def load_chunk(path: UPath) -> list[Any]:
         data = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
     except Exception as error:
         # damaged files raise anything
-        reason = "damaged, or with Python objects, whose loading could run code"
+        reason = "it is damaged, or holds Python objects, whose loading could run code"
         # whose text advises to trust the file
         if type(error).__name__ != "UnpicklingError":
             reason = (str(error) or type(error).__name__).splitlines()[0]
@@ -276,7 +293,10 @@ def load_chunk(path: UPath) -> list[Any]:
 
 
 class Chunk:
-    """An open chunk. entries: its scenes by key, as stored."""
+    """An open chunk file. entries: the stored mappings by key of the scene.
+
+    Raises ValueError for an entry without a key and for a key that occurs twice.
+    """
 
     def __init__(self, path: UPath) -> None:
         self.path = path
@@ -293,11 +313,11 @@ class Chunk:
                 self.entries[key] = entry
 
     def record(self, key: str) -> Record:
-        """Return a scene. Raises ValueError when it is not in this chunk or is malformed."""
+        """Return the scene `key`. Raises ValueError if it is invalid or not in this chunk."""
         if key not in self.entries:
             raise ValueError(
-                f"{self.path} does not hold the scene {key!r}, which index.json places there: "
-                "remove index.json to have the chunks read instead, or pack the data set again"
+                f"{self.path} does not hold the scene {key!r}, but index.json says so: remove "
+                "index.json, then scenes are listed from the chunks, or pack the data set again"
             )
         if key not in self._parsed:
             self._parsed[key] = parse_record(str(self.path), self.entries[key])
@@ -305,38 +325,43 @@ class Chunk:
 
 
 def has_chunks(folder: UPath) -> bool:
-    """Return whether a folder looks like one of chunks: it holds an index.json or .torch files."""
+    """Return whether a folder holds index.json or .torch files, as folders of chunks do."""
     return folder.is_dir() and (
         (folder / INDEX).is_file() or any(item.suffix == SUFFIX for item in folder.iterdir())
     )
 
 
 def stays_inside(name: str) -> bool:
-    """Return whether a relative name, with either kind of slash, stays in the folder."""
+    """Return whether a relative path, with / or \\, leads to a file inside its folder."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
     return bool(parts) and parts[0] != "/" and ".." not in parts and ":" not in parts[0]
 
 
 def read_chunk_index(path: UPath) -> dict[str, str]:
-    """Read an index.json: key to file name. Raises ValueError for a file outside the folder."""
-    index = read_json(path, "copy it again, or remove it to have the chunks read instead")
+    """Read an index.json, which maps the key of a scene to the name of its chunk.
+
+    Raises ValueError for another structure and for a chunk outside the folder.
+    """
+    index = read_json(path, "copy it again, or remove it, then scenes are listed from the chunks")
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
         raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
     inside = {name for name in set(index.values()) if stays_inside(name)}
     for key, name in index.items():
         if name not in inside:
             raise ValueError(
-                f"{path} places the scene {name_shown(key)} in {name_shown(name)!r}, outside its "
-                "own folder: correct the index, or remove it to have the chunks read instead"
+                f"{path} names for the scene {name_shown(key)} the chunk {name_shown(name)!r} "
+                "outside the folder of the index: correct the index, or remove it, then scenes are "
+                "listed from the chunks"
             )
     return index
 
 
 def list_scenes(folder: UPath) -> dict[str, UPath]:
-    """List the scenes of a folder by key, in the order of its index, or else of its chunks.
+    """Return the chunk file of each scene of a folder by key, in the order of index.json.
 
-    Scenes whose chunk is missing are left out and logged. Raises FileNotFoundError when none is
-    left, ValueError for an index or a chunk that cannot be read.
+    Without index.json all chunks are opened. Scenes whose chunk does not exist are left out with a
+    warning. Raises FileNotFoundError if no scene is left, ValueError for an index or a chunk that
+    cannot be read.
     """
     if not (folder / INDEX).is_file():
         return _scanned(folder)
@@ -348,8 +373,8 @@ def list_scenes(folder: UPath) -> dict[str, UPath]:
     missing = [f"{key} ({name})" for key, name in index.items() if name not in there]
     if not here:
         raise FileNotFoundError(
-            f"{folder / INDEX} names {len(index)} scenes, and none of their chunks exists: "
-            "download the chunks beside it"
+            f"{folder / INDEX} names {len(index)} scenes, but none of their chunks exists: "
+            "download the chunks into this folder"
         )
     if missing:
         warn_once(

@@ -1,4 +1,4 @@
-"""`datasets/chunks`: RealEstate10K-style chunks; their format is described in `chunk_files`."""
+"""`datasets/chunks`: read chunks in RealEstate10K's format, which `chunk_files` describes."""
 
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -42,21 +42,23 @@ class ChunksConfig(SceneSource.Config):
     """Options of `datasets/chunks`."""
 
     path: str
-    """Folder or fsspec URL with train/ and test/, relative to the working directory. Chunks at a
-    URL are read whole, by every process and worker: copy them to a local disk to train."""
+    """Folder or fsspec URL with train/ and test/. A relative folder starts at the working
+    directory. Every process and worker reads whole chunks from a URL: to train, copy them to a
+    local disk."""
     holdout: int = Field(default=0, ge=0)
-    """Keep every n-th frame of a scene for evaluation, from frame n // 2 on. 0 keeps the
-    frames that `qgs data pack` copied from its source; other chunks have none."""
+    """Hold out every Nth frame of a scene for evaluation, from frame N // 2 on. 0: the frames
+    that the chunk lists as held out, if `qgs data pack` wrote it; otherwise none."""
     max_scenes: int = Field(default=0, ge=0)
-    """Number of first scenes to use from each split. 0 uses all."""
+    """Number of scenes to use from each split, the first in its order. 0 uses all."""
     min_frames: int = Field(default=0, ge=0)
-    """Leave out scenes with fewer frames; this opens every chunk once at the start. 0 keeps all."""
+    """Leave out scenes with fewer frames than this number. To count frames, every chunk is opened
+    at the start. 0 keeps all scenes and opens none."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1] behind transparent pixels."""
 
 
 class ChunkScene(Scene):
-    """One scene of a chunk, read from the file when it is wanted. World: that of its poses."""
+    """A scene of a chunk, read from its file on first use, in the world of its stored poses."""
 
     def __init__(
         self, name: str, file: UPath, config: ChunksConfig, chunks: BoundedCache[Chunk]
@@ -79,7 +81,7 @@ class ChunkScene(Scene):
 
     @cached_property
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
-        """See `Scene`: as the option says, else as the chunk does."""
+        """See `Scene`: as the option `holdout` says; if it is 0, as the chunk lists them."""
         every = self._config.holdout
         return held_out_frames(len(self), every) if every else self._record.held_out
 
@@ -90,7 +92,7 @@ class ChunkScene(Scene):
 
     @cached_property
     def cameras(self) -> Cameras:
-        """See `Scene`; float64. Raises ValueError for cameras that cannot be used."""
+        """See `Scene`; in float64. Raises ValueError for a pose or intrinsics that are invalid."""
         record = self._record
         target = self._config.image_size
         require_usable(record)
@@ -103,7 +105,7 @@ class ChunkScene(Scene):
         return Cameras(torch.linalg.inv(record.w2c), intrinsics, target)
 
     def frame_name(self, frame: int) -> str:
-        """See `Scene`: the writer's name of a frame, else its time stamp."""
+        """Return the name of a frame in the chunk; chunks without names give its time stamp."""
         return self._record.names[frame]
 
     def stored_size(self, frame: int) -> Size:
@@ -116,7 +118,7 @@ class ChunkScene(Scene):
         return to_tensor(np.stack([self._pixels(record, frame) for frame in frames]))
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`; a frame without a mask has one of ones."""
+        """See `Scene`. The mask of a frame without one is 1 everywhere."""
         record = self._record
         if record.masks is None:
             return None
@@ -124,7 +126,7 @@ class ChunkScene(Scene):
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def encoded(self, frame: int) -> EncodedFrame:
-        """Return a frame as it is stored. Raises ValueError for a file that cannot be read."""
+        """Return a frame as an encoded file. Raises ValueError for an image that cannot be read."""
         record = self._record
         size = record.stored_size(frame)
         return EncodedFrame(
@@ -144,15 +146,15 @@ class ChunkScene(Scene):
         except OSError as error:
             raise ValueError(
                 f"{record.place(frame)} cannot be read as an image ({error}): copy or pack the "
-                "chunk again, or take the scene out of index.json"
+                "chunk again, or remove the scene from index.json"
             ) from error
         # intrinsics were cropped for the size that the scene gives
         height, width = record.image_sizes[frame]
         if abs(image.width * height / (image.height * width) - 1) > _SAME_ASPECT:
             raise ValueError(
-                f"{record.place(frame)} is {image.width} x {image.height} pixels, and its scene's "
-                f"images are {width} x {height}, another aspect ratio: chunks of mixed sizes need "
-                "'sizes', which `qgs data pack` writes"
+                f"{record.place(frame)} has {image.width} x {image.height} pixels, but images of "
+                f"its scene have {width} x {height}, another aspect ratio: chunks of mixed sizes "
+                "need the entry 'sizes', which `qgs data pack` writes"
             )
         return CropResize((image.height, image.width), self._config.image_size).image(image)
 
@@ -165,11 +167,11 @@ class ChunkScene(Scene):
 
 
 class ChunksSource(LazySource):
-    """Chunks under PATH/train and PATH/test; a folder without these is the training split.
+    """Scenes of chunks in PATH/train and PATH/test, or chunks in PATH itself, all for training.
 
-    A data set without test chunks is evaluated on the held-out frames of its training scenes,
-    where there are any. Scenes that an index.json names and whose chunks do not exist are left out,
-    counted and named in a warning.
+    A data set without test chunks is evaluated on the held-out frames of its training scenes, if
+    they have any. Scenes whose chunk is named by index.json but does not exist are left out; a
+    warning counts and names them.
     """
 
     name = "chunks"
@@ -190,13 +192,16 @@ class ChunksSource(LazySource):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Return whether train or test hold chunks or an index.json, or the folder chunks."""
+        """Return whether `path` holds chunks, or its train/ or test/ holds chunks or index.json."""
         inside = [path, *path.iterdir()] if path.is_dir() else []
         splits = [item for item in inside if item.name in ("train", "test")]
         return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
 
     def scenes(self, split: Split) -> LazyScenes:
-        """See `SceneSource`. Without test chunks, a training scene says if frames are held out."""
+        """See `SceneSource`. Without test chunks, test scenes are the training scenes.
+
+        This holds if scenes have held-out frames, which is looked up in the first chunk.
+        """
         if split in self.splits:
             return self.splits[split]
         train = self.splits["train"]
@@ -205,7 +210,7 @@ class ChunksSource(LazySource):
         return train if any(train[i].held_out for i in first) else self._nothing
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
-        """See `SceneSource`: one group for each chunk file."""
+        """See `SceneSource`. The scenes of each chunk file are one group."""
         by_file: dict[str, list[int]] = {}
         for index, file in enumerate(self.scenes(split).places.values()):
             by_file.setdefault(str(file), []).append(index)
@@ -215,7 +220,10 @@ class ChunksSource(LazySource):
 def first_scenes(
     places: Mapping[str, UPath], limit: int, opener: Callable[[str, UPath], Scene]
 ) -> LazyScenes:
-    """Return the first `limit` scenes; all for 0."""
+    """Return the first `limit` scenes of `places`; 0 returns all.
+
+    places: folder or file by scene name. opener: opens the scene of a name and a place.
+    """
     return LazyScenes(dict(islice(places.items(), limit or None)), opener)
 
 
@@ -240,7 +248,7 @@ def _folders(path: UPath) -> dict[Split, UPath]:
 def _long_enough(
     folder: UPath, config: ChunksConfig, opener: Callable[[str, UPath], ChunkScene]
 ) -> dict[str, UPath]:
-    """Return the scenes with `min_frames` frames; the others are counted and named."""
+    """Return the scenes of a folder with at least `min_frames` frames; warn of the others."""
     files = list_scenes(folder)
     if not config.min_frames:
         return files

@@ -1,7 +1,7 @@
-"""COLMAP: a sparse model, text or binary, beside a folder of photos.
+"""Read COLMAP's sparse models, text or binary, that lie beside a folder of photos.
 
-Points, which are most of a model, are not read, and models may lie on any file system; pycolmap
-offers neither. The formats are described at colmap.github.io/format.html.
+Unlike pycolmap, this reader skips the points, which are most of a model, and reads from any file
+system. The formats are described at colmap.github.io/format.html.
 """
 
 import io
@@ -41,14 +41,17 @@ _MODELS: dict[str, tuple[int, str, type[BendingLens] | None]] = {
     "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1", Fisheye),
     "RADIAL_FISHEYE": (9, "f cx cy k1 k2", Fisheye),
 }
-"""Number in binary files, parameters in their order, and lens of every camera model."""
+"""Camera models by name: number in binary files, parameters in order, and class of the lens."""
 _NAMES = {number: name for name, (number, _, _) in _MODELS.items()}
-_LONGER = "a file goes on after as many records as it promises"
+_LONGER = "a file goes on after the number of records that it announces"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 
 class Colmap(PhotoReader):
-    """The posed images by name, of a binary model before a text one, as `_PLACES` are ordered."""
+    """Reader of the posed images of a COLMAP model, sorted by name.
+
+    Folders are searched in the order of `_PLACES`; in each, a binary model comes before a text one.
+    """
 
     listing = "sparse/0/{cameras,images}.{bin,txt}"
 
@@ -80,7 +83,7 @@ class Colmap(PhotoReader):
             if len(cameras) + len({PurePosixPath(p[0]) for p in posed}) < len(listed) + len(posed):
                 raise ValueError("a camera or an image is listed twice")
             if unknown := {camera for *_, camera in posed} - cameras.keys():
-                raise ValueError(f"images are of cameras {sorted(unknown)}, which are not in it")
+                raise ValueError(f"images name cameras {sorted(unknown)}, which it does not hold")
         except ValueError as error:
             raise ValueError(
                 f"the COLMAP model {model} (cameras.{suffix}, images.{suffix}) cannot be read: "
@@ -105,16 +108,16 @@ def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
 
 
 Camera: TypeAlias = tuple[int, tuple[str, int, int, Sequence[float]]]
-"""Number, and the name of the model, width, height and parameters."""
+"""Number of the camera; name of its camera model, width and height in pixels, parameters."""
 Image: TypeAlias = tuple[str, list[float], int]
-"""Name, quaternion (w, x, y, z) with translation (x, y, z), number of the camera."""
+"""Name, world-to-camera as quaternion (w, x, y, z) and translation (x, y, z), camera's number."""
 
 
 def _text_cameras(model: UPath) -> Iterator[Camera]:
     for line in _lines(model / "cameras.txt"):
         number, name, width, height, *parameters = line.split()
         if "_" in "".join([number, width, height, *parameters]):  # Python reads 1_000 as a number
-            raise ValueError(f"cameras.txt has the line {line[:60]!r}, whose numbers are none")
+            raise ValueError(f"cameras.txt has a number with an underscore in {line[:60]!r}")
         yield int(number), (name, int(width), int(height), [*map(float, parameters)])
 
 
@@ -122,12 +125,15 @@ def _text_images(model: UPath) -> Iterator[Image]:
     for line in _lines(model / "images.txt", points=True):
         number, *fields = line.split(maxsplit=9)
         if len(fields) != 9 or not number.isdecimal() or "_" in "".join(fields[:8]):
-            raise ValueError(f"images.txt has {line[:60]!r} in place of 9 numbers and a name")
+            raise ValueError(f"images.txt has {line[:60]!r}, expected 9 numbers and a name")
         yield fields[8], [*map(float, fields[:7])], int(fields[7])
 
 
 def _lines(file: UPath, points: bool = False) -> Iterator[str]:
-    """Content lines of a file without comments; after each a line of `points` is skipped."""
+    """Yield the lines of a file without comments.
+
+    points: skip the line after each, which lists points. Raises ValueError if it is missing.
+    """
     with io.TextIOWrapper(open_file(file), encoding="utf-8") as lines:
         for line in lines:
             if (line := line.strip()) and not line.startswith("#"):
@@ -171,7 +177,7 @@ def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
 
 
 def _parameters(model: str) -> list[str]:
-    """Names of the parameters of a camera model."""
+    """Return the names of a camera model's parameters. Raises ValueError for an unknown model."""
     if model not in _MODELS:
         known = ", ".join(_MODELS)
         fix = f"undistort the photos with `colmap image_undistorter`, or use one of {known}"
@@ -180,7 +186,7 @@ def _parameters(model: str) -> list[str]:
 
 
 def _camera(model: str, width: int, height: int, parameters: Sequence[float]) -> dict[str, Any]:
-    """Fields of a `PhotoFrame` that the camera took."""
+    """Return the fields of a `PhotoFrame` that follow from its camera, by name."""
     values = dict(zip(_parameters(model), parameters, strict=True))
     size, problems = listed_size(height, width)
     focal = values.pop("f", math.nan)  # simple models have one for both axes
@@ -193,10 +199,14 @@ def _camera(model: str, width: int, height: int, parameters: Sequence[float]) ->
 
 
 def _c2w(*cam_from_world: float) -> np.ndarray:
-    """OpenCV camera-to-world; COLMAP gives world-to-camera."""
+    """Return OpenCV camera-to-world (4, 4) from COLMAP's quaternion and translation.
+
+    COLMAP's pose maps the world to the camera. Raises ValueError unless the quaternion has length 1
+    within 0.1.
+    """
     quaternion, translation = torch.tensor(cam_from_world, dtype=torch.float64).split([4, 3])
     if abs(float(quaternion.norm()) - 1) > 0.1:
-        raise ValueError(f"the quaternion {[*cam_from_world[:4]]} of an image has not length 1")
+        raise ValueError(f"the quaternion {[*cam_from_world[:4]]} of an image must have length 1")
     rotation = quat_to_matrix(quaternion / quaternion.norm()).T
     c2w = torch.eye(4, dtype=torch.float64)
     c2w[:3, :3] = rotation

@@ -1,4 +1,4 @@
-"""`datasets/dl3dv`: DL3DV's scenes, from archives or folders."""
+"""`datasets/dl3dv`: read the scenes of DL3DV from archives or folders."""
 
 import re
 import zipfile
@@ -29,27 +29,29 @@ class Dl3dvConfig(SceneSource.Config):
     """Options of `datasets/dl3dv`."""
 
     path: str
-    """Folder or fsspec URL of the data set, of a subset or of one scene, relative to the working
-    directory."""
+    """Folder or fsspec URL of the data set, of a part of it, or of one scene. A relative folder
+    starts at the working directory."""
     images: str | None = None
-    """Folder of photos to read, such as images_4; null for the least reduced one of a scene."""
+    """Folder of photos inside each scene, such as images_4. null: the one with the largest
+    photos."""
     test_scenes: str | None = None
-    """File that names the test scenes, all others being for training: an evaluation index, a JSON
-    list or lines of text; null trains on all."""
+    """File that names the test scenes: an evaluation index, a JSON list, or text with a name on
+    each line. Training uses all other scenes. null: training uses all scenes."""
     holdout: int = Field(default=0, ge=0)
-    """Hold out every n-th frame of a scene for evaluation, from frame n // 2 on. 0: none."""
+    """Hold out every Nth frame of a scene for evaluation, from frame N // 2 on. 0 holds out
+    none."""
     max_scenes: int = Field(default=0, ge=0)
-    """Only the first scenes of each split by name; 0 for all."""
+    """Number of scenes to use from each split, the first by name. 0 uses all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1] behind transparent pixels."""
 
 
 class Dl3dvSource(LazySource):
-    """Scenes of DL3DV, read in place: archives are not unpacked.
+    """Scenes of DL3DV, read from folders or from archives without unpacking them.
 
-    Without `test_scenes` all scenes are for training, and are evaluated on their held-out frames if
-    `holdout` asks for any. Intrinsics are those of transforms.json, scaled to the photos' size.
-    Images and test scenes that do not exist are left out, counted and named in a warning.
+    Without `test_scenes`, all scenes are for training; with `holdout`, held-out frames of the same
+    scenes are for evaluation. Intrinsics from transforms.json are scaled to the size of the photos.
+    Images and test scenes that do not exist are left out; a warning counts and names them.
     """
 
     name = "dl3dv"
@@ -80,11 +82,10 @@ class Dl3dvSource(LazySource):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Return whether there are archives or scene folders, also in folders such as 1K.
+        """Return whether `path`, or a folder in it such as 1K, holds archives or scenes of DL3DV.
 
-        Scene folders are named by a hash, or have the layout of DL3DV's benchmark.
-
-        A folder of photos that lists them itself is left to `qgs/photos`.
+        The folder of a scene is named by a hash, or has the layout of DL3DV's benchmark. False for
+        a folder that lists its own photos, which `qgs/photos` reads.
         """
         if path.is_file():
             return path.suffix == ".zip"
@@ -99,9 +100,9 @@ def _opened(name: str, place: UPath, **options: Any) -> PhotoScene:
 
 
 def find_scenes(path: UPath) -> dict[str, UPath]:
-    """Find folders and archives of scenes at or below `path` by name, folders before archives.
+    """Return the folder or archive of each scene at or below `path`, by name.
 
-    Raises FileNotFoundError for none.
+    If a scene has both, the folder is returned. Raises FileNotFoundError if there is no scene.
     """
     if not path.exists():
         raise FileNotFoundError(
@@ -120,8 +121,8 @@ def find_scenes(path: UPath) -> dict[str, UPath]:
         )
     if len(found) > len(scenes):
         warn_once(
-            f"{len(found) - len(scenes)} scenes of {path} are there more than once, as folders or "
-            "archives; one of each is read, the folder if there is one"
+            f"{len(found) - len(scenes)} scenes of {path} exist more than once, as folders or "
+            "archives; one copy of each is read, a folder before an archive"
         )
     return dict(sorted(scenes.items()))
 
@@ -140,9 +141,9 @@ def _places(path: UPath, depth: int) -> Iterator[tuple[str, UPath]]:
 
 
 def scene_folder(place: UPath) -> UPath:
-    """Return the folder with transforms.json of a folder or an archive.
+    """Return the folder with transforms.json inside a scene's folder or archive.
 
-    Raises FileNotFoundError without it, ValueError for an archive that cannot be read.
+    Raises FileNotFoundError if there is none, ValueError for an archive that cannot be read.
     """
     tops = [place]
     if place.suffix == ".zip":
@@ -152,7 +153,7 @@ def scene_folder(place: UPath) -> UPath:
             folders = (item for item in top.iterdir() if item.is_dir())
             tops = [top, *(item for item in folders if item.name not in _INSIDE)]
         except (zipfile.BadZipFile, OSError) as error:
-            reason = f"{place} is no zip archive or is cut off ({error})"
+            reason = f"{place} is not a zip archive, or is cut off ({error})"
             raise ValueError(f"{reason}: download it again") from error
     for top in tops:
         for inside in _INSIDE:
@@ -166,12 +167,12 @@ def scene_folder(place: UPath) -> UPath:
 
 
 def read_scene_list(file: UPath) -> list[str]:
-    """Read names of scenes: keys of a JSON mapping, a list, or lines.
+    """Read names of scenes from a JSON mapping (its keys), a JSON list, or lines of text.
 
-    Raises FileNotFoundError, and ValueError for none.
+    Raises FileNotFoundError if the file does not exist, ValueError if it names no scene.
     """
     if not file.is_file():
-        raise FileNotFoundError(f"the list of scenes {file} does not exist")
+        raise FileNotFoundError(f"the list of scenes {file} does not exist: correct its name")
     if file.suffix == ".json":
         names = read_json(file, "correct it")
         if not isinstance(names, dict | list) or not all(isinstance(name, str) for name in names):

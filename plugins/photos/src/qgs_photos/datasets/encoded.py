@@ -1,4 +1,4 @@
-"""Photos as they are stored."""
+"""Return photos as encoded files, without decoding them."""
 
 import io
 from dataclasses import dataclass
@@ -13,11 +13,12 @@ from qgs.paths import read_file
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """A photo as it is stored, and the camera that took it.
+    """A photo as an encoded file, and its camera.
 
-    data: bytes of the image file. mask: (H, W) uint8. c2w: (4, 4) float64, OpenCV axes. intrinsics:
-    fx, fy, cx, cy in pixels of the photo, whose size is (H, W). lens: None for a pinhole.
-    background: RGB in [0, 1] behind transparent pixels.
+    name: file name. data: bytes of the image file. c2w: camera-to-world (4, 4), float64, OpenCV
+    axes. intrinsics: fx, fy, cx, cy in pixels. size: (H, W) of the photo. lens: distortion; None
+    for a pinhole camera. mask: (H, W) uint8; None without. background: RGB in [0, 1] behind
+    transparent pixels.
     """
 
     name: str
@@ -31,7 +32,10 @@ class EncodedFrame:
 
 
 def encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
-    """Return a photo as it is stored. Raises ValueError for a file that cannot be read."""
+    """Return a photo as an encoded file, encoded again only if EXIF turns it.
+
+    Raises ValueError for a file that cannot be read.
+    """
     photo = scene.photos[frame]
     size = scene.stored_size(frame)
     background = scene.config.background

@@ -1,4 +1,4 @@
-"""Lenses that bend rays, and photos without their distortion."""
+"""Model the distortion of lenses, and undistort photos."""
 
 import math
 from abc import abstractmethod
@@ -19,15 +19,21 @@ _ROWS = 64
 
 
 class BendingLens(Lens):
-    """A lens by its function from the pinhole's plane z = 1 to its own."""
+    """A lens with distortion: a map of the plane z = 1 in front of the camera.
+
+    It maps the point in which a pinhole camera sees a ray to the point in which this lens sees it.
+    """
 
     @abstractmethod
     def distorted(self, points: Tensor) -> Tensor:
-        """Return where the lens puts points (..., 2) of the plane z = 1."""
+        """Map undistorted points (..., 2) in the plane z = 1 to distorted ones."""
 
     @abstractmethod
     def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) lie before where the function turns back."""
+        """Return whether undistorted points (..., 2) are in the photo's valid range.
+
+        Beyond it, the distorted radius decreases, and the map would show the photo again.
+        """
 
     def undistorted(
         self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
@@ -52,16 +58,19 @@ class BendingLens(Lens):
         return result
 
     def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
-        """See `Lens`. As COLMAP's undistorter chooses cameras by default (blank_pixels 0).
+        """See `Lens`. Same choice as the default of COLMAP's undistorter (blank_pixels 0).
 
-        1 where even MOST_ZOOM leaves some.
+        Returns 1 if black pixels remain even at MOST_ZOOM.
         """
         return _whole_zoom(intrinsics, self, size, target)
 
 
 @dataclass(frozen=True)
 class RadialTangential(BendingLens):
-    """OpenCV's plumb-bob model (Brown, 1966), also COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV."""
+    """OpenCV's radial-tangential distortion (Brown, 1966).
+
+    Covers COLMAP's camera models SIMPLE_RADIAL, RADIAL and OPENCV.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
@@ -80,7 +89,7 @@ class RadialTangential(BendingLens):
         return torch.stack([u, v], -1)
 
     def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) lie before where the radial polynomial turns back."""
+        """Return whether points (..., 2) lie where the radial polynomial still grows."""
         return (points * points).sum(-1) < _turn(self.k1, self.k2, self.k3)
 
     def turned(self) -> Self:
@@ -91,7 +100,7 @@ class RadialTangential(BendingLens):
 
 @dataclass(frozen=True)
 class Fisheye(BendingLens):
-    """OpenCV's fisheye model (Kannala and Brandt, 2006); equidistant without coefficients."""
+    """OpenCV's fisheye distortion (Kannala and Brandt, 2006); equidistant if all are 0."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -107,23 +116,24 @@ class Fisheye(BendingLens):
         return points * torch.where(radius > 0, bent / radius, 1.0)
 
     def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) lie before where the polynomial of angles turns back."""
+        """Return whether points (..., 2) lie where the polynomial in the angle still grows."""
         return points.norm(dim=-1).atan().square() < _turn(self.k1, self.k2, self.k3, self.k4)
 
     def turned(self) -> Self:
-        """See `Lens`: it is the same all around."""
+        """See `Lens`. The distortion has rotational symmetry, so the lens does not change."""
         return self
 
 
 def bending(lens: BendingLens) -> BendingLens | None:
-    """Return `lens`, or None where it leaves every ray as a pinhole would."""
+    """Return `lens`, or None if it has no distortion."""
     return lens if isinstance(lens, Fisheye) or any(vars(lens).values()) else None
 
 
 def _turn(*coefficients: float) -> float:
-    """Return the least t > 0, or inf, at which r (1 + k1 t + k2 t^2 + ...) stops growing with r.
+    """Return r^2 for the least radius r at which r (1 + k1 r^2 + k2 r^4 + ...) stops growing.
 
-    t = r^2. Beyond it the polynomial shows the same photo again, mirrored.
+    coefficients: k1, k2, ... Returns infinity if it always grows. Beyond this radius the polynomial
+    would show the photo again, mirrored.
     """
     slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(coefficients))]
     # Numerical roots of a real polynomial have small imaginary parts.
@@ -135,7 +145,10 @@ def _turn(*coefficients: float) -> float:
 def _in_photo(
     directions: Tensor, intrinsics: Intrinsics, lens: BendingLens, size: Size
 ) -> tuple[Tensor, Tensor]:
-    """Return where the photo shows directions (..., 2), -1 to 1 across it, and whether it does."""
+    """Return the places of directions (..., 2) in the photo, and whether the photo shows them.
+
+    directions: undistorted, in the plane z = 1. Places (..., 2) go from -1 to 1 across the photo.
+    """
     focal, centre = torch.tensor(intrinsics).to(directions).split(2)
     # From the pinhole's pixel to the photo's: the distortion is given in this direction.
     source = focal * lens.distorted(directions) + centre

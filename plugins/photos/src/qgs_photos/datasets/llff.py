@@ -1,4 +1,4 @@
-"""LLFF: `poses_bounds.npy` beside a folder of photos (Mildenhall et al., 2019)."""
+"""Read LLFF's scenes: `poses_bounds.npy` beside a folder of photos (Mildenhall et al., 2019)."""
 
 import numpy as np
 from upath import UPath
@@ -16,38 +16,40 @@ from qgs_photos.image_files import image_files
 
 
 class Llff(PhotoReader):
-    """The photos by name, each with its row: 15 numbers of a (3, 5) matrix, near and far.
+    """Reader of LLFF's scenes. The Nth row of the file belongs to the Nth photo by name.
 
-    The matrix is a camera-to-world whose axes are (down, right, back), then height, width and focal
-    length; the principal point is the middle. Near and far are checked, not used.
+    A row has 17 numbers: a (3, 5) matrix, then near and far. The columns of the matrix are the
+    axes down, right and back of the camera-to-world pose, the camera's centre, and height, width
+    and focal length. The principal point is the middle of the photo. Near and far are checked, but
+    not used.
     """
 
     listing = "poses_bounds.npy"
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`. Raises ValueError unless there are as many photos as rows."""
+        """See `PhotoReader`. Raises ValueError if there are not as many photos as rows."""
         file = folder / cls.listing
         photos = image_folder(folder, images)
         rows = _rows(file)
         files = image_files(photos)
         if len(files) != len(rows):
             raise ValueError(
-                f"{file} has {len(rows)} poses, but {photos} has {len(files)} images: they belong "
-                "together in the order of the names, so give all images and no others"
+                f"{file} has {len(rows)} poses, but {photos} has {len(files)} images: poses belong "
+                "to images in the order of names, so give all images and no others"
             )
         return Listing(file, [_frame(*pair) for pair in zip(files, rows, strict=True)])
 
 
 def _rows(file: UPath) -> np.ndarray:
-    """Read (N, 17) float64. Raises ValueError for a file of something else, and for near > far."""
+    """Read the rows (N, 17), float64. Raises ValueError for other contents, and for near > far."""
     try:
         with open_file(file) as opened:
             rows = load_array(opened)
     except Exception as error:
         # NumPy raises anything on damaged headers
         raise ValueError(
-            f"{file} is no NumPy file of numbers ({error}): export it again"
+            f"{file} is not a NumPy file of numbers ({error}): export it again"
         ) from error
     if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise ValueError(f"{file} must have shape (N, 17), got {rows.shape}: export it again")

@@ -1,4 +1,4 @@
-"""Samplers of views: pixelSplat's, DepthSplat's, and one for photos in any order."""
+"""View samplers: pixelSplat's, DepthSplat's, and one for photos in any order."""
 
 from collections.abc import Iterable, Sequence
 
@@ -29,18 +29,18 @@ from qgs.data.view_samplers import (
 from qgs.domain import Domain
 
 _SHARE = 0.5
-"""Share of the photos from which a sample chooses its inputs, so that a photo's inputs vary."""
+"""Share of the photos from which a sample chooses its inputs. Each sample draws other photos."""
 _JUDGED = 4
-"""Photos on which a scene without held-out ones is judged."""
+"""Number of photos on which a scene without held-out photos is evaluated."""
 
 
 class Bounded(ViewSampler):
-    """Inputs at both ends of a gap that widens over `warm_up_steps`, targets between them.
+    """Inputs at both ends of a gap and targets between them; the gap widens over `warm_up_steps`.
 
-    pixelSplat's sampler of this name for two inputs; further inputs are drawn between the ends.
-    The published code limits the largest gap by the least one on paths that do not close; here the
-    number of frames limits it. Targets may repeat. `views.gap` is read for windows around held-out
-    frames alone.
+    This is pixelSplat's sampler `bounded` for two inputs; further inputs are drawn between the
+    ends. pixelSplat also limits the largest gap to the least gap on paths that do not close; here
+    only the number of frames limits it. Targets may repeat. `views.gap` is used only for windows
+    around held-out frames.
     """
 
     name = "bounded"
@@ -50,18 +50,18 @@ class Bounded(ViewSampler):
         min_gap: int = Field(default=45, ge=1)
         """Least number of frames from the first input to the last, after the warm-up."""
         max_gap: int = Field(default=192, ge=1)
-        """Largest number, after the warm-up; a scene may allow less."""
+        """Largest number of frames from the first input to the last, after the warm-up. Shorter
+        scenes use what they have."""
         margin: int = Field(default=0, ge=0)
-        """Least number of frames between a target and the first or last input.
-
-        0: the inputs may be targets.
-        """
+        """Least distance in frames of a target from the first and the last input. 0: an input may
+        be a target."""
         warm_up_steps: int = Field(default=150_000, ge=0)
-        """Optimiser steps in which the gap goes from its initial bounds to the final ones."""
+        """Optimiser steps in which the bounds of the gap go from their initial to their final
+        values. 0: no warm-up."""
         initial_min_gap: int = Field(default=25, ge=1)
-        """Least gap in the first step."""
+        """Least number of frames from the first input to the last, in the first step."""
         initial_max_gap: int = Field(default=45, ge=1)
-        """Largest gap in the first step."""
+        """Largest number of frames from the first input to the last, in the first step."""
 
     config: Config
 
@@ -88,7 +88,10 @@ class Bounded(ViewSampler):
     def span(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int, parts: int = 1
     ) -> list[Frames]:
-        """Return the moments that are drawn from, first to last; gaps are divided by `parts`."""
+        """Draw a gap, and return its moments from first to last, each with its frames.
+
+        parts: divisor of the gap's bounds. Raises ValueError for a scene with too few frames.
+        """
         refuse_too_many(views.inputs + views.targets, scene)
         options = self.options(step)
         usable = moments(scene)
@@ -98,8 +101,8 @@ class Bounded(ViewSampler):
         low = max(min(low, high), 2 * options.margin, views.inputs - 1)
         if high < low:
             raise ValueError(
-                f"scene {scene.name!r} has {len(usable)} frames for inputs, and {low + 1} are "
-                "needed for this gap: lower min_gap or margin, or drop the scene"
+                f"scene {scene.name!r} has {len(usable)} frames for inputs, but this gap needs "
+                f"{low + 1}: lower min_gap or margin, or remove the scene"
             )
         gap = int(rng.integers(low, high + 1))
         first = int(rng.integers(0, len(usable) - gap))
@@ -108,7 +111,10 @@ class Bounded(ViewSampler):
     def seen(
         self, scene: Scene, span: Sequence[Frames], rng: np.random.Generator, step: int
     ) -> list[int]:
-        """Return the frames of a span that targets are drawn from."""
+        """Return the frames from which targets are drawn: the moments of `span` without the margin.
+
+        In a scene that moves, they are the frames of one random moment.
+        """
         margin = self.options(step).margin
         inside = span[margin : len(span) - margin]
         # all targets of a sample are of one moment
@@ -117,7 +123,10 @@ class Bounded(ViewSampler):
         return [frame for moment in inside for frame in moment]
 
     def gaps(self, step: int) -> tuple[int, int]:
-        """Return the least and largest gap after `step` steps: linear between the bounds."""
+        """Return the least and the largest gap in frames after `step` steps.
+
+        In the warm-up both change linearly.
+        """
         options = self.options(step)
         share = min(step / options.warm_up_steps, 1.0) if options.warm_up_steps else 1.0
         bounds = (
@@ -129,15 +138,17 @@ class Bounded(ViewSampler):
 
 
 class Farthest(Bounded):
-    """Inputs far from each other in a gap that widens over `warm_up_steps`, targets between them.
+    """Inputs far from each other in a gap, and targets in it; the gap widens over `warm_up_steps`.
 
-    DepthSplat's sampler `boundedv2` with `farthest_point`: two inputs are the ends of the gap, more
-    are chosen one after the other, each farthest from those chosen. Of few inputs the gap is
-    shorter: its bounds are divided by `views.inputs` // their number. Targets differ, and may be
-    inputs; where the gap has too few frames some repeat (there: fewer targets).
+    This is DepthSplat's sampler `boundedv2` with `farthest_point`. Two inputs are the ends of the
+    gap; of more inputs, each is the one farthest from those chosen before. With n inputs, fewer
+    than `views.inputs`, the bounds of the gap are divided by `views.inputs` // n. Targets may be
+    inputs. They differ unless the gap has too few frames; then some repeat (DepthSplat returns
+    fewer targets).
 
-    The number of inputs goes from `fewest` to `views.inputs` and again with the steps of training,
-    where the release draws it: each is as frequent, and samples of a step make one batch.
+    In training, n goes from `fewest` to `views.inputs`, one more in each step, and starts again.
+    DepthSplat draws n at random. In both every n is equally frequent; here all samples of a step
+    have the same n and make one batch.
     """
 
     name = "farthest"
@@ -155,7 +166,7 @@ class Farthest(Bounded):
         yield from super().problems(config, context)
         if context.inputs and config.fewest > context.inputs:
             reason = f"it is larger than `views.inputs`, {context.inputs}"
-            yield Problem("fewest", reason, "lower it, or raise `views.inputs`")
+            yield Problem("fewest", reason, "lower `fewest`, or raise `views.inputs`")
 
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
@@ -177,9 +188,10 @@ class Farthest(Bounded):
 
 
 def farthest_points(points: Tensor, count: int) -> list[int]:
-    """Choose `count` of `points` (N, 3): the one farthest from their mean, then from all chosen.
+    """Choose `count` of the points (N, 3) that are far from each other, and return their indices.
 
-    Points that coincide with a chosen one come last, each once.
+    The first is farthest from the mean of all; each further one is farthest from those chosen
+    before. Points that coincide with a chosen one come last, each once.
     """
     chosen = [int((points - points.mean(0)).norm(dim=-1).argmax())]
     while len(chosen) < count:
@@ -195,16 +207,17 @@ class Overlapping(ViewSampler):
 
     The inputs are those that `qgs demo` would choose for the random photo. They are .06 to .25
     scene depths apart, times a factor drawn log-uniformly between the bounds of `apart`. Targets
-    are the random photo and those nearest to it. In evaluation the factor is 1, and each held-out
-    photo is a target; a scene without held-out photos has four targets. `views.gap` is read only
-    for scenes that move: they are judged in the order of time, and training refuses them.
+    are the random photo and the photos nearest to it. In evaluation the factor is 1, and each
+    held-out photo is a target; a scene without held-out photos has four targets. Scenes that move
+    are evaluated in the order of time, with `views.gap`; training refuses them.
     """
 
     name = "overlapping"
 
     class Config(ComponentConfig):
         apart: tuple[float, float] = (0.5, 2.0)
-        """Bounds of the factor of distances and angles in training."""
+        """[least, largest] factor by which training multiplies distances and angles between
+        inputs. [1, 1]: always those of `qgs demo`."""
 
         @field_validator("apart")
         @classmethod
@@ -243,7 +256,7 @@ class Overlapping(ViewSampler):
         return tuple(sorted(inputs)), tuple(near[i % len(near)] for i in range(views.targets))
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
-        """See `ViewSampler`; none where a scene moves."""
+        """Return one window for each target photo; none for a scene that moves."""
         if scene.times is not None:
             return []
         # without held-out photos the target is one of those that inputs are chosen from
@@ -256,26 +269,26 @@ class Overlapping(ViewSampler):
         return found
 
     def _frusta(self, scene: Scene, factor: float = 1.0) -> Frusta:
-        """Return frusta of cameras that may stand and turn `factor` times as far apart."""
+        """Return the frusta of a scene, to choose inputs `factor` times as far apart and turned."""
         if scene.name not in self._depths:
             self._depths[scene.name] = scene_depth(scene)
         return Frusta(scene, apart(Domain(), factor), self._depths[scene.name])
 
 
 def apart(domain: Domain, factor: float) -> Domain:
-    """Return `domain` with the best inputs `factor` times as far apart and turned."""
+    """Return a domain whose inputs are `factor` times as far apart and turned as in `domain`."""
     low, high, turn = trained_ratios(domain)
     ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
     return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)
 
 
 def _enough(scene: Scene, least: int) -> list[int]:
-    """Return the frames of training; raises ValueError for fewer than `least`."""
+    """Return the training frames of a scene. Raises ValueError if there are fewer than `least`."""
     usable = training_frames(scene)
     if len(usable) < least:
         besides = f" beside {len(scene.held_out)} held-out ones" if scene.held_out else ""
         raise ValueError(
-            f"scene {scene.name!r} has {len(usable)} photos{besides}, and needs {least}: lower "
-            "views.inputs, hold fewer out or add photos"
+            f"scene {scene.name!r} has {len(usable)} photos{besides}, but needs {least}: lower "
+            "views.inputs, hold out fewer photos, or add photos"
         )
     return usable
