@@ -92,7 +92,7 @@ def test_a_file_that_is_no_path_is_refused(tmp_path):
         lens.replace('"w": 9, "h": 9, ', "") + "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]}",
     ):
         file.write_text(content)
-        must_refuse("path.json is no camera path", read_path, file, SIZE, None)
+        must_refuse("path.json is not a camera path", read_path, file, SIZE, None)
 
 
 def test_size_length_and_angle_of_view():

@@ -1,1 +1,1 @@
-"""Camera poses of photos and videos, and videos of camera paths."""
+"""Compute camera poses of photos and videos, and render videos of camera paths."""

@@ -1,4 +1,4 @@
-"""COLMAP in another process: its progress and its end."""
+"""Run COLMAP in another process, show its progress and report its errors."""
 
 import json
 import re
@@ -19,9 +19,10 @@ _STEP = re.compile(r"Process(?:ed file|ing image|ing block) \[(\d+)/(\d+)")
 
 
 def run(job: Job, show: Show) -> Sequence[str]:
-    """Do `job` in a process of its own; return the names of the photos of the largest model.
+    """Run `job` in a separate process; return the names of the photos in the largest model.
 
-    Raises PosesError where COLMAP finds none, or ends early.
+    show: called with the stage, the number of steps done and the number of all steps. Raises
+    PosesError if COLMAP finds no model or its process crashes.
     """
     # a failed check of COLMAP ends its process: it must not be that of the command
     told: dict[str, Any] = {}
@@ -56,7 +57,7 @@ def run(job: Job, show: Show) -> Sequence[str]:
         finally:
             process.kill()
     if "refused" in told:
-        raise PosesError(f"no poses: {told['refused']}")
+        raise PosesError(f"poses cannot be computed: {told['refused']}")
     if code := process.returncode:
         # glog begins errors by E or F and the date
         errors = [line for line in last if re.match("[EF]\\d{8}|.*Error", line)]
@@ -64,6 +65,6 @@ def run(job: Job, show: Show) -> Sequence[str]:
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
         raise PosesError(
             f"COLMAP ended in the stage {told.get('stage')!r} by {how} ({reason[:200]}): repeat "
-            "the command, with a smaller --side where memory is short"
+            "the command, with a smaller --side if memory is short"
         )
     return told["posed"]

@@ -1,4 +1,4 @@
-"""Photos without cameras and videos that a command opens: COLMAP makes their poses first."""
+"""Compute missing camera poses by COLMAP when a command opens a video, or photos without poses."""
 
 import json
 from contextlib import suppress
@@ -18,11 +18,14 @@ VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
 class ColmapOrPhotos(Colmap):
-    """COLMAP's models, which it makes of photos without cameras and of videos."""
+    """Reader of COLMAP's models that runs COLMAP for videos and for photos without poses."""
 
     @classmethod
     def posed(cls, path: UPath) -> UPath | None:
-        """Return the folder with the poses of `path`, made if need be, beside it in NAME_poses."""
+        """Return the folder NAME_poses beside `path` with its poses, computed if they are missing.
+
+        None if `path` is neither a video nor a folder with photos.
+        """
         # anything else is left to the readers of listings, whose errors say what it lacks
         is_video = path.suffix.lower() in VIDEOS and path.is_file()
         if is_video or any(map(image_files, (path, path / "images"))):
@@ -31,10 +34,10 @@ class ColmapOrPhotos(Colmap):
 
 
 def posed_folder(source: Path) -> Path:
-    """Return the poses of the photos or the video `source`, beside it in NAME_poses.
+    """Return the folder NAME_poses with the camera poses of `source`, photos or a video.
 
-    Makes them if need be. Raises PosesError where they belong to other photos than are there now,
-    OSError where they cannot be kept, and as `make_poses`.
+    The folder lies beside `source`. Missing poses are computed. Raises PosesError if the folder has
+    poses of other photos, OSError if it cannot be written, and what `make_poses` raises.
     """
     out = beside(source)
     lock = out.with_name(f".{out.name}.lock")
@@ -44,7 +47,7 @@ def posed_folder(source: Path) -> Path:
         if not is_made(source, out):
             with FileLock(lock):
                 if not is_made(source, out):
-                    text = "has no camera poses: they are made first, once, and kept in"
+                    text = "has no camera poses: computing them once, into"
                     say(console, f"{source} {text} {out}")
                     for line in make_poses(source, out, Options(), console).summary:
                         say(console, line)
@@ -53,27 +56,30 @@ def posed_folder(source: Path) -> Path:
                     lock.unlink()
     except PermissionError as error:
         raise OSError(
-            f"{out} cannot be made ({error.strerror}): run `qgs poses {source} --out FOLDER`, and "
-            "give that folder"
+            f"{out} cannot be written ({error.strerror}): run `qgs poses {source} --out FOLDER`, "
+            "and use FOLDER in place of the photos"
         ) from error
     return out
 
 
 def is_made(source: Path, out: Path) -> bool:
-    """Return whether `out` has the poses of `source`. Raises PosesError for those of others."""
+    """Return whether `out` has the poses of `source`; False if it has no poses.
+
+    Raises PosesError if it has poses of other photos.
+    """
     held = fingerprint(source)
     with suppress(OSError, json.JSONDecodeError):
         record = json.loads((out / RECORD).read_bytes())
         if record["source"] == held:
             return True
         raise PosesError(
-            f"{out} has the poses of what {source} held before: delete it, so that they are made "
-            f"anew, or run `qgs poses {source} --out FOLDER` and give that folder"
+            f"{out} has poses of other photos than {source} holds now: delete it to compute poses "
+            f"again, or run `qgs poses {source} --out FOLDER` and use FOLDER in place of the photos"
         )
     return False
 
 
 def beside(source: Path) -> Path:
-    """Return where the poses of `source` are kept."""
+    """Return the folder for the poses of `source`: NAME_poses beside it."""
     whole = source.resolve()
     return whole.with_name(f"{whole.stem if source.is_file() else whole.name}_poses")

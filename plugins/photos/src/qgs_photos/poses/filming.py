@@ -1,4 +1,4 @@
-"""Films of Gaussians: path, size and length; rendered pictures as mp4 or WebP."""
+"""Render videos of Gaussians along a camera path, as mp4 or WebP."""
 
 import json
 import math
@@ -35,9 +35,10 @@ _HEIGHT = 480
 
 
 class FilmScene(NamedTuple):
-    """Gaussians (1, G) and the cameras (1, V) of photos of them, in one world.
+    """Gaussians (1, G) and the cameras (1, V) of the scene's photos, in the same world.
 
-    world: from the photos' world to that one, the pose (4, 4) of its reference camera and scale.
+    world: the reference pose (4, 4) and the scale that map the world of the photos into this world,
+    see `own_world`.
     """
 
     gaussians: Gaussians
@@ -47,7 +48,10 @@ class FilmScene(NamedTuple):
 
 
 def film(scene: FilmScene, path: Cameras, file: Path, rate: int, console: Console) -> None:
-    """Render from the cameras (1, T) of a path, `rate` a second, and write `file`."""
+    """Render a scene from the cameras (1, T) of a path, and write a video.
+
+    rate: frames per second.
+    """
     path = path.to(scene.gaussians.means.device)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         cameras = bar.track(range(path.shape[1]), description="rendering")
@@ -60,7 +64,10 @@ def _picture(scene: FilmScene, camera: Cameras) -> np.ndarray:
 
 
 def write_film(frames: Iterator[np.ndarray], file: Path, rate: int) -> None:
-    """Write pictures of one size, `rate` a second, as H.264 in mp4, or as an endless WebP."""
+    """Write a video: H.264 in mp4, or an animated WebP that repeats forever.
+
+    frames: pictures of one size. rate: frames per second.
+    """
     refuse_suffix(file)
     with replacing(file) as temporary:
         if file.suffix.lower() == ".webp":
@@ -70,9 +77,9 @@ def write_film(frames: Iterator[np.ndarray], file: Path, rate: int) -> None:
 
 
 def refuse_suffix(file: Path) -> None:
-    """Raise ValueError for a file of another kind."""
+    """Raise ValueError unless the name of `file` ends with .mp4 or .webp."""
     if file.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{file} is no name of a video: it must end with {' or '.join(SUFFIXES)}")
+        raise ValueError(f"{file} cannot be a video: its name must end in {' or '.join(SUFFIXES)}")
 
 
 def _write_mp4(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
@@ -101,9 +108,11 @@ def _write_webp(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
 def cameras_of(
     scene: FilmScene, path: str, size: tuple[int, int] | None, frames: int, fov: float | None
 ) -> Cameras:
-    """Return the cameras (1, T) of a path: of KINDS, of so many frames, or of a file.
+    """Return the cameras (1, T) of a path.
 
-    size: (H, W). fov: vertical, in degrees. Raises ValueError for a path that is none.
+    path: one of KINDS, or a file. size: (H, W) of the video in pixels; None takes that of the
+    photos. frames: length of a path of KINDS. fov: vertical angle of view in degrees; None takes
+    that of the photos or the file. Raises ValueError for a file that is not a camera path.
     """
     size = size or _film_size(scene.cameras.size)
     if path in KINDS:
@@ -116,14 +125,17 @@ def cameras_of(
 
 
 def _film_size(photos: tuple[int, int]) -> tuple[int, int]:
-    """Return even sides of the photos' aspect, the shorter one at least _HEIGHT: H.264 has them."""
+    """Return (H, W) of a video for photos of (H, W): even, as H.264 needs, and at least _HEIGHT."""
     factor = max(_HEIGHT / min(photos), 1.0)
     height, width = (round(side * factor / 2) * 2 for side in photos)
     return height, width
 
 
 def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
-    """Return intrinsics (1, T, 4) at another size and angle of view, centred."""
+    """Return intrinsics (1, T, 4) for pictures of `size` (H, W), with centred principal points.
+
+    fov: vertical angle of view in degrees; None keeps all that `path` shows along the shorter side.
+    """
     height, width = size
     fx, fy, _, _ = path.intrinsics.unbind(-1)
     if fov is None:
@@ -141,7 +153,10 @@ def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
 
 @torch.no_grad()
 def seen_depth(scene: FilmScene) -> float:
-    """Return the median depth of what the first, the middle and the last camera see."""
+    """Return the median rendered depth in the first, the middle and the last camera.
+
+    1 if they show nothing.
+    """
     # three views say enough, and each is rendered whole
     count = scene.cameras.shape[1]
     rendered = scene.renderer(scene.gaussians, scene.cameras[:, [0, count // 2, count - 1]])
@@ -150,9 +165,11 @@ def seen_depth(scene: FilmScene) -> float:
 
 
 def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmScene:
-    """Open a folder of `qgs reconstruct` or `qgs scene`, or a PLY file with its photos.
+    """Open a folder of `qgs reconstruct` or `qgs scene`, or a PLY file.
 
-    photos: of the scene, where `source` does not hold their cameras. Raises ValueError without.
+    photos: the scene's photos, for their cameras; a folder of `qgs reconstruct` does not need them.
+    name: scene among several in `photos`. Raises ValueError if photos are needed and missing,
+    FileNotFoundError for another `source`.
     """
     if has_record(source):
         record = read_record(source)
@@ -161,18 +178,18 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
     file = source / "scene.ply" if source.is_dir() else source
     if not file.is_file():
         raise FileNotFoundError(
-            f"{source} is no PLY file and has neither {GAUSSIANS} with cameras.json nor "
-            "scene.ply: give what `qgs reconstruct` or `qgs scene` wrote"
+            f"{source} is not a PLY file and has neither {GAUSSIANS} with cameras.json nor "
+            "scene.ply: give a folder that `qgs reconstruct` or `qgs scene` wrote, or a PLY file"
         )
     if photos is None:
-        raise ValueError(f"{file} holds no cameras: add the photos, as `qgs video {source} PHOTOS`")
+        raise ValueError(f"{file} holds no cameras: name the photos, `qgs video {source} PHOTOS`")
     renderer = AutoRenderer(_scene_options(file.parent))
     cameras = photo_scene(photos, None, name).cameras
     return _in_own_world(load_ply(file), cameras, renderer)
 
 
 def _in_own_world(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> FilmScene:
-    """Move Gaussians (1, G) and cameras (V,) of the photos' world to the first camera's."""
+    """Move Gaussians (1, G) and cameras (V,) from the photos' world to that of the first camera."""
     # near and far of renderers are made for worlds in which what is seen is about 1 away
     reference = cameras.c2w[0].double()
     scale = 1 / _median_depth(gaussians, reference)
@@ -186,7 +203,7 @@ def _in_own_world(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) ->
 
 
 def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
-    """Return the median depth of Gaussians before the camera at `c2w` (4, 4), 1 for none."""
+    """Return the median depth of Gaussians before the camera `c2w` (4, 4); 1 if none is there."""
     w2c = torch.linalg.inv(c2w)
     depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
     ahead = depths[depths > 0]
@@ -194,7 +211,10 @@ def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
 
 
 def _scene_options(folder: Path) -> AutoRenderer.Config:
-    """Return the renderer's options of what `qgs scene` wrote, else the default ones."""
+    """Return renderer options with the background in `folder`/metrics.json of `qgs scene`.
+
+    Without this file, return the default options.
+    """
     try:
         given = json.loads((folder / "metrics.json").read_bytes())["background"]
         return AutoRenderer.Config.model_validate({"background": tuple(given)})

@@ -1,4 +1,4 @@
-"""Frames of a video: of each interval of time and of motion the sharpest."""
+"""Extract the sharpest frame of each interval of a video; intervals are shorter in fast motion."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -17,9 +17,9 @@ from qgs_photos.poses.photos import LEAST, PosesError, Show
 # 120 at even steps of time are too few where the camera turns fast: of a walk through an office as
 # a video, 42 of 120 frames got poses, and 143 of the 143 that follow the motion.
 FEWEST, MOST, PER_SECOND = 40, 240, 2.0
-"""Number of frames to take from a video, and their least rate."""
+"""Least and largest number of frames to take from a video, and their least number per second."""
 STEP = 0.06
-"""Shift of the picture, in parts of its width, after which another frame is taken."""
+"""Motion of the picture after which the next frame is taken, as a fraction of its sides."""
 # Frames of an interval that are compared.
 _JUDGED = 8
 # Longer side in pixels at which sharpness is measured.
@@ -35,18 +35,20 @@ def extract(
     count: int | None = None,
     progress: Show = lambda stage, done, total: None,
 ) -> list[str]:
-    """Write the sharpest frame of each interval as JPEG, upright, numbered from 0 on.
+    """Write the sharpest frame of each interval of a video into `folder`; return remarks.
 
-    count: of even intervals of time; by default as `Intervals` has them, and where these are more
-    than MOST, the sharpest of each few neighbours. progress: stage, seconds done and in all.
-    Returns remarks. What cannot be decoded is left out. Raises PosesError for no video, and for
-    fewer than LEAST frames.
+    Files are upright JPEGs, numbered from 0. Frames that cannot be decoded are left out.
+
+    count: number of intervals, all of the same duration. None makes intervals that are shorter in
+    fast motion, and keeps at most MOST frames (see `thinned`). progress: called with the stage, the
+    seconds done, and the seconds of the video. Raises PosesError for a file that is not a video or
+    has fewer than LEAST frames.
     """
     times, damaged = _times(video)
     if len(times) < LEAST:
         raise PosesError(
-            f"{video} has {counted(len(times), 'frame')} that can be read, and poses need {LEAST} "
-            "at least: take a longer video, or copy it again"
+            f"{video} has {counted(len(times), 'frame')} that can be read, but poses need at least "
+            f"{LEAST}: take a longer video, or copy it again"
         )
     start = times[0]
     # the last frame is shown as long as the others in the mean
@@ -77,8 +79,8 @@ def extract(
         _write(*best)
     if len(scores) < LEAST:
         raise PosesError(
-            f"{video} has {counted(len(scores), 'frame')} that can be decoded, and poses need "
-            f"{LEAST} at least: convert it to H.264, or copy it again"
+            f"{video} has {counted(len(scores), 'frame')} that can be decoded, but poses need at "
+            f"least {LEAST}: convert it to H.264, or copy it again"
         )
     if count is None:
         for path in scores.keys() - {*thinned(scores, MOST)}:
@@ -86,11 +88,14 @@ def extract(
     if not damaged:
         return []
     seconds = f"{float(last - start):.1f} s"
-    return [f"{video} is damaged: frames are taken up to {seconds}, where they could be decoded"]
+    return [f"{video} is damaged: only frames up to {seconds} that can be decoded are used"]
 
 
 def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
-    """Return at most `most` frames: of each even number of neighbours the one of highest score."""
+    """Return at most `most` frames, evenly spread: the best of each group of neighbours.
+
+    scores: sharpness by file of the frame; more is better.
+    """
     best = dict[int, Path]()
     for number, path in enumerate(sorted(scores)):
         part = number * most // len(scores)
@@ -100,9 +105,12 @@ def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
 
 
 class Intervals:
-    """Intervals of time, 1 / `rate` s long, or shorter ones in which the picture moves by STEP.
+    """Division of a video into intervals, of each of which one frame is taken.
 
-    count: of intervals of time alone. start, length: of the video, in seconds.
+    An interval ends after 1 / `rate` seconds, or before, when the picture has moved by STEP.
+
+    start, length: first time and duration of the video in seconds. count: number of intervals of
+    the same duration, whatever the motion; None ends intervals by motion too.
     """
 
     def __init__(self, start: float, length: float, count: int | None) -> None:
@@ -115,7 +123,10 @@ class Intervals:
         self._thumb: np.ndarray | None = None
 
     def place(self, time: float, frame: Any) -> int:
-        """Return the number of the interval of the next frame."""
+        """Return the index of the interval that holds the next frame, shown at `time` (seconds).
+
+        Frames must come in the order of time.
+        """
         # times are fractions: an interval ends with the frame that is due, in spite of rounding
         if self.count:
             place = int((time - self.start) * self.rate + 1e-6)
@@ -132,9 +143,9 @@ class Intervals:
 
 
 def shift(before: np.ndarray, after: np.ndarray) -> float:
-    """Return how far a small picture moved, in parts of its sides.
+    """Return how far a picture moved, as a fraction of its sides, by phase correlation.
 
-    By the peak of the phase correlation.
+    before, after: small grey pictures of size _THUMB.
     """
     one, other = (np.fft.rfft2((x - x.mean()) * _WINDOW) for x in (before, after))
     product = one * other.conj()
@@ -145,7 +156,7 @@ def shift(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def _opened(video: Path) -> Any:
-    """Open the container. Raises PosesError where it has no video stream."""
+    """Open a video file. Raises PosesError if it cannot be read or has no video stream."""
     try:
         container = av.open(str(video))
     except (FFmpegError, ValueError) as error:
@@ -155,12 +166,15 @@ def _opened(video: Path) -> Any:
         ) from error
     if not container.streams.video:
         container.close()
-        raise PosesError(f"{video} has no pictures: give a video")
+        raise PosesError(f"{video} has no video stream: give a video")
     return container
 
 
 def _times(video: Path) -> tuple[list[Fraction], bool]:
-    """Return when each frame is shown, ascending, by the packets; whether the file is cut off."""
+    """Return the times of all frames, ascending, in seconds, and whether the file is damaged.
+
+    Packets are read, but not decoded.
+    """
     times = list[Fraction]()
     broken = False
     with _opened(video) as container:
@@ -176,7 +190,7 @@ def _times(video: Path) -> tuple[list[Fraction], bool]:
 
 
 def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
-    """Yield time and frame; (0, None) for a packet that cannot be decoded."""
+    """Yield the time in seconds and the frame; (0, None) for a packet that cannot be decoded."""
     with _opened(video) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
@@ -210,7 +224,7 @@ def _grey(frame: Any, size: tuple[int, int]) -> np.ndarray:
 
 
 def _write(frame: Any, path: Path) -> None:
-    """Write a frame as JPEG, turned as the video says."""
+    """Write a frame as JPEG, turned upright as the video's metadata says."""
     image = Image.fromarray(frame.to_ndarray(format="rgb24"))
     # both count counterclockwise, in degrees
     if turn := round(frame.rotation / 90) % 4 * 90:

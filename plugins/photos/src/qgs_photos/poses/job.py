@@ -1,15 +1,17 @@
-"""The job of the process that runs COLMAP; no torch is imported here."""
+"""Describe the job of the process that runs COLMAP. This module imports no torch."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Job:
-    """Function that the process runs.
+    """Input of the process that runs COLMAP.
 
-    images: folder of photos, upright RGB. database, models: of COLMAP. groups: names of photos that
-    share a camera. sizes: (H, W) of each photo for which the result is. sequential: match
-    neighbours by name alone.
+    images: folder of upright RGB photos. database: COLMAP's file for features and matches. models:
+    folder for the results. groups: names of photos, in lists of photos that share a camera. sizes:
+    (H, W) in pixels of the original photos, to which intrinsics are scaled. sequential: match only
+    neighbours in the order of names; False matches all pairs. features: largest number of features
+    in a photo. threads: number of CPU threads. seed: random seed.
     """
 
     images: str

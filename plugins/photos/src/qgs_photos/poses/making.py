@@ -1,4 +1,4 @@
-"""Folders with the poses of photos or a video."""
+"""Make folders with the camera poses of photos or a video."""
 
 import json
 import os
@@ -37,14 +37,18 @@ from qgs_photos.poses.photos import (
 
 RECORD = "poses.json"
 EXHAUSTIVE = 80
-"""Photos up to which every pair is matched; of more, and of videos, neighbours in time."""
+"""Largest number of photos of which all pairs are matched. With more photos, and in videos, only
+neighbours in time are matched."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of `qgs poses`. frames: of a video. side: of the photos for COLMAP, in pixels.
+    """Options of `qgs poses`.
 
-    matching: "auto", "exhaustive" or "sequential". threads: 1 and a seed give the same file again.
+    frames: number of frames taken from a video; None chooses it. side: longer side in pixels of the
+    photos for COLMAP. matching: "exhaustive" matches all pairs, "sequential" neighbours; "auto"
+    chooses. features: largest number of features in a photo. threads: number of CPU threads; with 1
+    the same seed gives the same poses.
     """
 
     frames: int | None = None
@@ -57,9 +61,10 @@ class Options:
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of photos. without: names of photos that have none.
+    """Names of photos by result.
 
-    faulty: those that could not be read, and why.
+    posed: photos with a pose. without: photos for which no pose was found. faulty: photos that
+    cannot be read, with the reason. remarks: sentences for the user.
     """
 
     posed: Sequence[str]
@@ -69,34 +74,36 @@ class Poses:
 
     @property
     def summary(self) -> Iterator[str]:
-        """Sentences on how many photos have poses, and on those that have none."""
+        """Sentences for the user: how many photos have poses, and which have none."""
         total = len(self.posed) + len(self.without)
         yield f"{len(self.posed)} of {counted(total, 'photo')} have poses"
         yield from self.remarks
         if self.faulty:
             reasons = [f"{name} ({reason})" for name, reason in self.faulty.items()]
-            yield f"could not be read: {listed(reasons, 3)}"
+            yield f"photos that cannot be read: {listed(reasons, 3)}"
         if self.without:
             yield (
-                f"without poses: {listed(self.without)}; to get more, take photos between those "
-                "with and those without, so that neighbours share half of what they show, or name "
-                "another --matching"
+                f"photos without poses: {listed(self.without)}; to get more poses, take photos "
+                "between photos with and without poses, so that neighbours share half of what they "
+                "show, or try another --matching"
             )
 
 
 def fingerprint(source: Path) -> dict[str, Any]:
-    """Return what poses are made of: size and time of the video or of every photo, by name."""
+    """Return the size in bytes and the time (ns) of the video or of every photo, by file name.
+
+    Poses belong to a source as long as its fingerprint stays the same.
+    """
     files = [source] if source.is_file() else photo_files(source)
     stats = {file.name: file.stat() for file in files}
     return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
 
 def make_poses(source: Path, out: Path, options: Options, console: Console) -> Poses:
-    """Make poses of the photos or the video `source` in the new folder `out`.
+    """Compute the poses of `source`, photos or a video, and write them to the new folder `out`.
 
-    out: sparse/0 (a COLMAP model) and images, which any reader of COLMAP opens, and poses.json.
-    Raises PosesError for photos without poses, FileExistsError for a folder with something in it,
-    and OSError.
+    `out` gets sparse/0 (a COLMAP model), images/ and poses.json; any reader of COLMAP opens it.
+    Raises PosesError if no poses are found, FileExistsError if `out` is not empty, and OSError.
     """
     # too few photos raise before anything is written
     record = {"made_by": "qgs poses", "source": fingerprint(source), "options": asdict(options)}
@@ -116,7 +123,10 @@ def make_poses(source: Path, out: Path, options: Options, console: Console) -> P
 
 @contextmanager
 def _bars(console: Console) -> Iterator[Show]:
-    """Yield what shows how far a stage is, a bar for each; its name alone where nobody looks."""
+    """Yield a function that shows progress, with one bar for each stage.
+
+    Without a terminal it prints only the names of stages.
+    """
     tasks = dict[str, TaskID]()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     hidden = not console.is_terminal
@@ -146,13 +156,14 @@ def _made(source: Path, out: Path, working: Path, options: Options, show: Show) 
     else:
         files = photo_files(source)
         names = left_out_formats(files[0].parent)
-        remarks = [f"not read, convert them to JPEG: {listed(names, 3)}"] if names else []
+        left_out = f"left out, convert these photos to JPEG: {listed(names, 3)}"
+        remarks = [left_out] if names else []
     photos, faulty = prepare(files, out / "images", small, options.side, show)
     if len(photos) < LEAST:
         why = listed((f"{name}: {reason}" for name, reason in faulty.items()), 3, "; ")
         raise PosesError(
-            f"{source} has {counted(len(photos), 'photo')} that can be read, and poses need "
-            f"{LEAST} at least ({why}): replace them"
+            f"{source} has {counted(len(photos), 'photo')} that can be read, but poses need at "
+            f"least {LEAST}: replace the damaged photos ({why})"
         )
     # neighbours in a video share most; all pairs of 80 photos take a minute
     ordered = source.is_file() or len(photos) > EXHAUSTIVE

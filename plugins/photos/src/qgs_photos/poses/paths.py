@@ -1,4 +1,4 @@
-"""Camera paths: about what photos show, along them, or as a file lists them."""
+"""Make camera paths around a scene or along its photos, or read them from a file."""
 
 import json
 import math
@@ -28,9 +28,9 @@ _TURNS = 2.0
 
 
 def path_of(kind: str, cameras: Cameras, depth: float, frames: int) -> Cameras:
-    """Return a path (1, frames) of a kind of KINDS past `cameras` (1, V).
+    """Return a camera path (1, frames) of a `kind` in KINDS, for a scene with `cameras` (1, V).
 
-    depth: of what they show. The intrinsics are those of the first camera.
+    depth: distance from the cameras to what they show. Intrinsics are those of the first camera.
     """
     if kind == "orbit":
         return orbit(cameras, depth, frames)
@@ -43,7 +43,8 @@ def path_of(kind: str, cameras: Cameras, depth: float, frames: int) -> Cameras:
 def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
     """Return poses (frames, 4, 4) that circle the mean of `c2w` (V, 4, 4) and look at one point.
 
-    They move to and fro meanwhile, as the spirals of LLFF (Mildenhall et al., 2019) do.
+    While they circle, they move forward and back, as in LLFF's spirals (Mildenhall et al., 2019).
+    The point lies `depth` in front of the mean pose.
     """
     right, down, forward, centre = mean_camera(c2w)[:3].unbind(-1)
     angle = torch.arange(frames).to(c2w) * (2 * math.pi * _TURNS / frames)
@@ -54,7 +55,7 @@ def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
 
 
 def walk(c2w: Tensor, frames: int) -> Tensor:
-    """Return poses (frames, 4, 4) along those of photos (V, 4, 4) in their order, smoothed."""
+    """Return smoothed poses (frames, 4, 4) along the poses `c2w` (V, 4, 4) of photos, in order."""
     count = len(c2w)
     # a mean of poses is none: `look_at` makes one of its axes
     times = torch.linspace(0, count - 1, frames).to(c2w)
@@ -65,10 +66,11 @@ def walk(c2w: Tensor, frames: int) -> Tensor:
 
 
 def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Tensor, Tensor]:
-    """Read OpenCV poses (T, 4, 4) and intrinsics (T, 4) in pixels of `size` (H, W), float64.
+    """Read a camera path: camera-to-world (T, 4, 4), OpenCV axes, and intrinsics (T, 4), float64.
 
-    file: a camera path of nerfstudio's viewer, or a transforms file. fov: vertical angle of view in
-    degrees instead of the file's. Raises ValueError where it is neither.
+    file: a camera path of nerfstudio's viewer, or a transforms file. size: (H, W) of the video, for
+    the intrinsics in pixels. fov: vertical angle of view in degrees; None takes that in the file.
+    Raises ValueError for any other file.
     """
     try:
         data = json.loads(file.read_bytes())
@@ -81,7 +83,7 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
             raise ValueError(problem)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
-            f"{file} is no camera path ({type(error).__name__}: {error}): give one that "
+            f"{file} is not a camera path ({type(error).__name__}: {error}): give a path that "
             "nerfstudio's viewer saved, a transforms.json, or one of " + ", ".join(KINDS)
         ) from error
     height, width = size
@@ -92,18 +94,18 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
 
 
 def _keyframe(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """Return the pose of an entry of a path of nerfstudio's viewer, in OpenCV axes, and fy."""
+    """Return camera-to-world (4, 4), OpenCV axes, and fy in pixels of a keyframe of nerfstudio."""
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
     return pose * _OPENGL, _focal(float(entry.get("fov") or 50.0), size[0])
 
 
 def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """Return the pose of a photo of a transforms file and fy at another size."""
+    """Return the pose (4, 4) of a photo of a transforms file, and its fy in pixels of `size`."""
     if frame.problems or frame.size is None:
         raise ValueError(f"{frame.name}: {next(iter(frame.problems), 'add its h and w')}")
     return frame.c2w, frame.intrinsics[1] * size[0] / frame.size[0]
 
 
 def _focal(angle: float, height: int) -> float:
-    """Return the focal length in pixels of a vertical angle of view in degrees."""
+    """Return the focal length in pixels for a vertical `angle` of view in degrees."""
     return height / 2 / math.tan(math.radians(angle) / 2)

@@ -1,4 +1,4 @@
-"""Photos of a user, made ready for COLMAP: upright, RGB with 8 bits, no larger than wanted."""
+"""Prepare photos for COLMAP: turn them upright, convert to 8-bit RGB, reduce large ones."""
 
 import json
 import os
@@ -29,16 +29,20 @@ _LENS = (0x920A, 0xA405, 0xA434)
 
 
 Show: TypeAlias = Callable[[str, int, int], None]
-"""Called with a stage, what is done of it, and what there is."""
+"""Function that shows progress: name of the stage, number of steps done, number of all steps."""
 
 
 class PosesError(ValueError):
-    """Photos or a video of which no poses can be made; the message says what to do."""
+    """Error for photos or a video whose poses cannot be computed; its message says what to do."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo that is ready. name: in both folders. size: (H, W) upright. camera: of EXIF."""
+    """A prepared photo.
+
+    name: file name. size: (H, W) of the upright original in pixels. camera: text from EXIF that
+    differs between cameras, lenses and focal lengths; empty without EXIF.
+    """
 
     name: str
     size: tuple[int, int]
@@ -46,27 +50,27 @@ class Photo:
 
 
 def photo_files(folder: Path) -> list[Path]:
-    """Return the photos in `folder`, or in its `images`, 2 before 10.
+    """Return the photos in `folder`, or in its subfolder images/, sorted so that 2 precedes 10.
 
-    Raises PosesError below LEAST.
+    Raises PosesError for fewer than LEAST photos.
     """
     found = next((f for f in (folder, folder / "images") if image_files(UPath(f))), folder)
     files = [Path(str(file)) for file in image_files(UPath(found)) if file.is_file()]
     if len(files) >= LEAST:
         return sorted(files, key=lambda file: _by_number(file.name))
-    text = f"{found} holds {counted(len(files), 'photo')}, and poses need {LEAST} at least"
+    text = f"{found} holds {counted(len(files), 'photo')}, but poses need at least {LEAST}"
     if foreign := left_out_formats(found):
         raise PosesError(f"{text}; {listed(foreign, 3)} cannot be read: convert them to JPEG")
-    raise PosesError(f"{text}: take more, from places of your own choice")
+    raise PosesError(f"{text}: take more photos, from different positions")
 
 
 def _by_number(name: str) -> tuple[str, str]:
-    """Return a key that sorts 2 before 10."""
+    """Return a key for sorting names by the numbers in them: "2" before "10"."""
     return re.sub(r"\d+", lambda found: found[0].zfill(20), name), name
 
 
 def left_out_formats(folder: Path) -> list[str]:
-    """Return names of photos in `folder` in formats that are not read."""
+    """Return the names of photos in `folder` whose formats cannot be read, such as raw photos."""
     names = (file.name for file in folder.iterdir())
     return sorted(name for name in names if name.lower().endswith(_FOREIGN))
 
@@ -78,11 +82,13 @@ def prepare(
     side: int,
     progress: Show = lambda stage, done, total: None,
 ) -> tuple[list[Photo], dict[str, str]]:
-    """Put `files` upright into `kept`, and no longer than `side` into `working`.
+    """Write upright photos into `kept`, and copies of at most `side` pixels into `working`.
 
-    A file that is upright already is linked, or copied across file systems. Returns those that are
-    ready, in the order of `files`, and of the others name and reason. Names get a number before
-    them where they sort differently as text, which COLMAP and readers of its models go by.
+    A file that needs no change is linked, or copied to another file system. If the order of `files`
+    is not the alphabetical order of names, which COLMAP uses, names get a number in front.
+
+    Returns the prepared photos in the order of `files`, and for each photo that cannot be read its
+    name and the reason. progress: called with the stage, the number of photos done, and of all.
     """
     ready = list[Photo]()
     faulty = dict[str, str]()
@@ -106,7 +112,7 @@ def prepare(
 def _prepared(file: Path, name: str, kept: Path, working: Path, side: int) -> Photo:
     with file.open("rb") as opened, opened_image(opened) as image:
         if min(image.size) < SMALLEST:
-            raise ValueError(f"it has {image.width} x {image.height} pixels")
+            raise ValueError(f"{image.width} x {image.height} pixels are too few")
         image.load()
         turned = orientation(image) != 1
         stays = image.format in _PLAIN
@@ -131,9 +137,9 @@ def _prepared(file: Path, name: str, kept: Path, working: Path, side: int) -> Ph
 
 
 def _exif(image: Image.Image) -> tuple[bytes, str]:
-    """Return EXIF without the orientation, and what tells cameras and focal lengths apart.
+    """Return EXIF data without the orientation, and a text that identifies camera and focal length.
 
-    Both are empty where EXIF is damaged.
+    Both are empty if EXIF is damaged.
     """
     try:
         exif = image.getexif()
@@ -163,7 +169,7 @@ def _link(file: Path, path: Path) -> None:
 
 
 def camera_groups(photos: Sequence[Photo]) -> list[list[str]]:
-    """Return names of the photos that share a camera: of one size, one lens, one focal length."""
+    """Return names of photos in groups that share a camera: same size, lens and focal length."""
     groups = defaultdict[object, list[str]](list)
     for photo in photos:
         groups[photo.size, photo.camera].append(photo.name)

@@ -1,8 +1,8 @@
-"""COLMAP in a process of its own, `python -m qgs_photos.poses.worker`: torch is never in it.
+"""Run COLMAP in a separate process without torch: `python -m qgs_photos.poses.worker`.
 
-One line of JSON on standard input is the job; when that input ends, so does this process, so that
-it never outlives the command that started it. Standard output has lines of JSON between
-those that COLMAP logs.
+Standard input has one line of JSON, the `Job`. When this input is closed, the process ends, so that
+it never outlives the command that started it. Standard output has lines of JSON on progress and the
+result, among the lines that COLMAP logs.
 """
 
 import json
@@ -27,9 +27,11 @@ FEW_MATCHES = 15
 # Of a model; photos from one place give models of next to no points.
 FEW_POINTS = 30
 SMALL = {"init_min_tri_angle": 4.0, "init_min_num_inliers": 50}
-"""Limits for the first two photos if COLMAP finds none by its own, 16 degrees and 100 points."""
+"""Weaker limits on the first two photos, used if COLMAP finds no pair with its own limits of 16
+degrees and 100 points."""
 SMALL_SIDE = 1000
-"""Longer side in pixels up to which photos are doubled first, which finds more and takes longer."""
+"""Longer side in pixels up to which features are searched at twice the photo's size. This finds
+more features and takes longer."""
 # Of the error in pixels: what a refined principal point must reach.
 BETTER = 0.99
 # Photos of a camera from which on its principal point is refined.
@@ -37,7 +39,7 @@ FREE_CENTRE = 20
 
 
 def main() -> None:
-    """Read a job, do it, and print its result."""
+    """Read a job from standard input, run it, and print its result."""
     job = Job(**json.loads(sys.stdin.readline()))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     print(json.dumps(mapped(job)), flush=True)
@@ -49,15 +51,18 @@ def _end_with_parent() -> None:
 
 
 def tell(stage: str, done: int, total: int) -> None:
-    """Print a line for the process that reads this one's output."""
+    """Print the progress as JSON for the process that reads the output.
+
+    done, total: number of steps done, and of all steps in this stage.
+    """
     print(json.dumps({"stage": stage, "done": done, "total": total}), flush=True)
 
 
 def mapped(job: Job) -> Mapping[str, Any]:
-    """Find features, matches, poses; models go to `job.models`/0, 1, ..., the largest to `best`.
+    """Find features, matches and poses; write the models that COLMAP finds into `job.models`.
 
-    Returns "refused" with a reason where there is nothing to go on with, else "posed" with the
-    names of the photos of the largest model.
+    The largest model is in its subfolder `best`. Returns {"posed": names of the photos in this
+    model}, or {"refused": reason} if the photos give no model.
     """
     COLMAP.set_random_seed(job.seed)
     total = len(job.sizes)
@@ -81,8 +86,8 @@ def mapped(job: Job) -> Mapping[str, Any]:
         counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
     if sum(count >= FEW_FEATURES for count in counts) < 3:
         reason = (
-            f"fewer than three of {total} photos have enough points to match: they are blurred, or "
-            "what they show is bare. Take sharp ones of something with texture"
+            f"fewer than three of {total} photos have enough features to match: the photos are "
+            "blurred, or show surfaces without texture. Take sharp photos of something with texture"
         )
         return {"refused": reason}
     tell("matching", 0, total)
@@ -104,8 +109,8 @@ def mapped(job: Job) -> Mapping[str, Any]:
     # a model needs three photos, so two pairs
     if pairs < 2:
         reason = (
-            f"of {total} photos, {pairs} pairs share enough points. Take more photos, a step "
-            "apart, so that each shows half of what the one before shows"
+            f"only {pairs} pairs of {total} photos have enough matches. Take more photos, a step "
+            "apart, so that each shows half of what the photo before shows"
         )
         return {"refused": reason}
     return _models(job, total)
@@ -141,8 +146,8 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
             break
     else:
         reason = (
-            f"{total} photos match, but no two of them show the same from places far enough apart. "
-            "Walk around what you take, do not turn on the spot, and take more photos"
+            f"the {total} photos match, but no two of them show the same from positions far enough "
+            "apart. Take more photos, and walk around your subject: do not turn on the spot"
         )
         return {"refused": reason}
     largest = max(solid, key=lambda model: model.num_reg_images())
@@ -153,11 +158,11 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
 
 
 def _centred(model: Any, threads: int) -> Any:
-    """Refine principal points, where many photos share a camera and it fits better.
+    """Refine the principal points of `model` if many photos share a camera and the error decreases.
 
-    COLMAP keeps them in the middle of the image; photos that are cut out of larger ones then turn.
-    Long lenses do not show where it is: the error of `mary_rose` (19 degrees) stays the same, and
-    its cameras would turn by half a degree.
+    COLMAP keeps principal points in the middle of the image, so poses of cropped photos are turned.
+    With long lenses a principal point cannot be measured: on `mary_rose` (19 degrees) refinement
+    would leave the error unchanged and turn the cameras by half a degree.
     """
     counts = dict.fromkeys(model.cameras, 0)
     for image in model.images.values():
@@ -175,7 +180,10 @@ def _centred(model: Any, threads: int) -> Any:
 
 
 def _scaled(model: Any, sizes: Mapping[str, tuple[int, int]]) -> Any:
-    """Return `model` in pixels of the photos of `sizes`, of which COLMAP saw smaller copies."""
+    """Scale the cameras and points of `model` from reduced photos to the sizes of the originals.
+
+    sizes: (H, W) of the originals by name.
+    """
     scales = dict[int, Any]()
     for image in model.images.values():
         camera = model.cameras[image.camera_id]
