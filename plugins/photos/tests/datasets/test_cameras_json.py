@@ -81,7 +81,7 @@ def test_what_is_read(tmp_path, photos, caplog):
         assert_close(read.cameras.intrinsics, torch.tensor([LENS] * 6).double())
         assert [Path(read.frame_name(i)).name for i in range(6)] == names
         assert formats_of(folder) == ["cameras"]
-        assert ("read as parts" in caplog.text) == (form == "parts"), form
+        assert ("read as fractions" in caplog.text) == (form == "parts"), form
 
 
 def test_what_is_refused_names_the_file(photos, file):

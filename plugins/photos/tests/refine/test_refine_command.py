@@ -95,9 +95,9 @@ def test_what_makes_no_sense_is_refused_in_a_sentence(reconstruction, photos, tm
     out = tmp_path / "out"
     for source, given, options, message in (
         (tmp_path / "none", photos, (), "give a folder that `qgs reconstruct` wrote"),
-        (by_hand, photos, (), "a model that is in no file"),
+        (by_hand, photos, (), "a model that is not in a file"),
         (damaged, photos, (), "does not describe a reconstruction"),
-        (reconstruction, moved, ("--scene", "moved"), "or have other poses now"),
+        (reconstruction, moved, ("--scene", "moved"), "or their poses have changed"),
         (reconstruction, photos, ("--seconds", 0), "--seconds must be a time above 0"),
     ):
         result = run_qgs("refine", source, given, *options, "--out", out)

@@ -112,7 +112,7 @@ def test_without_the_viewer_there_is_no_page(monkeypatch):
 def test_options_that_cannot_be_used_are_refused(photos, tmp_path):
     out = tmp_path / "out"
     for options, message in (
-        ("--model none --scale 0.4", "--scale are of a model"),
+        ("--model none --scale 0.4", "--scale need a model"),
         ("--minutes 0", "--minutes"),
         ("--seconds inf", "--seconds"),
         ("--holdout 1", "--holdout"),

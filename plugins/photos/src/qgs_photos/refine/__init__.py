@@ -1,4 +1,4 @@
-"""Per-scene refinement for qgs: predicted Gaussians, optimised on the photos of their scene."""
+"""Refinement: optimise the Gaussians of one scene on its photos."""
 
 from qgs_photos.refine.refining import RefinedScene, refine
 

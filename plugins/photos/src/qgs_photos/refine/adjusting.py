@@ -1,4 +1,4 @@
-"""Adjustment of each photo beside the Gaussians: its pose and its exposure."""
+"""Optimise the pose and the exposure of each photo together with the Gaussians."""
 
 import torch
 import torch.nn.functional as F
@@ -15,11 +15,14 @@ _HELD = {"poses": 10.0, "colors": 0.1}
 
 
 class Adjustments:
-    """Corrections of V photos, each optimised in the steps of its own photo.
+    """Corrections of the poses and colours of photos, optimised in steps on the respective photo.
 
-    poses: (6,) of each photo, half the axis of a turn and a shift over `size`, both in the
-    camera's frame. colors: (3, 4), what is added to an affine map of rendered RGB. Empty for
-    neither.
+    A pose has 6 parameters in the frame of its camera: half the rotation vector (radians), and the
+    translation divided by `size`. An exposure has 3 x 4: the deviation from the identity of an
+    affine map of rendered RGB.
+
+    photos: their number. poses, exposure: whether to optimise these. size: of the scene, in world
+    units. like: tensor whose type and device the parameters get.
     """
 
     def __init__(self, photos: int, poses: bool, exposure: bool, size: float, like: Tensor) -> None:
@@ -36,7 +39,7 @@ class Adjustments:
         self._optimizer = torch.optim.Adam(groups, eps=1e-15) if groups else None
 
     def cameras(self, photo: int, cameras: Cameras) -> Cameras:
-        """Return the cameras (1, 1) of a photo, as corrected."""
+        """Return the corrected camera (1, 1) of the photo with index `photo`."""
         if "poses" not in self._parts:
             return cameras
         turn, shift = self._parts["poses"][photo].split(3)
@@ -47,13 +50,13 @@ class Adjustments:
         return Cameras(cameras.c2w @ move, cameras.intrinsics, cameras.size)
 
     def every_camera(self, cameras: Cameras) -> Cameras:
-        """Return the cameras (1, V) of all photos, as corrected, without gradients."""
+        """Return the corrected cameras (1, V) of all photos, without gradients."""
         with torch.no_grad():
             each = [self.cameras(v, cameras[:, v : v + 1]).c2w for v in range(cameras.shape[1])]
         return Cameras(torch.cat(each, 1), cameras.intrinsics, cameras.size)
 
     def seen(self, photo: int, rgb: Tensor) -> Tensor:
-        """Return rendered rgb (1, 1, 3, H, W) in the exposure of a photo."""
+        """Return rendered `rgb` (1, 1, 3, H, W) with the exposure of the photo `photo`."""
         if "colors" not in self._parts:
             return rgb
         change = self._parts["colors"][photo]
@@ -61,11 +64,11 @@ class Adjustments:
         return rgb + turned + change[:, 3, None, None]
 
     def cost(self, photo: int) -> Tensor | float:
-        """Return what the corrections of a photo add to the loss."""
+        """Return the term of the loss that keeps the corrections of a photo small."""
         return sum(_HELD[k] * part[photo].square().sum() for k, part in self._parts.items())
 
     def step(self, used: float) -> None:
-        """Follow the gradients of a step. used: part of the budget spent so far."""
+        """Take an optimizer step. used: fraction of the time already spent, lowers the rate."""
         if self._optimizer is not None:
             for group in self._optimizer.param_groups:
                 group["lr"] = _RATES[group["name"]] * _LAST**used

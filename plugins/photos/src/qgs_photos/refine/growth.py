@@ -1,7 +1,8 @@
-"""Growth of optimised Gaussians: opaque ones are split, dead ones become copies of them.
+"""Add Gaussians during the optimisation: split opaque Gaussians, and relocate dead ones to them.
 
-Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024). In place of its
-noise, a copy is displaced by a fraction of its parent's size, so that the two can separate.
+Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024). The paper adds
+noise to positions. Here a copy is displaced by a fraction of its parent's size, so that copy and
+parent can separate.
 """
 
 from collections.abc import Mapping
@@ -14,8 +15,8 @@ from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Gaussians
 
 DEAD = 0.005
-"""Opacity below which a Gaussian is relocated, as in the paper. A higher threshold deletes
-semi-transparent fog, whose single Gaussians are all faint."""
+"""Opacity below which a Gaussian is dead and is relocated, as in the paper. A higher threshold
+would delete fog that the photos show, which consists of faint Gaussians."""
 # Displacement of a copy over its parent's scales.
 _BESIDE = 0.2
 # Copies of one Gaussian at a time, as in the paper's code.
@@ -25,11 +26,12 @@ _OPACITY_MARGIN = 1e-4
 
 
 class FreeGaussians:
-    """Gaussians (1, G) as unbounded parameters (G, ...), with Adam.
+    """Gaussians (1, G) as parameters (G, ...) without bounds, and their Adam optimizer.
 
-    values: by name, means, log_scales, quats, opacity_logits, color_logits, and sh and features if
-    given. With sh, which allow any colour, `colors` takes the place of color_logits. active: how
-    many of the coefficients are used; the others wait as they are.
+    values: the parameters by name: means, log_scales, quats, opacity_logits, color_logits, and sh
+    and features if given. With sh, colours have no bounds, so `colors` replaces color_logits.
+    active: number of spherical harmonics that are used; the others keep their values. None without
+    sh. rates: learning rate by name.
     """
 
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
@@ -64,7 +66,7 @@ class FreeGaussians:
         return len(self.values["means"])
 
     def gaussians(self) -> Gaussians:
-        """Return Gaussians (1, G) with gradients to `values`."""
+        """Return the Gaussians (1, G); gradients flow to `values`."""
         values = {name: value[None] for name, value in self.values.items()}
         return Gaussians(
             means=values["means"],
@@ -78,10 +80,11 @@ class FreeGaussians:
 
     @torch.no_grad()
     def grow(self, count: int, generator: torch.Generator) -> None:
-        """Relocate dead Gaussians and add new ones up to `count`, as copies of others.
+        """Turn dead Gaussians into copies of opaque ones, and add further copies up to `count`.
 
-        Parents are drawn by opacity. Parent and copies share its opacity and shrink, so that the
-        rendering stays the same, and their moments restart at 0. If all are faint, none is dead.
+        Parents are sampled with probabilities proportional to opacity. Parent and copies become
+        smaller and more transparent, so that together they render like the parent before. Their
+        moments of Adam restart at 0. If all Gaussians are below DEAD, none is relocated.
         """
         opacities = self.values["opacity_logits"].sigmoid()
         faint = (opacities < DEAD) & (opacities >= DEAD).any()
@@ -112,7 +115,7 @@ class FreeGaussians:
             self.optimizer.state[new] = state
 
     def _split(self, parents: Tensor) -> None:
-        """Set opacity and scale of every parent to the values that its copies get too."""
+        """Set the opacity and scale of every parent to the values that parent and copies share."""
         shares = torch.bincount(parents, minlength=self.count) + 1
         chosen = (shares > 1).nonzero()[:, 0]
         logits = self.values["opacity_logits"]
@@ -121,7 +124,7 @@ class FreeGaussians:
         self.values["log_scales"][chosen] += shrink.log()[:, None]
 
     def _places_in(self, parents: Tensor, generator: torch.Generator) -> Tensor:
-        """Return points (n, 3), each drawn around the centre of one of `parents` (n,)."""
+        """Return random points (n, 3), each near the centre of one of the `parents` (n,)."""
         values = self.values
         turns = quat_to_matrix(F.normalize(values["quats"][parents], dim=-1))
         drawn = torch.randn(len(parents), 3, 1, generator=generator).to(turns)
@@ -130,11 +133,11 @@ class FreeGaussians:
 
 
 def shared(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Return opacity and scale factor of N equal Gaussians that together look like one.
+    """Return the opacity a and the scale factor of N equal Gaussians that replace one Gaussian.
 
-    opacities: (n,), of the one. shares: (n,) integers N, clamped to _MOST_COPIES.
-    Equation 9 of the paper: the sum over k of C(N, k+1) (-1)^k / sqrt(k+1) a^(k+1). In float64,
-    because terms of alternating sign cancel.
+    opacities: (n,), of the replaced Gaussians. shares: (n,) integers N, clamped to _MOST_COPIES.
+    By equation 9 of the paper, the factor is the old opacity divided by the sum over k from 0 of
+    C(N, k+1) (-1)^k / sqrt(k+1) a^(k+1). In float64, because terms of alternating sign cancel.
     """
     shares = shares.clamp_max(_MOST_COPIES).double()
     old = opacities.double()

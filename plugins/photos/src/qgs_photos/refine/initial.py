@@ -1,4 +1,4 @@
-"""Start of the optimisation of `qgs scene`: a model's Gaussians, or some placed by the photos."""
+"""Make the first Gaussians of `qgs scene`: by a model, or from the photos alone."""
 
 import struct
 from dataclasses import dataclass
@@ -26,7 +26,8 @@ from qgs_photos.refine.scene_photos import TIMED, ScenePhotos
 from qgs_photos.refine.sweeping import swept
 
 ENOUGH = 4
-"""Photos from which on a start at their pixels is as good as a model's, see docs/refine.md."""
+"""Number of photos from which on Gaussians placed at pixels are as good a start as those of a
+model, see docs/refine.md."""
 _OPACITY = 0.1
 # Nearest points that give a size.
 _NEIGHBOURS = 3
@@ -36,9 +37,11 @@ _FIXED = struct.Struct("<Q3d3BdQ")
 
 @dataclass(frozen=True)
 class Initialisation:
-    """A model's Gaussians (1, G), or none for Gaussians at the photos, and their world.
+    """How the optimisation starts.
 
-    world: reference pose (4, 4) and scale, as of `own_world`. frames: names of the inputs, as text.
+    model: name of the model, or "none". world: reference pose (4, 4) and scale of the world of the
+    Gaussians, see `own_world`. gaussians: (1, G) of the model; None places Gaussians by the photos.
+    frames: names of the model's input photos, separated by commas; None without a model.
     """
 
     model: str
@@ -48,13 +51,14 @@ class Initialisation:
 
 
 def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisation:
-    """Take the photos alone where there are ENOUGH, unless a model or its options are wanted.
+    """Choose between a model and the photos alone, and run the model.
 
-    Raises ValueError for options of a model that is not wanted, and without a model.
+    Without --model, --frames and --scale, the photos alone are used if there are at least ENOUGH.
+    Raises ValueError for --frames or --scale with --model none, and if no model is installed.
     """
     of_model = options.frames is not None or options.scale is not None
     if options.model == NONE and of_model:
-        raise ValueError("--frames and --scale are of a model: leave them out, or --model none")
+        raise ValueError("--frames and --scale need a model: leave them out, or --model none")
     enough = not of_model and len(photos.frames) >= ENOUGH
     if options.model == NONE or (options.model is None and enough):
         return Initialisation(NONE, photos_world(photos))
@@ -72,22 +76,27 @@ def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisati
 
 
 def shipped_model() -> str:
-    """Return a model that an installed plugin ships, one of worlds where there is one.
+    """Return the name of a model that an installed plugin ships.
 
-    Those were trained for photos. Raises ValueError for none.
+    Models of the plugin `worlds` come first, since they were trained for photos. Raises ValueError
+    if no plugin ships a model.
     """
     registry, _ = load_usable_plugins()
     models = [pair for plugin in registry.plugins.values() for pair in plugin.models.items()]
     names = [name for name, file in models if file.is_file()]
     if not names:
         raise ValueError(
-            "no trained model is installed: install query-gaussians-worlds, or name one (--model)"
+            "no trained model is installed: install query-gaussians-worlds, or name a model by "
+            "--model"
         )
     return min(names, key=lambda name: (not name.startswith("worlds/"), name))
 
 
 def photos_world(photos: ScenePhotos) -> tuple[Tensor, Tensor]:
-    """Return the first camera's world, see `own_world`, in which photos show what is 1 away."""
+    """Return the world of the first camera, scaled so that the scene's depth is about 1.
+
+    Returns reference pose (4, 4) and scale, see `own_world`.
+    """
     scale = 1 / scene_depth(photos.small)
     views = ViewsConfig(scale="constant", scale_factor=scale)
     return own_world(photos.small, photos.frames[:1], views)
@@ -96,9 +105,11 @@ def photos_world(photos: ScenePhotos) -> tuple[Tensor, Tensor]:
 def photos_start(
     scene: Scene, world: tuple[Tensor, Tensor], views: Views, count: int, most: int
 ) -> Gaussians:
-    """Return Gaussians (1, G) at COLMAP's points where the scene has some, the others at pixels.
+    """Return Gaussians (1, G) at COLMAP's points, if the scene has any, and at pixels of photos.
 
-    count: of all at the end. most: at pixels, of the photos `views` (1, V), at least TIMED.
+    world: of the Gaussians, see `own_world`. views: photos (1, V). count: number of Gaussians at
+    the end of the optimisation, which these do not exceed. most: largest number at pixels; without
+    COLMAP's points there are at least TIMED.
     """
     parts = list[Gaussians]()
     if isinstance(scene, PhotoScene) and (points := sparse_points(scene.folder)):
@@ -112,10 +123,10 @@ def photos_start(
 
 
 def sparse_points(folder: UPath) -> tuple[Tensor, Tensor] | None:
-    """Return positions (N, 3), float64, and colours (N, 3) in [0, 1], in the cameras' world.
+    """Return COLMAP's points: positions (N, 3) in the cameras' world, and colours (N, 3) in [0, 1].
 
-    folder: of a scene's photos. None where COLMAP did not make the cameras, and without points.
-    Raises ValueError for points that cannot be read.
+    Both are float64. folder: the scene's. None if the cameras are not from a COLMAP model, or if it
+    has no points. Raises ValueError for points that cannot be read.
     """
     # other formats go first, and have a world of their own
     if formats_of(folder)[:1] != ["colmap"]:
@@ -157,9 +168,10 @@ def _binary(content: bytes) -> list[list[float]]:
 def from_points(
     points: tuple[Tensor, Tensor], world: tuple[Tensor, Tensor], most: int
 ) -> Gaussians:
-    """Return at most `most` Gaussians (1, G) at points, as large as the gaps to their neighbours.
+    """Return Gaussians (1, G) at points, each as large as the mean distance to its neighbours.
 
-    points: see `sparse_points`. world: reference pose (4, 4) and scale, as of `own_world`.
+    points: positions and colours, see `sparse_points`. world: reference pose (4, 4) and scale of
+    the Gaussians' world, see `own_world`. most: largest number; of more points some are sampled.
     """
     means, colors = points
     reference, scale = world

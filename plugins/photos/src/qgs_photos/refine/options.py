@@ -1,4 +1,4 @@
-"""Options of `qgs scene`, as a user gives them and as they are once all are chosen."""
+"""Hold the options of `qgs scene`, first as the user gives them, then with all values chosen."""
 
 import shlex
 from dataclasses import dataclass
@@ -7,14 +7,17 @@ from qgs.reconstruction.scenes import Size
 from qgs_photos.refine.refining import NO_EXTRAS, Extras
 
 NONE = "none"
-"""Value of --model (start from the photos alone) and of --holdout (optimise on all photos)."""
+"""Value "none": for --model, start from the photos alone; for --holdout, hold no photo out."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of `qgs scene`; None where it chooses. seconds: of the optimisation alone.
+    """Options of `qgs scene`; None lets the command choose.
 
-    frames: inputs of the model, as text. size: (H, W) of the photos.
+    frames: input photos of the model, separated by commas. scale: of camera positions for the
+    model. size: (H, W) of the photos in pixels. gaussians: their number. seconds: time of the
+    optimisation alone. holdout: N to hold out every Nth photo, or NONE. scene: name among several.
+    extras: further quantities to optimise. masks: treat pixels outside masks as background.
     """
 
     model: str | None = None
@@ -30,7 +33,7 @@ class Options:
     masks: bool = False
 
     def command(self, photos: str, out: str) -> str:
-        """Return a command line that makes the scene again; all must be chosen."""
+        """Return a command line that makes the scene again. `size` and `seconds` must be set."""
         assert self.size is not None
         assert self.seconds is not None
         height, width = self.size

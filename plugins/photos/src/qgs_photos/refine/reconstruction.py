@@ -1,4 +1,4 @@
-"""A reconstruction in a folder, refined on the photos of its scene."""
+"""Open a finished reconstruction, and refine it on the photos of its scene."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,13 +26,15 @@ _SAME_POSE = 1e-3
 def opened_reconstruction(
     folder: Path, photos: str, size: Size | None, name: str | None, device: str
 ) -> tuple[Reconstruction, Scene, Sequence[int]]:
-    """Open what `qgs reconstruct` wrote into `folder`, and its scene at the size to refine at.
+    """Open the reconstruction that `qgs reconstruct` wrote into `folder`, and its photos.
 
-    And the frames that its model was trained on.
+    Returns the reconstruction, the scene with photos of `size`, and the indices of the photos on
+    which its model was trained.
 
-    size: (H, W) of these, by default the recorded one. name: of the scene, by
-    default the recorded one. Raises FileNotFoundError for another folder, ValueError for a
-    reconstruction without a model and for other photos, and as the model and the data do.
+    size: (H, W) of the photos in pixels; None takes that of the reconstruction. name: scene among
+    several; None takes that of the reconstruction. Raises FileNotFoundError if `folder` holds no
+    reconstruction, ValueError if its model is unknown or the photos are others, and what the
+    readers of model and photos raise.
     """
     if not has_record(folder):
         raise FileNotFoundError(
@@ -42,8 +44,8 @@ def opened_reconstruction(
     record = read_record(folder)
     if not record.model:
         raise ValueError(
-            f"{folder} was made by a model that is in no file: save it and reconstruct again, or "
-            "call qgs_photos.refine.refine in Python"
+            f"{folder} was made by a model that is not in a file: save the model and reconstruct "
+            "again, or call qgs_photos.refine.refine in Python"
         )
     model = load(record.model, device)
     recipe = resolve(model.recipe or {})
@@ -65,7 +67,10 @@ def opened_reconstruction(
 
 
 def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
-    """Raise ValueError unless `scene` has the recorded frames: their files and their poses."""
+    """Raise ValueError unless the photos and poses of `scene` are those of the reconstruction.
+
+    photos: name of their folder for the message.
+    """
     frames = (*record.inputs, *record.compared)
     expected = [record.photos.get(frame, str(frame)) for frame in frames]
     found = [scene.frame_name(frame) for frame in frames if frame < len(scene)]
@@ -74,8 +79,8 @@ def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
         if torch.allclose(poses, record.cameras.c2w, _SAME_POSE, _SAME_POSE):
             return
     raise ValueError(
-        f"{photos} are not the photos that {record.folder} was made of, or have other poses now; "
-        f"it has {listed(expected, 3)}: give those, or reconstruct again"
+        f"{photos} does not hold the photos from which {record.folder} was made, or their poses "
+        f"have changed; it was made from {listed(expected, 3)}: give these, or reconstruct again"
     )
 
 
@@ -102,11 +107,11 @@ def refine_reconstruction(
     inputs_only: bool,
     console: Console,
 ) -> Reconstruction:
-    """Refine the Gaussians of `start` on photos of `scene`, at the size of these photos.
+    """Refine the Gaussians of the reconstruction `start` on photos of `scene`.
 
-    seen: frames that its model was trained on. seconds, count: see `refine`. inputs_only: optimise
-    on the input photos alone; otherwise on all photos that are neither compared with nor held out
-    of training.
+    seen: indices of photos on which the model was trained. seconds: time of the optimisation.
+    count: number of Gaussians in the result; None keeps their number. inputs_only: optimise only on
+    the input photos; False: on all photos that are neither compared with nor held out of training.
     """
     frames, targets = _chosen_frames(scene, start, inputs_only)
     every = views_in(start.sample.world, scene, (*frames, *targets)).to(
@@ -147,7 +152,7 @@ def refine_reconstruction(
 def _chosen_frames(
     scene: Scene, start: Reconstruction, inputs_only: bool
 ) -> tuple[list[int], Frames]:
-    """Return the frames to optimise on, and those to compare with."""
+    """Return the indices of photos to optimise on, and of photos to compare the result with."""
     inputs = start.sample.input_frames
     targets = start.sample.target_frames
     # A reconstruction is compared near its inputs; its refinement covers the whole scene, and is

@@ -1,8 +1,8 @@
-"""Refinement: Gaussians of one scene, optimised on its photos as 3D Gaussian splatting does.
+"""Refine the Gaussians of one scene: optimise them on its photos, as 3D Gaussian splatting does.
 
-Half of the predicted Gaussians are replaced by Gaussians on surfaces that the photos show, whose
-depth is found by matching. On unfamiliar scenes a model leaves floaters and holes that gradient
-steps, which are short, cannot repair.
+First, half of a model's Gaussians are replaced by Gaussians on surfaces whose depth is found by
+matching photos. On scenes unlike its training data, a model leaves floaters and holes, which the
+short steps of gradient descent cannot repair.
 """
 
 import math
@@ -63,10 +63,11 @@ _DEGREES_FROM = (0.1, 0.35, 0.6)
 
 @dataclass(frozen=True)
 class RefinedScene:
-    """Refined Gaussians (1, G).
+    """Result of a refinement.
 
-    seconds: of optimisation. cameras: (1, V) of the photos, corrected where that was wanted.
-    stopped_by: the signal that ended it early.
+    gaussians: (1, G). steps, seconds: length of the optimisation. cameras: (1, V) of the photos,
+    optimised if `Extras.poses` is set. stopped_by: name of the signal that ended the optimisation
+    early; None if it was complete.
     """
 
     gaussians: Gaussians
@@ -78,10 +79,10 @@ class RefinedScene:
 
 @dataclass(frozen=True)
 class Extras:
-    """Parts to optimise beside means, shapes, opacities and colours.
+    """What to optimise in addition to means, shapes, opacities and colours of the Gaussians.
 
-    degree: spherical harmonics up to this degree, 0 to 3, grow with time where the start has none.
-    exposure: an affine map of the colours of each photo. poses: the camera of each photo.
+    degree: spherical harmonics up to this degree, 0 to 3, are added in steps if the first Gaussians
+    have none. exposure: an affine map of the colours of each photo. poses: the pose of each photo.
     """
 
     degree: int = 0
@@ -105,13 +106,14 @@ def refine(
 ) -> RefinedScene:
     """Optimise `gaussians` (1, G) on the photos `views` (1, V) of their scene.
 
-    seconds: of optimisation, counted after the first step, in which kernels compile. count:
-    Gaussians at the end, by default as many as given; they grow in the first part of the time.
-    The optimisation starts from the most opaque of the given Gaussians and, as the part `swept` of
-    all, from others at pixels, where the photos agree on a depth. renderer: `qgs/auto` by default.
-    console: where progress is shown; nowhere by default. extras: what else is optimised. The first
-    Ctrl-C finishes the step and returns the result so far. Works in any world: its size is measured
-    by the distance of the Gaussians from the cameras.
+    The optimisation starts from the most opaque of the given Gaussians, and from new Gaussians at
+    pixels, at the depth on which photos agree. The world may have any unit. The first Ctrl-C
+    finishes the step and returns the result so far.
+
+    seconds: time of the optimisation, without the first step, in which kernels compile. count:
+    number of Gaussians at the end, reached in the first part of the time; None keeps their number.
+    swept: fraction of new Gaussians at the start, from 0 to 1. renderer: by default `qgs/auto`.
+    console: shows progress; None shows none. extras: further quantities to optimise.
 
     Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
     """
@@ -135,9 +137,10 @@ def refine(
 def seconds_of_step(
     gaussians: Gaussians, views: Views, renderer: nn.Module, extras: Extras = NO_EXTRAS
 ) -> float:
-    """Return the time of a step of `refine` with these Gaussians and photos (1, V) of this size.
+    """Measure the time in seconds of a step of `refine` on these Gaussians and photos (1, V).
 
-    The least of three, after one in which kernels compile, with all harmonics in use.
+    It is the least of three steps with all spherical harmonics, after a step in which kernels
+    compile.
     """
     run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras)
     run.levels = run.levels[-1:]
@@ -152,7 +155,7 @@ def seconds_of_step(
 
 
 class _Run:
-    """One refinement: its Gaussians, photos by level of resolution, and clock."""
+    """A refinement in progress: Gaussians, photos at several resolutions, time spent."""
 
     def __init__(
         self,
@@ -196,7 +199,7 @@ class _Run:
         self.order: list[int] = []
 
     def until_spent(self, progress: TrainingProgress, stop: StopRequest) -> None:
-        """Optimise until the time is used or a stop is requested."""
+        """Take steps until the time is spent or a stop is requested."""
         while self.spent < self.seconds and not stop:
             began = perf_counter()
             loss, quality = self.optimise()
@@ -210,7 +213,10 @@ class _Run:
             self.free.grow(self.wanted, self.generator)
 
     def optimise(self) -> tuple[float, float]:
-        """Take one step on one photo, then grow if due; return the loss and PSNR before it."""
+        """Take a step on one photo, and add Gaussians if it is time for that.
+
+        Returns the loss and the PSNR before the step.
+        """
         used = min(self.spent / self.seconds, 1.0)
         for group in self.free.optimizer.param_groups:
             last = _LAST_OF_MEANS if group["name"] == "means" else _LAST
@@ -242,7 +248,7 @@ class _Run:
         return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))
 
     def _grow(self, used: float) -> None:
-        """Relocate and add Gaussians if that is due; used: part of the budget spent so far."""
+        """Relocate and add Gaussians at regular steps. used: fraction of the time already spent."""
         regular = self.step - self.grown >= _STEPS_BETWEEN_GROWTHS and used < _SETTLED
         if regular or (used >= _GROWN and self.free.count < self.wanted):
             self.grown = self.step
@@ -254,10 +260,11 @@ class _Run:
 def partly_swept(
     gaussians: Gaussians, views: Views, count: int, part: float, generator: torch.Generator
 ) -> Gaussians:
-    """Return `count` Gaussians (1, count): the most opaque given ones, and a `part` swept.
+    """Return the most opaque of the given Gaussians and new ones at pixels, together (1, count).
 
-    A single photo has no depth, so that all are given ones. Spherical harmonics and features of
-    the swept ones are 0.
+    part: fraction of new Gaussians, from 0 to 1. Their depth comes from a plane sweep, and their
+    spherical harmonics and features are 0. With a single photo, which gives no depth, there are no
+    new Gaussians.
     """
     new = int(part * count) if views.images.shape[1] > 1 else 0
     # faint Gaussians of a model are fog, which hides more than it shows
@@ -273,13 +280,13 @@ def partly_swept(
 
 
 def distance(gaussians: Gaussians, views: Views) -> float:
-    """Return the median distance of Gaussians (1, G) from the nearest camera, above 0."""
+    """Return the median distance of Gaussians (1, G) from their nearest camera, at least 1e-6."""
     distances = torch.cdist(gaussians.means[0], views.cameras.c2w[0, :, :3, 3])
     return float(distances.amin(1).median().clamp_min(1e-6))
 
 
 def resized(views: Views, part: int) -> Views:
-    """Return the views at 1/part of their resolution, by means over areas."""
+    """Return the views with height and width divided by `part`; pixels are averaged over areas."""
     if part == 1:
         return views
     height, width = views.cameras.size
@@ -306,6 +313,6 @@ def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: 
         )
     if not all(bool(tensor.isfinite().all()) for _, tensor in named_tensors(gaussians)):
         raise ValueError(
-            "some Gaussians are not finite, so they cannot be refined: the model that predicted "
-            "them is broken, or its photos are far from what it was trained on"
+            "some Gaussians are NaN or infinite and cannot be refined: the model that predicted "
+            "them is broken, or its photos are unlike its training data; use another model"
         )

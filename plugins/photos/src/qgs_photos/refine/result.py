@@ -1,4 +1,4 @@
-"""The files and scores of an optimised scene."""
+"""Score an optimised scene on held-out photos, and write its files."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -38,9 +38,11 @@ PageWriter = Callable[[Gaussians, Views, tuple[float, float, float]], str]
 
 @dataclass(frozen=True)
 class Result:
-    """An optimised scene, photos `views` (1, V) optimised on, and `judged` (1, H) held-out ones.
+    """An optimised scene with its photos.
 
-    world: of the Gaussians, reference pose (4, 4) and scale, as of `own_world`.
+    command: command line that makes the scene again. world: reference pose (4, 4) and scale of the
+    world of the Gaussians, see `own_world`. views: photos (1, V) of the optimisation. judged:
+    held-out photos (1, H), on which the scene is scored.
     """
 
     command: str
@@ -52,16 +54,16 @@ class Result:
     judged: Views
 
     def in_photos_world(self, gaussians: Gaussians) -> Gaussians:
-        """Return Gaussians (1, G) in the frame and unit of the photos' cameras."""
+        """Return Gaussians (1, G) in the world coordinates of the photos' cameras."""
         reference, scale = self.world
         return moved(gaussians, reference, 1 / float(scale))
 
     def photo(self, frame: int) -> str:
-        """Return the file of a photo."""
+        """Return the file name of the photo with index `frame`."""
         return self.photos.small.frame_name(frame)
 
     def render(self, views: Views) -> Tensor:
-        """Return the scene as from the cameras of `views` (1, V): (1, V, 3, H, W)."""
+        """Render the scene from the cameras of `views` (1, V): RGB (1, V, 3, H, W)."""
         gaussians = replace(self.refined.gaussians, features=None)
         return self.renderer(gaussians, views.cameras).rgb
 
@@ -70,9 +72,10 @@ class Result:
 def write_scene(
     result: Result, out: Path, page: PageWriter | None, began: float, console: Console
 ) -> None:
-    """Write scene.ply, scene.splat, metrics.json, held_out.png and the page into `out`.
+    """Write scene.ply, scene.splat, metrics.json, held_out.png and index.html into `out`.
 
-    began: start of the command, for the total time in metrics.json.
+    page: function that makes index.html; None writes no page. began: time of `perf_counter` at the
+    start of the command, for the total time in metrics.json.
     """
     refined = result.refined
     # neither .splat files nor the page show harmonics
@@ -103,14 +106,14 @@ def write_scene(
         say(
             console,
             f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
-            f"{mean['ssim']:.3f}; the nearest photo {mean['nearest_input']:.2f} dB",
+            f"{mean['ssim']:.3f}; a copy of the nearest photo: PSNR {mean['nearest_input']:.2f} dB",
         )
     for name in names:
         say(console, f"wrote {out / name}")
 
 
 def scores(result: Result) -> dict[str, Any]:
-    """Return metrics.json: the command, the optimisation, scores of held-out photos."""
+    """Return the contents of metrics.json: command, optimisation, scores on held-out photos."""
     refined = result.refined
     rows = list[dict[str, Any]]()
     for place, frame in enumerate(result.photos.held_out):
@@ -142,7 +145,10 @@ def scores(result: Result) -> dict[str, Any]:
 
 
 def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> images.Picture:
-    """Draw some held-out photos over what was rendered of them."""
+    """Draw some held-out photos in a row, and below each the render from its camera.
+
+    rows: scores of the held-out photos.
+    """
     every = -(-len(rows) // _SHOWN)
     views = result.judged.select(slice(None, None, every))
     pictures = {
@@ -154,13 +160,16 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
 
 
 def page_writer(console: Console) -> PageWriter | None:
-    """Return the viewer's function that makes a page; None, with a remark, without the viewer."""
+    """Return the viewer's function that makes an HTML page.
+
+    If the viewer is not installed, print this and return None.
+    """
     try:
         from qgs_viewer.page import gaussians_html
     except ImportError:
         say(
             console,
-            f"no page to turn the scene on, it needs query-gaussians-viewer: {INSTALL_ALL}",
+            f"index.html is not written, it needs query-gaussians-viewer: {INSTALL_ALL}",
         )
         return None
     return gaussians_html
@@ -168,9 +177,10 @@ def page_writer(console: Console) -> PageWriter | None:
 
 @torch.no_grad()
 def plain(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
-    """Return Gaussians (1, G) without `sh`, in the mean colour that cameras (1, V) see of each.
+    """Return Gaussians (1, G) without `sh`, in the mean of the colours that cameras (1, V) see.
 
-    Those count that have its mean in their image; where none has, all do.
+    The mean is over the cameras in whose image the Gaussian's centre lies; if it lies in none, over
+    all cameras.
     """
     if gaussians.sh is None:
         return gaussians

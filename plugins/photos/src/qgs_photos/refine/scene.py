@@ -1,4 +1,4 @@
-"""`qgs scene`: from photos to the files of the best scene in a given time."""
+"""Run `qgs scene`: make the files of the best scene from photos in a given time."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,28 +21,29 @@ from qgs_photos.refine.scene_photos import TIMED, ScenePhotos, affordable
 from qgs_photos.refine.sweeping import swept
 
 END = 4.0
-"""Seconds kept for scores and files."""
+"""Seconds reserved for scores and files at the end."""
 PART_OF_END = 0.03
-"""Part of the time kept for them besides."""
+"""Fraction of the whole time that is reserved for scores and files in addition to END."""
 # Of the time for the optimisation, however long all else took.
 _LEAST_PART = 0.1
 SWEEP = 0.12
-"""Part of the time in which pixels get a depth."""
+"""Fraction of the optimisation's time to spend on finding depths of pixels."""
 
 
 def make_scene(
     path: str, out: Path, options: Options, began: float, seconds: float, console: Console
 ) -> None:
-    """Choose, optimise, judge and write.
+    """Choose the settings, optimise the scene, score it on held-out photos, and write its files.
 
-    began: on the clock of `perf_counter`. seconds: for everything from then on.
+    path: photos. out: new folder. began: time of `perf_counter` at the start of the command.
+    seconds: time from `began` to the last file.
     """
     # its remark comes first, before minutes of bars
     page = page_writer(console)
     ends = began + seconds - END - PART_OF_END * seconds
 
     def left() -> float:
-        """Return the seconds that are left for the optimisation, or were given for it."""
+        """Return the seconds for the optimisation: those of --seconds, or the time that is left."""
         return options.seconds or max(ends - perf_counter(), _LEAST_PART * seconds)
 
     photos = ScenePhotos(path, options)
@@ -92,25 +93,26 @@ def make_scene(
 
 
 def masked(views: Views, background: Sequence[float]) -> Views:
-    """Put the background in place of what the photos' masks leave out.
+    """Return the views with pixels outside their masks replaced by the background (RGB in [0, 1]).
 
-    What is empty is thereby seen to be empty. Raises ValueError for photos without masks.
+    The optimisation then leaves these pixels without Gaussians. Raises ValueError for photos
+    without masks.
     """
     if views.masks is None:
-        raise ValueError("--masks: these photos have no masks: leave it out, or add masks")
+        raise ValueError("--masks: these photos have no masks: leave --masks out, or add masks")
     color = views.images.new_tensor(background)[:, None, None]
     return replace(views, images=views.masks * views.images + (1 - views.masks) * color)
 
 
 def timed_sweep(views: Views) -> tuple[Gaussians, float]:
-    """Return some Gaussians (1, G) at pixels of photos (1, V), and the seconds of each."""
+    """Return TIMED Gaussians (1, G) at pixels of photos (1, V), and the seconds for each."""
     began = perf_counter()
     found = swept(views, TIMED, 1.0, torch.Generator().manual_seed(0))
     return found, (perf_counter() - began) / found.count
 
 
 def backdrop(scene: Scene, frames: Sequence[int]) -> tuple[float, float, float]:
-    """Return the median colour at photos' edges: what is there need not be made of Gaussians."""
+    """Return the median RGB in [0, 1] along the edges of photos, as background of the scene."""
     # 16 photos show the background as well as all
     few = frames[:: max(len(frames) // 16, 1)]
     pixels = scene.images(few)

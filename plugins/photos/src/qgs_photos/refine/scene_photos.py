@@ -1,4 +1,4 @@
-"""The photos of `qgs scene`: which are held out, and how large they may be in a given time."""
+"""Open the photos of `qgs scene`: choose held-out photos, and a photo size for a given time."""
 
 import math
 
@@ -10,18 +10,19 @@ from qgs.reconstruction.scenes import Size, installed_sources, named_scene
 from qgs_photos.refine.options import NONE, Options
 
 TIMED = 2048
-"""Pixels whose depth is found at least, and Gaussians with which a step is timed."""
+"""Number of Gaussians at pixels with which a step is timed; at least as many start a scene without
+COLMAP's points."""
 SIZES = range(96, 2161, 16)
-"""Shorter sides that are considered, pixels."""
+"""Photo sizes to choose from: shorter side in pixels."""
 # 1,600 steps on 320 x 320 pixels gave less, at any size, than 2,000 on 128 x 128 did in a fifth of
 # the time.
 LEAST_STEPS = 4000
-"""Steps that a refinement takes at least; then photos may be larger."""
+"""Least number of steps. A larger photo size is chosen only if the time allows this many steps."""
 STEPS_OF_PHOTO = 25
-"""Steps of each photo, where these are more."""
+"""Least number of steps for each photo, if this gives more than LEAST_STEPS in all."""
 # twice as many gained less than their time
 DENSITY = 0.6
-"""Gaussians over pixels of a photo."""
+"""Number of Gaussians as a fraction of the number of pixels in a photo."""
 MOST_GAUSSIANS = 262_144
 # Of memory for each value of a photo, at all its sizes: half of it is kept free.
 _BYTES = 16
@@ -35,10 +36,10 @@ _SMALL = 128
 
 
 class ScenePhotos:
-    """The photos of `qgs scene` at any size.
+    """The photos of `qgs scene`, at any size.
 
-    small: the scene at a small size. held_out: frames that are judged, and frames: those that are
-    optimised on.
+    path: folder, URL or video. small: the scene with small photos. held_out: indices of photos that
+    are held out for scores. frames: indices of the other photos, for the optimisation.
     """
 
     def __init__(self, path: str, options: Options) -> None:
@@ -53,26 +54,31 @@ class ScenePhotos:
         self.small.held_out = self.held_out
 
     def at(self, size: Size | None) -> Scene:
-        """Return the scene with photos of this size (H, W)."""
+        """Return the scene with photos of `size` (H, W); None takes the reader's default."""
         source, _ = open_for(self.path, size, None, self._sources)
         return named_scene(source, self.path, self.name)
 
 
 def judged_frames(scene: Scene, holdout: str) -> Frames:
-    """Return the frames that are judged and never optimised on.
+    """Return the indices of the held-out photos, which are scored and never optimised on.
 
-    holdout: NONE, or n as of `held_out_frames`; a split of the photos' own goes first. Raises
-    ValueError for another text.
+    holdout: NONE, or N to hold out every Nth photo, unless the photos have a split of their own.
+    Raises ValueError for another text.
     """
     if holdout == NONE:
         return ()
     if not holdout.isdecimal() or int(holdout) < 2:
-        raise ValueError(f"--holdout must be none or every how many, such as 8; got {holdout!r}")
+        raise ValueError(
+            f"--holdout must be none, or N of at least 2 for every Nth photo; got {holdout!r}"
+        )
     return tuple(scene.held_out) or held_out_frames(len(scene), int(holdout))
 
 
 def sized(scene: Scene, side: int) -> Size:
-    """Return (H, W) of whole photos with this shorter side, never larger than stored."""
+    """Return (H, W) of uncropped photos whose shorter side has `side` pixels.
+
+    Photos are never enlarged.
+    """
     stored = scene.stored_size(0) or scene.cameras.size
     # enlarged photos show nothing more and take longer
     factor = min(side / min(stored), 1.0)
@@ -83,10 +89,11 @@ def sized(scene: Scene, side: int) -> Size:
 def affordable(
     step: float, timed: Size, photos: ScenePhotos, seconds: float, options: Options
 ) -> tuple[Size, int]:
-    """Return photo size and number of Gaussians for which `seconds` and the memory are enough.
+    """Return the largest photo size (H, W) that time and memory allow, and a number of Gaussians.
 
-    step: seconds of one with TIMED Gaussians on a photo of the size `timed` (H, W). What the
-    options set stays. The smallest size is taken where nothing is enough.
+    step: measured seconds of a step with TIMED Gaussians on a photo of size `timed` (H, W).
+    seconds: time of the optimisation. options: a size or a number in them is kept. If even the
+    smallest size is too large, it is returned.
     """
     steps = max(LEAST_STEPS, STEPS_OF_PHOTO * len(photos.frames))
     available = available_bytes()

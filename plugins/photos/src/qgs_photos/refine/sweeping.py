@@ -1,4 +1,4 @@
-"""Gaussians at pixels of photos, at the depth that other photos confirm: a plane sweep.
+"""Place Gaussians at pixels of photos, at the depth on which photos agree best (plane sweep).
 
 Source: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996), with patches along rays.
 """
@@ -38,10 +38,10 @@ _PIXELS = 2.0
 
 @torch.no_grad()
 def swept(views: Views, count: int, size: float, generator: torch.Generator) -> Gaussians:
-    """Return Gaussians (1, count) at random pixels of photos (1, V), with their colours.
+    """Return Gaussians (1, count) at random pixels of photos (1, V), in the colours of the pixels.
 
-    size: approximate distance of the scene from the cameras; also the depth of pixels that no
-    other photo shows.
+    size: approximate distance of the scene from the cameras. It is the depth of pixels that no
+    other photo shows. generator: samples the pixels.
     """
     height, width = views.cameras.size
     pixels = height * width
@@ -59,7 +59,10 @@ def swept(views: Views, count: int, size: float, generator: torch.Generator) -> 
 def _on_photo(
     views: Views, photo: int, pixels: Tensor, size: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return means, scales and colours (n, 3) at `pixels` (n,) of a photo, in row-major order."""
+    """Return means, scales and colours, each (n, 3), of Gaussians at `pixels` (n,) of a photo.
+
+    Pixels are numbered row by row.
+    """
     cameras = views.cameras
     pixels = pixels.to(views.images.device)
     rows = pixels // cameras.size[1]
@@ -72,7 +75,7 @@ def _on_photo(
 
 
 def _rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
-    """Return world directions (..., 3) of pixels (...), scaled to depth 1 in the camera."""
+    """Return the world directions (..., 3) of pixels, scaled to depth 1 in the camera."""
     fx, fy, cx, cy = cameras.intrinsics[0, photo]
     x = (columns + 0.5 - cx) / fx
     y = (rows + 0.5 - cy) / fy
@@ -80,7 +83,10 @@ def _rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor
 
 
 def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float) -> Tensor:
-    """Return the depth (n,) of pixels (n,) of one photo, of least cost against the others."""
+    """Return the depths (n,) of pixels of one photo: of the depths tried, those of least cost.
+
+    The cost is the difference of colours from other photos.
+    """
     cameras = views.cameras
     height, width = cameras.size
     logs = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _DEPTHS, device=rows.device)
@@ -112,7 +118,10 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
 
 
 def _others(cameras: Cameras, photo: int, size: float) -> list[int]:
-    """Return photos with the best baseline and direction for matching `photo`; itself if alone."""
+    """Return the photos whose baseline and direction are best for matching `photo`.
+
+    A single photo is matched with itself.
+    """
     centres = cameras.c2w[0, :, :3, 3]
     axes = cameras.c2w[0, :, :3, 2]
     baseline = (centres - centres[photo]).norm(dim=-1) / size
