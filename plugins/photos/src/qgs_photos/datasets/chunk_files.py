@@ -54,10 +54,7 @@ _DIVIDED_TWICE = 0.02
 
 @dataclass(frozen=True)
 class Record:
-    """A scene as a chunk holds it, with encoded images.
-
-    where: chunk and scene for messages. The other fields are described at the top of this file.
-    """
+    """A scene as a chunk holds it, see the top of this file. where: file and scene for messages."""
 
     where: str
     key: str
@@ -107,10 +104,7 @@ class Record:
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """Check an entry of a chunk and return its scene.
-
-    file: name of the chunk for messages. data: the entry. Raises ValueError for another structure.
-    """
+    """Return the scene in the entry `data` of the chunk `file`. Raises ValueError if malformed."""
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
             f"{file} holds {a_type(data)}, expected a mapping with 'key', 'cameras' and 'images': "
@@ -243,10 +237,7 @@ def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
-    """Yield a problem if intrinsics are not fractions of the image's width and height.
-
-    They look as if they were in pixels, or divided twice.
-    """
+    """Yield a problem if a frame's intrinsics look like pixels or as if divided twice."""
     values = record.cameras[frame, :4].tolist()
     focal = max(values[:2])
     divided_twice = 0 < focal < _DIVIDED_TWICE
@@ -293,10 +284,7 @@ def load_chunk(path: UPath) -> list[Any]:
 
 
 class Chunk:
-    """An open chunk file. entries: the stored mappings by key of the scene.
-
-    Raises ValueError for an entry without a key and for a key that occurs twice.
-    """
+    """An open chunk file. entries: the stored mappings by key of the scene."""
 
     def __init__(self, path: UPath) -> None:
         self.path = path

@@ -69,7 +69,7 @@ class Bounded(ViewSampler):
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """See `Component`."""
         if context.inputs == 1:
-            yield Problem("", "it needs two inputs, and `views.inputs` is 1", "take qgs/span")
+            yield Problem("", "it needs two inputs, but `views.inputs` is 1", "take qgs/span")
         for low, high in (("min_gap", "max_gap"), ("initial_min_gap", "initial_max_gap")):
             if getattr(config, low) > getattr(config, high):
                 yield Problem(low, f"it is larger than `{high}`", f"raise `{high}`")

@@ -89,7 +89,7 @@ def check(
         held[report.name].append(report)
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
         general += index_findings(file, held)
-        notes.append(f"compared with the index {file}")
+        notes.append(f"scenes were compared with the index {file}")
     if factors := [1 / scene.depth for scene in scenes if scene.depth]:
         ends = f"{min(factors):.4g} to {max(factors):.4g}"
         median = f"{np.median(factors):.4g}"
