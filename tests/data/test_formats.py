@@ -64,7 +64,7 @@ def test_what_a_folder_holds_most_is_read_in_a_told_order(tmp_path, caplog):
     write_llff(tmp_path, photos)
     write_colmap(tmp_path, photos, "text")
     assert_same(scene(tmp_path), photos)
-    assert "data.format: llff reads the other" in caplog.text
+    assert "(colmap, llff) and is read as colmap; set data.format" in caplog.text
     must_refuse(r"transforms\.json", scene, tmp_path, format="nerfstudio", kind=FileNotFoundError)
 
 

@@ -1,4 +1,4 @@
-"""Photos in folders: formats that list cameras, and which of them a folder holds."""
+"""Photos in folders: formats of camera listings, and reading the listing of a folder."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ _SMALLEST = (
 
 
 def readers() -> dict[str, type[PhotoReader]]:
-    """Return readers by format name: `Nerfstudio`, then `installed_readers`.
+    """Return all photo readers by format name: `Nerfstudio`, then those of plug-ins.
 
-    Where a folder holds several listings, the first of this order is read.
+    If a folder has several listings, the first format in this order is read.
     """
     own = {"nerfstudio": Nerfstudio}
     return own | installed_readers() | own
 
 
 def formats_of(folder: UPath) -> list[str]:
-    """Return the formats whose listings `folder` holds, in the order of `readers`."""
+    """Return the formats in which `folder` lists cameras, in the order of `readers`."""
     return [name for name, reader in readers().items() if reader.recognises(folder)]
 
 
 def with_cameras(path: UPath) -> UPath:
-    """Return `path`, or the folder with cameras that a reader makes of photos without cameras."""
+    """Return `path`; for photos without cameras, a folder with cameras if a reader can make one."""
     if not is_local(path) or formats_of(path):
         return path
     # A folder of scenes may hold other pictures too.
@@ -49,42 +49,42 @@ def with_cameras(path: UPath) -> UPath:
 
 
 def read_listing(folder: UPath, format: str = "auto", images: str | None = None) -> Listing:
-    """Read the photos that `folder` lists in `format`, or in the first of `readers` that it holds.
+    """Read the photos that `folder` lists. format: "auto" reads the first format of `readers`.
 
-    images: another folder of photos, such as images_4. Raises FileNotFoundError for no folder or no
-    listing, ValueError for a listing that cannot be read.
+    images: folder with scaled copies of the photos to read, such as images_4. Raises
+    FileNotFoundError without a folder or listing, and ValueError for an unreadable listing.
     """
     known = readers()
     listings = ", ".join(f"{reader.listing} ({name})" for name, reader in known.items())
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"photo folder {folder} (from {UPath.cwd()}) does not exist or is no folder: give the "
-            f"folder that holds {listings}"
+            f"photo folder {folder} (from {UPath.cwd()}) is not a folder: give the folder that "
+            f"contains one of these: {listings}"
         )
     held = formats_of(folder)
     if held and format not in ("auto", *held):
         needed = known[format].listing
         raise FileNotFoundError(
-            f"{folder} has no {needed}, which {format} needs; it can be read as {', '.join(held)}"
+            f"{folder} has no {needed}, which {format} needs; data.format can be {', '.join(held)}"
         )
     if not held:
         inside = listed(sorted(item.name for item in folder.iterdir()))
         more = "" if "colmap" in known else " (query-gaussians-photos reads more)"
         raise FileNotFoundError(
-            f"{folder} lists no cameras; it holds {inside or 'nothing'}. Make some by `qgs poses`, "
-            f"or give a folder that holds {listings}{more}. A minimal transforms.json: {_SMALLEST}"
+            f"{folder} lists no cameras; it holds {inside or 'nothing'}. Run `qgs poses`, "
+            f"or give a folder with one of {listings}{more}. A minimal transforms.json: {_SMALLEST}"
         )
     if format == "auto" and len(held) > 1:
         warn_once(
             f"{folder} holds photos in {len(held)} formats ({', '.join(held)}) and is read as "
-            f"{held[0]}; in a recipe, data.format: {held[1]} reads the other"
+            f"{held[0]}; set data.format in a recipe to read another format"
         )
     found = known[held[0] if format == "auto" else format].read(folder, images)
     still = [frame.name for frame in found.frames if frame.time is None and not frame.problems]
     if still and len({frame.time is None for frame in found.frames}) > 1:
         raise ValueError(
-            f"{found.file} gives no 'time' for {listed(still)}, and one for other frames: write it "
-            "for each, or for none where nothing moves"
+            f"{found.file} gives 'time' only for some frames, not for {listed(still)}: write a "
+            "time for all frames, or for no frame if nothing moves"
         )
     return found
 
@@ -92,10 +92,12 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
 def present_frames(
     folder: UPath, format: str = "auto", images: str | None = None, outside: bool = False
 ) -> tuple[list[PhotoFrame], list[str]]:
-    """Return the frames of a listing's splits whose images exist, and the paths of the others.
+    """Return the frames of a folder's listing whose images exist, and paths of missing images.
 
-    What is left out is logged. Raises FileNotFoundError when fewer than two images or a mask do not
-    exist, ValueError for poses and intrinsics that cannot be right.
+    Frames that the listing puts into no split are left out. A warning tells what is left out.
+    format, images: see `read_listing`. outside: allow files outside of `folder`. Raises
+    FileNotFoundError if fewer than two images exist or a mask is missing, and ValueError for poses
+    and intrinsics that cannot be right.
     """
     found = read_listing(folder, format, images)
     # A listing of a stranger must not name other files of this machine.

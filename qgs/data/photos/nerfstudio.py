@@ -1,4 +1,4 @@
-"""nerfstudio's `transforms.json`, and files of the same schema: Blender's, DL3DV's."""
+"""Reader of nerfstudio's `transforms.json`, and of the same schema from Blender and DL3DV."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ from qgs.data.photos.reader import (
 from qgs.paths import read_json
 
 PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-"""Camera models that are a pinhole where no coefficient bends rays."""
+"""Camera models that are a pinhole if all distortion coefficients are 0."""
 _COEFFICIENTS = (
     "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
     "sx1", "sy1", "b1", "b2",
@@ -40,13 +40,16 @@ _OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 class Nerfstudio(PhotoReader):
-    """`transforms.json` with masks, depth, splits; reduced copies if all photos are missing."""
+    """Format `transforms.json`, with masks, depth maps and splits.
+
+    If the listed folder `images` is missing, scaled copies such as images_4 are read.
+    """
 
     listing = "transforms.json"
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`: the frames in the file's order."""
+        """Read the frames in the order of the file; see `PhotoReader`."""
         file = folder / cls.listing
         frames = read_transforms(file)
         top = {PurePosixPath(frame.name).parts[:1] for frame in frames}
@@ -58,8 +61,11 @@ class Nerfstudio(PhotoReader):
 
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
-    """Read the frames of a transforms file in order, with their faults. Raises ValueError."""
-    data = read_json(file, "export it again")
+    """Read the frames of a transforms file, in its order, with their problems.
+
+    Raises ValueError for a file without frames or with wrong splits.
+    """
+    data = read_json(file, "export the file again")
     entries = data.get("frames") if isinstance(data, Mapping) else None
     if not isinstance(entries, list) or not entries:
         raise ValueError(f"{file} lists no frames: expected a non-empty list under 'frames'")
@@ -78,13 +84,14 @@ def read_transforms(file: UPath) -> list[PhotoFrame]:
 
 
 def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None) -> PhotoFrame:
-    """Read an entry of 'frames'; what cannot be read becomes a problem of the frame.
+    """Read an entry of 'frames'; values that cannot be read become problems of the frame.
 
-    size: (H, W) of the image where neither the entry nor the top of `data` gives 'h' and 'w'.
+    data: the whole file; its values apply to entries that lack them. size: (H, W) of the image if
+    neither entry nor `data` has 'h' and 'w'.
     """
     path = entry.get("file_path") if isinstance(entry, Mapping) else None
     if not isinstance(path, str) or not PurePosixPath(path).name or "://" in path:
-        problem = FrameProblem("its 'file_path' names no file", "correct or remove it")
+        problem = FrameProblem("its 'file_path' names no file", "correct or remove the frame")
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
     values = _Values({**data, **entry})
     height = values.number("h")
@@ -112,28 +119,28 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
 
 
 class _Values(dict[str, Any]):
-    """Values of a frame, or of all frames, and the problems of those that cannot be read."""
+    """Values of a frame, and problems of values that cannot be read."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
         self.problems: list[FrameProblem] = []
 
     def problem(self, reason: str, fix: str) -> None:
-        """Note what cannot be read."""
+        """Add a problem."""
         self.problems.append(FrameProblem(reason, fix))
 
     def number(self, key: str) -> float | None:
-        """Return a finite number; None where it is absent or null, or a problem."""
+        """Return the finite number `key`; None if it is absent, null or invalid, a problem."""
         value = self.get(key)
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
         if value is not None:
-            self.problem(f"{key!r} must be a finite number, got {value!r}", "correct it")
+            self.problem(f"{key!r} must be a finite number, got {value!r}", "correct the value")
         return None
 
 
 def image_name(file_path: str) -> str:
-    """Return `file_path` in one spelling; one without an image's suffix, as of Blender, is PNG."""
+    """Return `file_path` with `/` as separator; add .png if it has no suffix, as in Blender."""
     name = PurePosixPath(file_path.replace("\\", "/"))
     suffix = name.suffix.lower()
     known = suffix[1:].isalpha() or suffix in Image.registered_extensions()
@@ -156,23 +163,26 @@ def _intrinsics(values: _Values, size: Size | None) -> Intrinsics:
     fy = _focal(values, "y", size and size[0]) or fx
     if fx is None or fy is None:
         values.problem(
-            "there is no focal length",
-            "expected 'fl_x' (pixels), or 'camera_angle_x' (radians) with 'w' and 'h', in the "
-            "frame or at the top of the file",
+            "the focal length is missing",
+            "add 'fl_x' (pixels), or 'camera_angle_x' (radians) with 'w' and 'h', to the frame "
+            "or to the top of the file",
         )
         return _NO_INTRINSICS
     cx = values.number("cx")
     cy = values.number("cy")
     if size is None and (cx is None or cy is None):
         reason = "neither 'cx' and 'cy' nor 'w' and 'h' are given"
-        values.problem(reason, "add either pair")
+        values.problem(reason, "add one of the two pairs")
         return _NO_INTRINSICS
     height, width = size or (0, 0)
     return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
 
 
 def _focal(values: _Values, axis: str, side: int | None) -> float | None:
-    """Return a focal length in pixels, as given or from the angle of view of a `side`."""
+    """Return the focal length of an axis in pixels: as listed, or from the angle of view.
+
+    axis: "x" or "y". side: width or height in pixels. None without a valid value.
+    """
     angle = values.number(f"camera_angle_{axis}")
     given = values.number(f"fl_{axis}")
     if given or angle is None or side is None or not 0 < angle < math.pi:
@@ -198,7 +208,10 @@ def _lens(values: _Values) -> Lens | None:
 
 
 def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[PhotoFrame]:
-    """Return `frames` with nerfstudio's splits; unnamed frames are of the other one, or unused."""
+    """Return `frames` with the splits that nerfstudio's lists of file names give.
+
+    Frames in no list belong to the split without a list; if both have lists, they are unused.
+    """
     known = {frame.name for frame in frames}
 
     def named(part: str) -> set[str]:
@@ -208,7 +221,7 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
             raise ValueError(f"{key!r} must be a list of file names, got {given!r}")
         names = set(map(image_name, given))
         if unknown := sorted(names - known):
-            raise ValueError(f"{key!r} names {unknown[0]}, which no frame has: remove the name")
+            raise ValueError(f"{key!r} names {unknown[0]}, but no frame has this name: remove it")
         return names
 
     train = named("train")

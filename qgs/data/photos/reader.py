@@ -1,4 +1,4 @@
-"""Base of readers of photos, the frames that they give, and the problems of these."""
+"""Base class of photo readers, the frames that they return, and checks of frames."""
 
 import math
 import os
@@ -19,10 +19,10 @@ from qgs.wording import listed, name_shown, numbered, warn_once
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 Size: TypeAlias = tuple[int, int]
 GROUP = "qgs.photo_readers"
-"""Entry point group of further readers: format name = module:subclass of `PhotoReader`."""
+"""Entry-point group for readers of plug-ins: FORMAT = "module:subclass of `PhotoReader`"."""
 UNLESS = (
-    "correct them, unless the photo is cut from a larger one; fx and cx go with the width, fy and "
-    "cy with the height"
+    "correct the intrinsics, unless the photo is cut from a larger one; fx and cx refer to the "
+    "width, fy and cy to the height"
 )
 _COPY = re.compile(r"images(_\d+)?")
 # Pixels of a listed photo.
@@ -45,7 +45,7 @@ _FOCAL = (0.1, 30.0)
 
 @dataclass(frozen=True)
 class FrameProblem:
-    """A fault of a `PhotoFrame`."""
+    """A mistake in the listing of a `PhotoFrame`: the reason and how to fix it."""
 
     reason: str
     fix: str
@@ -55,42 +55,44 @@ class FrameProblem:
 
 
 class Lens(ABC):
-    """A lens that bends rays, hashable, as `PhotoReader.lens` gives it; a pinhole has none."""
+    """Lens with distortion, made by `PhotoReader.lens`; hashable. Pinhole cameras have none."""
 
     @abstractmethod
     def undistorted(
         self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
     ) -> np.ndarray:
-        """Return the photo as a pinhole camera with the same intrinsics would have taken it.
+        """Return a photo as a pinhole camera with the same intrinsics would have taken it.
 
-        pixels: (H, W) or (H, W, C), returned in the same shape and dtype. intrinsics: in pixels of
-        it. nearest: take the nearest pixel, no mean. What the lens did not see is 0.
+        pixels: the photo, (H, W) or (H, W, C); the result has its shape and dtype. intrinsics: fx,
+        fy, cx, cy in pixels of the photo. nearest: take the nearest pixel in place of an
+        interpolation. Pixels outside of the photo are 0.
         """
 
     @abstractmethod
     def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
-        """Return the least zoom at which the middle of an undistorted photo has no black edges.
+        """Return the smallest zoom of a centre crop without black edges in an undistorted photo.
 
-        intrinsics: in pixels of the photo, of `size` (H, W), whose middle of the aspect of `target`
-        is shown.
+        intrinsics: in pixels of the photo. size: (H, W) of the photo. target: (H, W) whose aspect
+        ratio the crop has.
         """
 
     @abstractmethod
     def turned(self) -> Self:
-        """Return the lens of a camera turned by a quarter, clockwise."""
+        """Return the lens of the same camera turned clockwise by 90 degrees."""
 
 
 @dataclass(frozen=True)
 class PhotoFrame:
-    """One photo as listed; nothing of it is judged yet (see `refuse_problems`).
+    """One photo as listed. Its values are not checked yet, see `refuse_problems`.
 
-    name: the image file relative to the scene's folder. path: that file. mask: its mask; the image
-    itself for its alpha channel. depth: its depth map. c2w: (4, 4) float64 OpenCV camera-to-world.
-    intrinsics: fx, fy, cx, cy in pixels of an image of `size` (H, W), or of the file where the
-    listing gives no size. lens: None for a pinhole. split: as listed, None without splits. time:
-    when it was taken, in the listing's unit; None where nothing moves. turns: clockwise quarters
-    from the stored pixels to those of the camera, see `qgs.data.photos.source.upright`.
-    problems: what the listing says that cannot be read; a pose or intrinsics concerned are NaN.
+    name: image file relative to the scene's folder. path: path of the image. mask: file of the
+    mask; the image itself if its alpha channel is the mask. depth: file of the depth map.
+    c2w: (4, 4) float64 OpenCV camera-to-world. intrinsics: fx, fy, cx, cy in pixels of an image of
+    `size` (H, W); without a listed size, in pixels of the file. lens: None for a pinhole camera.
+    split: as listed; None without splits. time: when the photo was taken, in the listing's unit;
+    None for static scenes. turns: number of clockwise quarter turns that bring the stored pixels
+    upright, see `qgs.data.photos.source.upright`. problems: values in the listing that cannot be
+    read; an unreadable pose or unreadable intrinsics are NaN.
     """
 
     name: str
@@ -107,7 +109,7 @@ class PhotoFrame:
     problems: tuple[FrameProblem, ...] = ()
 
     def at_size(self, size: Size) -> Intrinsics:
-        """Return intrinsics in pixels of an image of `size`, a scaled copy of what is listed."""
+        """Return intrinsics in pixels of a scaled copy of the photo. size: (H, W) of the copy."""
         height, width = self.size or size
         x = size[1] / width
         y = size[0] / height
@@ -117,17 +119,20 @@ class PhotoFrame:
 
 @dataclass(frozen=True)
 class Listing:
-    """The photos of a folder. file: what lists them. frames: in the order of the listing."""
+    """Photos of a folder. file: the file that lists them. frames: in the order of that file."""
 
     file: UPath
     frames: Sequence[PhotoFrame]
 
 
 class PhotoReader(ABC):
-    """A format that lists posed photos; subclasses are entry points of `GROUP`, which name it."""
+    """Base of readers of one format that lists photos and cameras.
+
+    An entry point in the group `GROUP` gives the format its name.
+    """
 
     listing: ClassVar[str]
-    """Path of the listing below the folder, for messages."""
+    """Path of the listing file inside the folder of photos."""
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
@@ -136,35 +141,36 @@ class PhotoReader(ABC):
 
     @classmethod
     def posed(cls, path: UPath) -> UPath | None:
-        """Return a folder with cameras for `path`, photos without cameras or a video.
+        """Compute cameras for a video or for photos without cameras; return a folder with both.
 
-        It is made if need be; None where this format makes no cameras. Commands that open a user's
-        photos ask for it, a training never does.
+        An existing result is reused. Returns None if this reader cannot compute cameras. Commands
+        that open a user's photos call it; training never does.
         """
         return None
 
     @classmethod
     def lens(cls, model: str, coefficients: Mapping[str, float]) -> Lens | None:
-        """Return the lens of a camera model as nerfstudio and COLMAP name it; None if unknown.
+        """Return the lens of a camera model; None if this reader does not know the model.
 
-        coefficients: those that are not 0, such as k1.
+        model: name in nerfstudio or COLMAP. coefficients: distortion coefficients that are not 0,
+        by name, such as k1.
         """
         return None
 
     @classmethod
     @abstractmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """Read the photos that `folder` lists; neighbours in the list should be so in space.
+        """Read the photos that `folder` lists. Neighbours in the list should be near in space.
 
-        images: folder of photos to read instead of the listed one, such as images_4. Raises
-        FileNotFoundError where it does not exist, ValueError for a listing that cannot be read.
+        images: folder with scaled copies of the photos to read, such as images_4. Raises
+        FileNotFoundError if it does not exist, and ValueError for an unreadable listing.
         """
 
 
 def installed_readers() -> dict[str, type[PhotoReader]]:
-    """Return readers of installed distributions by format name; of equal names the first.
+    """Return the readers of installed plug-ins by format name; of equal names, the first.
 
-    One that cannot be loaded is left out and logged.
+    A reader that cannot be loaded is left out with a warning.
     """
     found: dict[str, type[PhotoReader]] = {}
     for entry in installed(GROUP):
@@ -177,7 +183,7 @@ def installed_readers() -> dict[str, type[PhotoReader]]:
 
 
 def numbers(value: object) -> np.ndarray:
-    """Return nested lists as float64; an empty array for what is no array of numbers."""
+    """Return nested lists as a float64 array; an empty array if they are no array of numbers."""
     try:
         return np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -185,7 +191,7 @@ def numbers(value: object) -> np.ndarray:
 
 
 def existing(paths: Iterable[UPath]) -> set[UPath]:
-    """Return those of `paths` that exist; each folder is listed once, which object stores need."""
+    """Return the paths that exist. Each folder is listed once, since object stores are slow."""
     names: dict[str, set[str]] = {}
     held: set[UPath] = set()
     for path in paths:
@@ -198,17 +204,20 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:
-    """Return `wanted`, else images, else its least reduced copy. Raises FileNotFoundError."""
+    """Return the folder of photos: `wanted`, or else images, or else its largest scaled copy.
+
+    Raises FileNotFoundError if there is none.
+    """
     if wanted is not None:
         chosen = folder / wanted
         if not chosen.is_dir():
-            raise FileNotFoundError(f"{chosen} does not exist: correct `images`")
+            raise FileNotFoundError(f"{chosen} does not exist: correct the option `images`")
         return chosen
     copies = [item for item in folder.iterdir() if _COPY.fullmatch(item.name) and item.is_dir()]
     if not copies:
         raise FileNotFoundError(
-            f"{folder} has neither a folder `images` nor a scaled copy such as images_4: name the "
-            "folder of photos as `images`"
+            f"{folder} has neither a folder `images` nor a scaled copy such as images_4: set the "
+            "option `images` to the folder of photos"
         )
     # `images` counts as reduced by 1.
     return min(copies, key=lambda item: int(item.name.partition("_")[2] or 1))
@@ -217,7 +226,10 @@ def image_folder(folder: UPath, wanted: str | None) -> UPath:
 def with_images(
     frames: Sequence[PhotoFrame], folder: UPath, wanted: str | None
 ) -> list[PhotoFrame]:
-    """Return `frames` with photos from the `image_folder`. Raises as that."""
+    """Return `frames` with photos of the same names in `image_folder(folder, wanted)`.
+
+    Raises FileNotFoundError if there is no such folder.
+    """
     photos = image_folder(folder, wanted)
     inside = wanted or photos.name
 
@@ -231,7 +243,7 @@ def with_images(
 
 
 def refuse_outside(folder: UPath, found: Listing) -> None:
-    """Raise ValueError for a listed file that is not in `folder`; a link there is."""
+    """Raise ValueError if a listed file is outside of `folder`. Links in `folder` are allowed."""
     for frame in found.frames:
         for file in filter(None, (frame.path, frame.mask, frame.depth)):
             if os.path.relpath(file.path, folder.path or ".").split(os.sep)[0] == "..":
@@ -242,11 +254,11 @@ def refuse_outside(folder: UPath, found: Listing) -> None:
 
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
-    """Yield problems of a pose (4, 4): NaN, mirrored, sheared or scaled."""
+    """Yield a problem if a pose (4, 4) has NaN or huge values, is mirrored, sheared or scaled."""
     # NaN is not at most anything.
     if not np.abs(c2w).max() <= _FARTHEST:
         reason = f"the pose has NaN or numbers larger than {_FARTHEST:.0e}"
-        yield FrameProblem(reason, "correct it, or remove the frame")
+        yield FrameProblem(reason, "correct the pose, or remove the frame")
         return
     # Mirrored is told from sheared: the remedies differ.
     rotation = c2w[:3, :3]
@@ -258,25 +270,28 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
         )
     elif np.linalg.det(rotation) < 0:
         fix = "negate one axis of the camera, or export the poses again"
-        yield FrameProblem("the pose mirrors and so is not rigid", fix)
+        yield FrameProblem("the pose is mirrored, so it is not rigid", fix)
 
 
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
-    """Yield problems of fx, fy, cx, cy in pixels of `size` (H, W)."""
+    """Yield a problem if fx, fy, cx, cy are not finite, not positive, or not in pixels.
+
+    size: listed (H, W); None without one.
+    """
     fx, fy, cx, cy = intrinsics
     values = f"(fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g})"
     if not all(map(math.isfinite, intrinsics)) or fx <= 0 or fy <= 0:
-        reason = f"intrinsics are not finite, or focal lengths not positive {values}"
+        reason = f"intrinsics must be finite and focal lengths positive {values}"
         yield FrameProblem(reason, "export the intrinsics again")
         return
     in_pixels = size is not None and max(size) > 20 * _NORMALISED
     if max(fx, fy) < _NORMALISED and (in_pixels or max(abs(cx), abs(cy)) <= 1):
-        fix = "they must be in pixels; multiply fx and cx by the width, fy and cy by the height"
+        fix = "write pixels: multiply fx and cx by the width, fy and cy by the height"
         yield FrameProblem(f"the intrinsics look normalised {values}", fix)
 
 
 def are_plausible(intrinsics: Intrinsics, size: Size) -> bool:
-    """Return whether fx, fy, cx, cy are those of a usual whole photo of `size` (H, W)."""
+    """Return whether fx, fy, cx, cy are usual for an uncropped photo of `size` (H, W)."""
     fx, fy, cx, cy = intrinsics
     height, width = size
     nearest, farthest = (limit * max(size) for limit in _FOCAL)
@@ -286,17 +301,17 @@ def are_plausible(intrinsics: Intrinsics, size: Size) -> bool:
 
 
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
-    """Yield problems of an image file of `size` (H, W); a scaled copy of `listed` has none."""
+    """Yield a problem if an image of `size` (H, W) is not a scaled copy of the size `listed`."""
     if listed is None or _alike(size, listed):
         return
     swapped = _alike(size, (listed[1], listed[0]))
     yield FrameProblem(
         f"the image is {size[1]} x {size[0]} pixels, but listed as {listed[1]} x {listed[0]}, "
-        "another aspect ratio, so that the intrinsics cannot be scaled",
-        "width and height are swapped; swap them back, or turn the photos' pixels where EXIF does "
-        "(`mogrify -auto-orient`)"
+        "another aspect ratio, so the intrinsics cannot be scaled",
+        "width and height are swapped; swap the listed ones, or turn the stored pixels as EXIF "
+        "says (`mogrify -auto-orient`)"
         if swapped
-        else "give the original image, or correct the listed size",
+        else "restore the original image, or correct the listed size",
     )
 
 
@@ -306,7 +321,7 @@ def _alike(size: Size, other: Size) -> bool:
 
 
 def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FrameProblem, ...]]:
-    """Return the listed size (H, W); None, and the problem, where no photo can have it."""
+    """Return a listed size (H, W) and no problem; None and a problem if the size is impossible."""
     if all(1 <= side <= LARGEST_SIDE for side in (height, width)):
         return (round(height), round(width)), ()
     size = f"{str(width)[:12]} x {str(height)[:12]}"
@@ -315,7 +330,7 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
 
 
 def refuse_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:
-    """Raise ValueError for the first problem, with its frame; log implausible intrinsics."""
+    """Raise ValueError for the first problem of a frame; warn of implausible intrinsics."""
     for index, frame in enumerate(frames):
         for problem in frame.problems or (
             *pose_problems(frame.c2w),

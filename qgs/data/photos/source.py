@@ -1,4 +1,4 @@
-"""Source `qgs/photos`: a folder of photos with their cameras, or a folder of such folders."""
+"""Data source `qgs/photos`: a folder of photos and cameras, or a folder of such folders."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -38,37 +38,39 @@ from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 
 _CACHED = 512 * 2**20
-"""Bytes of decoded images that a split keeps."""
+"""Size in bytes of the cache of decoded images."""
 _TURNS = {3: 2, 6: 1, 8: 3}
 """Clockwise quarter turns by EXIF orientation. The others mirror, which no camera does."""
 _QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""Axes of a camera turned clockwise, in its axes before: the new x was -y, the new y was x."""
+"""Rotation for a clockwise quarter turn: the new x axis is the old -y, the new y the old x."""
 
 
 class PhotosConfig(SceneSource.Config):
     """Options of `qgs/photos`."""
 
     path: str
-    """Folder of one scene, folder of scenes, or folder with scenes in train and test. It may be
-    absolute, relative to the working directory, or an fsspec URL. For videos and photos without
-    cameras, run `qgs poses` first."""
+    """Folder of one scene, folder of scenes, or folder with scenes in the folders train and test.
+    Absolute, relative to the working directory, or a URL of fsspec. For a video, or for photos
+    without cameras, run `qgs poses` first."""
     format: str = "auto"
     """Format of the camera listing: nerfstudio, or a format of a plug-in, such as colmap. auto uses
     the first format that the folder has."""
     images: str | None = None
-    """Folder of photos to read, such as images_4. null reads the listed photos."""
+    """Folder with scaled copies of the photos to read, such as images_4. null reads the listed
+    photos."""
     outside: bool = False
-    """Also read photos outside of the folder, by absolute paths or `..`. Links are always
-    followed."""
+    """Allow listings to name files outside of the folder, by absolute paths or `..`. Links are
+    always followed."""
     holdout: int = Field(default=8, ge=0)
-    """Hold out every n-th frame for evaluation, from frame n // 2 on; with fewer frames, the middle
-    one. 0 holds out none. A split in the listing replaces this."""
+    """Hold out every nth frame for evaluation, starting at frame n // 2; in scenes of fewer frames,
+    the middle frame. 0 holds out no frame. Splits in the listing take precedence."""
     max_frames: int = Field(default=0, ge=0)
-    """Number of first frames to read from a listing. 0 reads all."""
+    """Number of frames to read from the start of a listing. 0 reads all frames."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """RGB in [0, 1] behind transparent pixels."""
+    """RGB colour in [0, 1] behind transparent pixels."""
     depth_unit: float = Field(default=1e-3, gt=0)
-    """World units per number in a depth map. The default reads millimetres, as of nerfstudio."""
+    """Depth in world units that the value 1 in a depth map means. The default is for millimetres,
+    as nerfstudio writes them."""
 
     @field_validator("format")
     @classmethod
@@ -80,9 +82,10 @@ class PhotosConfig(SceneSource.Config):
 
 
 class PhotoScene(Scene):
-    """Scene of a listing's photos, in the listing's world and order.
+    """Scene of listed photos, in the coordinates and the order of the listing.
 
-    cache: decoded images, shared by scenes. Raises the errors of `present_frames`.
+    cache: cache for decoded images, which several scenes share. Raises the errors of
+    `present_frames`.
     """
 
     def __init__(
@@ -107,9 +110,10 @@ class PhotoScene(Scene):
 
     @cached_property
     def cameras(self) -> Cameras:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """See `Scene`; float64. Raises ValueError if a photo and its listed size disagree.
+        """Cameras of all frames, float64, after crop and resize; see `Scene`.
 
-        Only one header is read for all photos of a folder with the same listed size.
+        One photo is opened for all photos of a folder with the same listed size. Raises ValueError
+        if its size is not a scaled copy of the listed size.
         """
         sizes: dict[object, Size] = {}
         intrinsics: list[Tensor] = []
@@ -123,35 +127,35 @@ class PhotoScene(Scene):
         return Cameras(c2w, torch.stack(intrinsics), self.config.image_size)
 
     def images(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`. Raises ValueError for a file that cannot be decoded."""
+        """Read photos, see `Scene`. Raises ValueError for a file that cannot be decoded."""
         return to_tensor(self._stacked(self._image, frames))
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`; photos without a mask get 1 everywhere if other photos have masks."""
+        """Read masks, see `Scene`. If only some photos have masks, masks of other photos are 1."""
         if all(frame.mask is None for frame in self.photos):
             return None
         masks = self._stacked(self._mask, frames)
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`; 0 in frames without a depth map, and None if none of `frames` has one."""
+        """Read depth maps, see `Scene`. A frame without one gets 0; None if all lack one."""
         if all(self.photos[i].depth is None for i in frames):
             return None
         return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
 
     def frame_name(self, frame: int) -> str:
-        """See `Scene`: the image file, relative to the scene's folder."""
+        """Return the path of the image file relative to the scene's folder."""
         return self.photos[frame].name
 
     def stored_size(self, frame: int) -> Size:
-        """See `Scene`."""
+        """Return (H, W) of the image file in pixels, turned upright."""
         photo = self.photos[frame]
         return _checked(read_image(photo.path, image_size), photo, photo.path)
 
     def _stacked(
         self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
     ) -> np.ndarray:
-        """Return the results of `read` for the frames, (F, H, W, ...), from the cache if there."""
+        """Return cached results of `read` for each frame, stacked to (F, H, W, ...)."""
 
         def cached(frame: int) -> np.ndarray:
             key = (self.name, read.__name__, frame)
@@ -184,7 +188,7 @@ class PhotoScene(Scene):
     def _delivered(
         self, image: Image.Image, frame: PhotoFrame, file: UPath, nearest: bool = False
     ) -> np.ndarray:
-        """Return the content of `file`, upright and undistorted, at `image_size`."""
+        """Return an image decoded from `file`: upright, undistorted, cropped and resized."""
         # A mask or depth map follows the photo.
         if file != frame.path and frame.size is None:
             frame = replace(frame, size=read_image(frame.path, image_size))
@@ -198,7 +202,7 @@ class PhotoScene(Scene):
         return self._crop(frame, size).image(image, kernel)
 
     def _crop(self, frame: PhotoFrame, size: Size) -> CropResize:
-        """Return the crop of a photo of `size`, without the parts that the lens did not see."""
+        """Return the crop without black edges of an undistorted photo of `size` (H, W)."""
         target = self.config.image_size
         lens = frame.lens
         zoom = 1.0 if lens is None else lens.whole_zoom(frame.at_size(size), size, target)
@@ -206,14 +210,14 @@ class PhotoScene(Scene):
 
 
 def whole_mask(frame: PhotoFrame) -> Image.Image:
-    """Return the mask of a photo that has one, as stored; raises ValueError if unreadable."""
+    """Read the mask of a photo that has a mask, in stored size; raise ValueError if unreadable."""
     assert frame.mask is not None
     decode = decode_alpha if frame.mask == frame.path else decode_mask
     return Image.fromarray(read_image(frame.mask, decode))
 
 
 def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
-    """Return upright (H, W) of a frame's `file`; ValueError if the listing has another size."""
+    """Return upright (H, W) of a file of `size`; raise ValueError if the listed size differs."""
     size = turned_size(size, frame)
     for problem in size_problems(size, frame.size):
         raise ValueError(f"{file}: {problem}")
@@ -221,11 +225,11 @@ def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
 
 
 class PhotosSource(LazySource):
-    """Source of photos of one or many scenes; both splits have the same scenes.
+    """Data source of photos of one scene or many scenes.
 
-    Held-out frames separate the splits. If the folder has scenes in `train` and in `test`, these
-    are the splits instead. A single scene is opened immediately; many scenes are opened on demand.
-    Raises the errors of `present_frames`.
+    Training and test split have the same scenes; held-out frames separate them. But if the folder
+    has scenes in the folders `train` and `test`, these are the splits. A single scene is opened
+    immediately; many scenes are opened on demand. Raises the errors of `present_frames`.
     """
 
     name = "photos"
@@ -258,15 +262,15 @@ class PhotosSource(LazySource):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Return whether the folder lists cameras.
+        """Return whether the folder `path` lists cameras.
 
-        Other folders, such as a folder of scenes, open as photos if no other source reads them.
+        A folder that no source recognises, such as a folder of scenes, is opened by `qgs/photos`.
         """
         return bool(formats_of(path))
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
-        """See `SceneSource`: also True for a scene in a folder of scenes, or in its `train`."""
+        """Return whether `path` is `root`, or a scene in `root` or in its folder `train`."""
         inside = path in (root / path.name, root / "train" / path.name)
         return path == root or (inside and bool(formats_of(path)))
 
@@ -274,13 +278,13 @@ class PhotosSource(LazySource):
     def config_for(
         cls, path: str, image_size: tuple[int, int], trained: SceneSourceConfig | None
     ) -> SceneSourceConfig:
-        """See `SceneSource`; no frame is held out."""
+        """Return options for data outside of training, see `SceneSource`; no frame is held out."""
         config = super().config_for(path, image_size, trained)
         return config.model_copy(update={"holdout": 0})
 
 
 def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
-    """Return the folders in `root` with a scene in the wanted format, by name."""
+    """Return the folders in `root` that hold a scene in `config.format`, by name."""
     wanted: dict[str, UPath] = {}
     others: list[str] = []
     for folder in sorted(filter(UPath.is_dir, listing(root)), key=lambda item: item.name):
@@ -298,16 +302,16 @@ def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
 
 
 def folder_name(folder: UPath) -> str:
-    """Return the name of the scene in `folder`."""
+    """Return the name of the scene in `folder`: the name of the folder."""
     return folder.resolve().name or "photos"
 
 
 def upright(frame: PhotoFrame) -> PhotoFrame:
-    """Return `frame` turned upright by EXIF, with its camera and lens.
+    """Return `frame` with camera and lens turned upright as the photo's EXIF orientation says.
 
-    If the listed size is the upright one, the listed camera is upright too. If the size cannot
-    tell, as for squares and half turns, the camera belongs to the stored pixels. Frames of an
-    object store stay as they are.
+    If the listed size is that of the upright photo, the listed camera is upright already. If both
+    sizes are equal, as for squares and half turns, the listed camera belongs to the stored pixels
+    and is turned. Frames in an object store are not turned.
     """
     # In an object store, each header would be a request.
     if not is_local(frame.path) or not frame.path.is_file():
@@ -327,12 +331,12 @@ def upright(frame: PhotoFrame) -> PhotoFrame:
 
 
 def turned_size(size: Size, frame: PhotoFrame) -> Size:
-    """Return upright (H, W) of a file of `frame` with stored `size`: photo, mask or depth map."""
+    """Return the upright (H, W) of a photo, mask or depth map of `frame` with the stored `size`."""
     return _swapped(size) if _quarters(size, frame) % 2 else size
 
 
 def turned(image: Image.Image, frame: PhotoFrame) -> Image.Image:
-    """Return a photo, mask or depth map turned upright; one that is upright stays as it is."""
+    """Turn a photo, mask or depth map of `frame` upright unless its pixels are upright already."""
     quarters = _quarters((image.height, image.width), frame)
     # Pixels are moved, not interpolated; the angle is counterclockwise.
     return image.rotate(-90 * quarters, expand=True) if quarters else image
@@ -343,14 +347,17 @@ def _swapped(size: Size) -> Size:
 
 
 def _quarters(size: Size, frame: PhotoFrame) -> int:
-    """Return the turns of a file of `size` (H, W); 0 if the listed size shows it is upright."""
+    """Return clockwise quarter turns of a file of `size` (H, W); 0 if its size is upright."""
     fits, fits_turned = (not any(size_problems(own, frame.size)) for own in (size, _swapped(size)))
     return 0 if frame.turns % 2 and fits and not fits_turned else frame.turns
 
 
 @lru_cache(maxsize=2**16)
 def _header(path: str, changed: int) -> tuple[Size, int]:
-    """Return the stored (H, W) and the quarter turns; (1, 1) and 0 if it is not an image."""
+    """Return stored (H, W) and quarter turns of an image file; (1, 1) and 0 for other files.
+
+    changed: time of the last change, part of the key of the cache.
+    """
     try:
         with open(path, "rb") as file, opened_image(file) as image:
             return (image.height, image.width), _TURNS.get(orientation(image), 0)
@@ -359,7 +366,7 @@ def _header(path: str, changed: int) -> tuple[Size, int]:
 
 
 def _quarter(frame: PhotoFrame) -> PhotoFrame:
-    """Turn camera, size and lens of `frame` by a quarter, clockwise."""
+    """Turn camera, size and lens of `frame` clockwise by 90 degrees."""
     assert frame.size is not None
     height, width = frame.size
     fx, fy, cx, cy = frame.intrinsics

@@ -52,7 +52,7 @@ def test_faults_of_files(planted, shots):
 
 def test_faults_of_cameras(planted):
     planted(f"error: {ALL}the poses do not fit the photos: *check the convention*").poses *= OPENGL
-    planted("error: frame 1 (images/1.jpg): the pose mirrors*").poses[1, :, 0] *= -1
+    planted("error: frame 1 (images/1.jpg): the pose is mirrored*").poses[1, :, 0] *= -1
     planted("error: frame 4 (images/4.jpg): the pose has NaN*").poses[4] = np.nan
     off = planted("error: frame 1 (images/1.jpg): the intrinsics *are implausible*")
     off.frames[1]["cx"] = 200.0
@@ -126,7 +126,7 @@ def test_faults_of_masks(planted, shots):
 def test_a_camera_that_stands_still_may_film_what_moves(planted):
     """Two frames have one pose; times tell them apart, but are wrong in the last room."""
     repeats = "error: frame 5 (images/5.jpg): the pose repeats *"
-    wrong = ["error: *gives no 'time' for images/4.jpg, images/5.jpg, and one for other frames*"]
+    wrong = ["error: *gives 'time' only for some frames, not for images/4.jpg, images/5.jpg:*"]
     cases = (([], [repeats]), ([0.5] * 6, [repeats]), (range(6), []), ([0, 1, "2", 3], wrong))
     for times, lines in cases:
         room = planted(*lines)

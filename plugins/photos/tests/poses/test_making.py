@@ -145,7 +145,7 @@ def test_poses_are_made_once_and_kept_beside_the_photos(folder, calls):
 
 
 def test_a_training_makes_none(folder, calls):
-    must_refuse("Make some by `qgs poses`", opened, folder, kind=FileNotFoundError)
+    must_refuse("Run `qgs poses`", opened, folder, kind=FileNotFoundError)
     assert not calls
 
 
