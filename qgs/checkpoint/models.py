@@ -141,7 +141,7 @@ def _copy(stream: Any, local: IO[bytes], folder: Path) -> None:
         local.write(part)
         left -= len(part)
     if announced > limit or left <= 0:
-        raise OSError(f"it is larger than {decimal(limit)}")
+        raise OSError(f"the file is larger than {decimal(limit)}")
 
 
 def _opened(url: str) -> Any:

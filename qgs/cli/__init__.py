@@ -49,13 +49,13 @@ def offered_command(name: str, offers: list[EntryPoint]) -> Any:
     try:
         (entry,) = offers
         offered = entry.load()
-        assert isinstance(offered, typer.Typer), f"it is a {type(offered)}, not a typer.Typer"
+        assert isinstance(offered, typer.Typer), f"its entry is {type(offered)}, not a typer.Typer"
     # Importing runs the distribution's code.
     except (Exception, SystemExit) as error:
         releases = [f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist]
         reason = (
             f"the command `qgs {name}` of {listed(sorted(releases))} cannot be used: "
-            f"{type(error).__name__}: {error}; update it, or keep only one of several"
+            f"{type(error).__name__}: {error}; update it, and keep only one if several are named"
         )
 
         def refuse() -> None:

@@ -42,8 +42,7 @@ def evaluate(
 ) -> None:
     """Score a checkpoint on views that it has not seen.
 
-    Two baselines without a model are scored too: the nearest input view and the mean
-    colour of the inputs.
+    Two baselines are scored as well: the nearest input view and the mean input colour.
     """
     console = Console()
     settings = list(overrides or ())

@@ -32,12 +32,7 @@ def reconstruct(
     photos: Annotated[
         str, typer.Argument(help="Folder or URL of photos or of a data set, or a video file.")
     ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Folder for all results, or .ply or .splat file for the Gaussians alone."
-        ),
-    ],
+    out: Annotated[Path, typer.Option(help="Folder for the results, or .ply or .splat file.")],
     inputs: Inputs = None,
     frames: Frames = None,
     holdout: Annotated[
@@ -51,9 +46,7 @@ def reconstruct(
     overrides: ViewsSettings = None,
     overwrite: Annotated[
         bool,
-        typer.Option(
-            "--overwrite", help="Write into a folder that is not empty, or over an existing file."
-        ),
+        typer.Option("--overwrite", help="Write into a non-empty folder, or over a file."),
     ] = False,
     size: Size = None,
     scene_name: SceneName = None,

@@ -35,13 +35,10 @@ def evaluate(
 ) -> Evaluation:
     """Score `model` with the metrics of `recipe` on the recipe's test views.
 
-    Computes on the device of the model, and restores its training or evaluation mode. A scene that
-    fails gets no score; the result names it with the reason.
-
+    The device and the mode of the model stay. A scene that fails gets a reason in place of a score.
     step: optimiser steps after which the weights were saved. observe: called after each scene with
-    the number of finished scenes and of all scenes. views_of: see `EvaluationPlan`. sampler: view
-    sampler, by default the recipe's. show: called with each sample and the rendering of its
-    targets.
+    the numbers of finished and of all scenes. views_of: see `EvaluationPlan`. sampler: view
+    sampler, by default the recipe's. show: called with each sample and its rendered targets.
 
     Raises the errors of the data source, of `read_index` and of `Measures`, and ValueError if no
     scene could be scored.

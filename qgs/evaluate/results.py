@@ -196,7 +196,7 @@ class Evaluation:
         yield from (f"missing {scene}: {why}" for scene, why in [*self.missing.items()][:10])
         if given := [score.scene for score in self.scores if score.given]:
             yield (
-                f"{counted(len(given), 'scene')} with frames as context and as target, on "
+                f"{counted(len(given), 'scene')} with frames as input and as target, for "
                 f"which the nearest input view is perfect: {listed(given)}"
             )
         for name, why in self.incomplete.items():

@@ -147,7 +147,7 @@ def load_plugin(name: str) -> InstalledPlugin:
     if len(entries) > 1:
         releases = ", ".join(sorted(map(_release, entries)))
         reason = f"several distributions offer a plugin `{name}`: {releases}"
-        raise PluginError(reason, "uninstall all but one of them")
+        raise PluginError(reason, "uninstall all but one of these")
     entry = entries[0]
     release = _release(entry)
     assert entry.dist is not None

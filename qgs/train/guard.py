@@ -185,7 +185,7 @@ class Guard:
             raise OutOfMemoryError(
                 f"out of memory in step {step + 1}: {str(error).splitlines()[0][:300]}. "
                 "Continue the saved run with --resume and a higher training.accumulate, more "
-                "processes, or fewer training.render_views. A new run also needs less memory with "
+                "processes, or a lower training.render_views. A new run needs less memory with "
                 "lower views.inputs, views.targets, training.batch_size, data.image_size, "
                 "model.queries.count or model.head.gaussians_per_query."
             ) from error

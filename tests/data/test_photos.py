@@ -52,7 +52,7 @@ frame 1 .*k6 | {"frame": {"k6": 0.001}}
 frame 1 .*4 x 4 | {"frame": {"transform_matrix": [1, 2]}}
 frame 1 \(images/1.png\).*NaN | {"frame": {"transform_matrix": [[NaN, 0, 0, 0], REST]}}
 frame 1 .*not rigid | {"frame": {"transform_matrix": [[2, 0, 0, 0], REST]}}
-frame 1 .*mirrors | {"frame": {"transform_matrix": [[-1, 0, 0, 0], REST]}}
+frame 1 .*mirrored | {"frame": {"transform_matrix": [[-1, 0, 0, 0], REST]}}
 focal | {"fl_x": null}
 frame 0 .*pixels | {"fl_x": 1.2, "fl_y": 1.3, "cx": 0.5, "cy": 0.5}
 EQUIRECTANGULAR | {"camera_model": "EQUIRECTANGULAR"}
