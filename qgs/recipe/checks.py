@@ -126,14 +126,14 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
         known: dict[str, Any] = draft.registry.components("encoder")
         others = " or ".join(f"`{name}`" for name in sorted(known) if known[name].tunable)
         reason = f"`{encoder.type}` at model.encoder has no latents to tune"
-        fix = f"write `queries`, or use {others} in the slot `encoder`"
+        fix = f"set evaluation.tuning to `queries`, or use {others} in the slot `encoder`"
         yield ("evaluation", "tuning"), reason, fix
     if settings.training.judge_inputs:
         path = ("training", "judge_inputs")
         fix = "set training.judge_inputs to false; evaluations do not read it"
         # A loss would compare renderings from moved cameras with photos from true ones.
         if settings.views.pose_noise:
-            reason = "input views must have exact cameras, but views.pose_noise moves them"
+            reason = "judge_inputs needs exact input cameras, but views.pose_noise moves them"
             yield path, reason, fix
         objective: Any = parts["objective",]
         if not objective.component.judges_inputs:

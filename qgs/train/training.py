@@ -168,7 +168,7 @@ class Trainer:
         # Users who set only the steps often inherit a time budget without noticing.
         if self.config.seconds:
             self.notes.append(
-                f"stops after {self.config.seconds:g} s (training.seconds) or "
+                f"training stops after {self.config.seconds:g} s (training.seconds) or "
                 f"{self.config.steps:,} steps (training.steps), whichever comes first"
             )
         self.training_pass = TrainingPass(recipe, self.model).to(self.accelerator.device)

@@ -58,8 +58,8 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
     listings = ", ".join(f"{reader.listing} ({name})" for name, reader in known.items())
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"photo folder {folder} (from {UPath.cwd()}) is not a folder: give the folder that "
-            f"contains one of these: {listings}"
+            f"photo folder {folder} (from {UPath.cwd()}) does not exist or is not a folder: give "
+            f"a folder with one of these: {listings}"
         )
     held = formats_of(folder)
     if held and format not in ("auto", *held):
