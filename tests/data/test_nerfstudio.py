@@ -63,7 +63,7 @@ def test_depth_that_is_not_finite_is_unknown(folder):
     change(folder, 0, depth_file_path="depth.npy")
     assert read(folder).depths([0])[0, 0, [3, 5, 7], [4, 6, 8]].tolist() == [0, 0, 2]
     np.save(folder / "depth.npy", np.zeros((30, 40, 3)))
-    must_refuse("per pixel", read(folder).depths, [0])
+    must_refuse("one channel", read(folder).depths, [0])
 
 
 NAMES = [f"images/view_{i:03d}.png" for i in range(6)]
