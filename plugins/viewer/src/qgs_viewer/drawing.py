@@ -121,7 +121,7 @@ class Drawing:
     """Draw a scene with viser. Drawing a part again replaces it.
 
     photo_depth: distance from a camera to its photo. anchor_radius: radius of the dots of anchors.
-    Both are in units of the shown world.
+    Both are in units of the viewer's world.
     """
 
     def __init__(self, api: viser.SceneApi) -> None:
@@ -286,7 +286,7 @@ def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
 
 
 def distance_to(scene: QueryScene) -> float:
-    """Return the median depth of opaque Gaussians in the input cameras, in shown world units.
+    """Return the median depth of opaque Gaussians in input cameras, in units of the viewer's world.
 
     Without cameras, return the median distance of the Gaussians from their median position.
     """

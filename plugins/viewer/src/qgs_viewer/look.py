@@ -29,7 +29,7 @@ EXACT = 128
 
 
 def hex_color(color: Color) -> str:
-    """Return #rrggbb."""
+    """Return an RGB colour as text for HTML: #rrggbb."""
     return "#{:02x}{:02x}{:02x}".format(*color)
 
 

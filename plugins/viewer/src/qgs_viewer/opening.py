@@ -86,7 +86,7 @@ class ModelSource(Source):
         self.world = own_world(scene, tuple(frames), views)
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
-        """Reconstruct from the photos `frames`, and place the result in the shown world.
+        """Reconstruct from the photos `frames`, and place the result in the viewer's world.
 
         Raises ValueError without frames, and for frames that are missing, repeated or too many.
         """

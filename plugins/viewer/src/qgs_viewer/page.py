@@ -101,7 +101,7 @@ def stand(server: viser.ViserServer, scene: QueryScene) -> None:
 
 
 def up_of(scene: QueryScene) -> torch.Tensor:
-    """Return the mean up direction of the input cameras, a unit vector (3,) in the shown world.
+    """Return the mean up direction of the input cameras, a unit vector (3,) in the viewer's world.
 
     Without cameras it is -y.
     """
@@ -112,7 +112,7 @@ def up_of(scene: QueryScene) -> torch.Tensor:
 
 
 def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first viewpoint and the point that it looks at, both (3,) in the shown world.
+    """Return the first viewpoint and the point that it looks at, both (3,) in the viewer's world.
 
     The viewpoint lies a little behind the input camera nearest to the mean of all. If the cameras
     are far apart and do not look at one point, it lies before that camera, since a wall may be

@@ -1,4 +1,4 @@
-"""Place Gaussians, cameras and photos in the shown world, and pick a Gaussian by a ray."""
+"""Place Gaussians, cameras and photos in the viewer's world, and pick a Gaussian by a ray."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ class Placement:
 
     @staticmethod
     def identity() -> "Placement":
-        """Return the map that changes nothing."""
+        """Return the identity, which maps every point to itself."""
         return Placement(torch.eye(3).double(), torch.zeros(3).double(), 1.0)
 
     @staticmethod
@@ -76,7 +76,7 @@ class Splats:
 
 @full_precision
 def splats(gaussians: Gaussians, placement: Placement) -> Splats:
-    """Place the Gaussians (1, G) of one scene in the shown world.
+    """Place the Gaussians (1, G) of one scene in the viewer's world.
 
     Colours do not depend on the direction: a warning says so if the Gaussians have `sh`.
     """

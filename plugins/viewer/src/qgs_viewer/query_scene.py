@@ -35,8 +35,8 @@ class Inside:
 class Reading:
     """The k patches that a query attends to most.
 
-    points: their centres (k, 3) in the shown world. shares: the query's attention to each, (k,).
-    side: width of a patch in the shown world.
+    points: their centres (k, 3) in the viewer's world. shares: the query's attention to each, (k,).
+    side: width of a patch in the viewer's world.
     """
 
     points: Tensor
@@ -49,7 +49,7 @@ class QueryScene:
     """A reconstruction: Gaussians (1, G), the input views (1, V), and the model's queries.
 
     frames: indices of the input views in their scene. placement: map from the world of the
-    Gaussians and views into the shown world. inside: the model and its states; None if only the
+    Gaussians and views into the viewer's world. inside: the model and its states; None if only the
     Gaussians are known, and then there are no queries. background: RGB in [0, 1] behind the
     Gaussians.
     """
@@ -73,7 +73,7 @@ class QueryScene:
         return self.inside.model.depth if self.inside else 0
 
     def refuse_missing(self, query: int | None) -> None:
-        """Raise ValueError for a query that the scene does not have."""
+        """Raise ValueError if the scene has no query with this index; None passes."""
         if query is not None and query >= self.queries:
             last = self.queries - 1
             there = f"queries are 0 to {last}" if self.queries else "this source has no queries"
@@ -81,15 +81,15 @@ class QueryScene:
 
     @cached_property
     def splats(self) -> Splats:
-        """All Gaussians in the shown world."""
+        """All Gaussians in the viewer's world."""
         return splats(self.gaussians, self.placement)
 
     def query_of(self, gaussian: int) -> int:
-        """Return the query that a Gaussian belongs to."""
+        """Return the index of the query that made the Gaussian with this index."""
         return gaussian * self.queries // self.gaussians.count
 
     def members(self, query: int) -> slice:
-        """Return the Gaussians of a query."""
+        """Return the indices of the Gaussians that a query made."""
         each = self.gaussians.count // self.queries
         return slice(query * each, (query + 1) * each)
 
@@ -99,7 +99,7 @@ class QueryScene:
         return self.support(0) is not None
 
     def support(self, layer: int) -> SpatialSupport | None:
-        """Return the supports (1, N) of all queries in the shown world, float64.
+        """Return the supports (1, N) of all queries in the viewer's world, float64.
 
         layer: decoder layer after which they are taken; 0 is before the first. None if the queries
         have no anchors.
@@ -136,7 +136,7 @@ class QueryScene:
         return self.inside.memory.grid
 
     def hub(self, query: int, layer: int) -> Tensor:
-        """Return the point (3,) at which lines from a query start, in the shown world.
+        """Return the point (3,) at which lines from a query start, in the viewer's world.
 
         It is the anchor after `layer`, or the mean of the query's Gaussians if it has no anchor.
         """
@@ -148,7 +148,7 @@ class QueryScene:
     def strongest(self, query: int, layer: int, count: int, depth: float) -> Reading | None:
         """Return the `count` patches that a query attends to most, averaged over heads.
 
-        depth: distance from a camera to its photo in the shown world. None if `attention` is None.
+        depth: distance from a camera to its photo in the viewer's world. None as for `attention`.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:
@@ -173,7 +173,7 @@ def explained(
 ) -> QueryScene:
     """Reconstruct views (1, V) by `model`, and keep the states of its queries after each layer.
 
-    frames: indices of the views in their scene. placement: map into the shown world; by default
+    frames: indices of the views in their scene. placement: map into the viewer's world; by default
     none.
     """
     memory = model.encoder(views)

@@ -36,7 +36,7 @@ class ModelScenes:
 
     @property
     def target_camera(self) -> Cameras:
-        """The camera (1, 1) of the first target of the first scene."""
+        """The camera (1, 1) of the first target view of the first sample."""
         return self.samples[0].targets.cameras[:, :1]
 
     def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
@@ -87,7 +87,7 @@ def model_scenes(
 
 
 def _samples(plan: EvaluationPlan) -> list[Sample]:
-    """Return the samples of all scenes. Raises ValueError for the first scene that fails."""
+    """Return the samples of all scenes. Raises ValueError if a scene cannot be read."""
     samples: list[Sample] = []
     for scene in plan.wanted:
         try:

@@ -1,4 +1,4 @@
-"""`qgs data check` and `qgs data pack`."""
+"""The commands `qgs data check` and `qgs data pack`."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class Finding:
 
 
 def errors_of(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the errors among `findings`."""
+    """Return the findings that are errors, without warnings."""
     return [finding for finding in findings if finding.severity == "error"]
 
 
