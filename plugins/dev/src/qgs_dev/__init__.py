@@ -1,4 +1,4 @@
-"""The contract suite: checks that every component of a slot must pass.
+"""Contract suite for components: checks that every component of a slot must pass.
 
     import pytest
     from qgs_dev import runs_of
@@ -7,7 +7,7 @@
     def test_contract(run):
         run.check()
 
-`qgs check-plugin sightline` makes the same checks and prints a report.
+`qgs check-plugin sightline` runs the same checks and prints a report.
 """
 
 from importlib import import_module
@@ -42,7 +42,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names on first use, so that `--help` needs neither torch nor pydantic."""
+    """Import a public name on first use, so that `--help` imports neither torch nor pydantic."""
     if name not in __all__:
         raise AttributeError(f"module 'qgs_dev' has no attribute {name!r}")
     # `running` also imports the public names of the other modules.

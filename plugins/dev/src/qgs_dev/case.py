@@ -1,4 +1,4 @@
-"""Cases of the contract suite, a component with options and sizes, and the errors of checks."""
+"""Cases of the contract suite (a component with options and sizes), and errors of checks."""
 
 import re
 from collections.abc import Mapping
@@ -50,21 +50,22 @@ NOISE = 0.1
 
 
 class ContractError(AssertionError):
-    """Error for a component that breaks its contract; the message says what it did instead."""
+    """Error for a component that breaks its contract. The message says what the component did."""
 
 
 class CannotCheck(Exception):  # noqa: N818 (not an error: the reason of a skip)
-    """Signal that a check cannot run here; the message is the reason."""
+    """Error for a check that cannot run on this component or machine. The message is the reason."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A component to check: `Case(MyAttention.Config(bandwidth="fixed"))`.
+    """Component to check, with options and sizes: `Case(MyAttention.Config(bandwidth="fixed"))`.
 
-    config: options of the component. The class in which `Config` is nested is the one checked.
-    dims: sizes to build it with. image_size: (H, W) of the views; None tries a few small ones.
-    state_dict: expected name -> shape of every entry, so that saved weights stay loadable; None
-        expects nothing.
+    config: options of the component; the class in which this `Config` is nested is checked.
+    dims: model sizes with which the component is built.
+    image_size: (H, W) of the views in pixels; None takes the first valid of a few small sizes.
+    state_dict: expected shapes of all saved weights, by name, so that published weights stay
+        loadable; None expects nothing.
     Raises TypeError unless `config` holds the options of a complete component.
     """
 
@@ -80,7 +81,7 @@ class Case:
 
     @property
     def component(self) -> type[contracts.Component]:
-        """Class under test."""
+        """Class of the component."""
         component = self.config.__component__
         assert component is not None
         return component
@@ -92,23 +93,23 @@ class Case:
 
     @property
     def reads(self) -> Fields:
-        """Fields that the component requires."""
+        """Specifications of the fields that the component requires, by name."""
         return self.component.fields_read(self.config)
 
     @property
     def writes(self) -> Fields:
-        """Fields that the component provides."""
+        """Specifications of the fields that the component provides, by name."""
         return self.component.fields_written(self.config)
 
     @property
     def has_parameters(self) -> bool:
-        """True for a component that is built with the sizes of the model."""
+        """True if the component is built with the sizes of the model, so it may have parameters."""
         return issubclass(self.component, contracts.ModelComponent)
 
     # Reports name every check of the case by it.
     @cached_property
     def label(self) -> str:
-        """Slot and name, and the options that differ from their defaults, in YAML."""
+        """Slot and name of the component, and the options that are not default, as YAML."""
         given = dict(self.config)
         changed = {
             name: given[name]
@@ -121,14 +122,17 @@ class Case:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(H, W) of the views."""
+        """Size (H, W) of the views in pixels."""
         if self.image_size is not None:
             return self.image_size
         return next((size for size in IMAGE_SIZES if not self.problems(size)), IMAGE_SIZES[0])
 
     @property
     def device(self) -> str:
-        """CPU if the component supports it, otherwise its GPU; CannotCheck if there is none."""
+        """Device for the checks: "cpu" if the component supports it, otherwise "cuda".
+
+        Raises CannotCheck if this machine has no device that the component supports.
+        """
         devices = getattr(self.component, "devices", ("cpu",))
         if "cpu" in devices:
             return "cpu"
@@ -137,12 +141,15 @@ class Case:
         raise CannotCheck(f"runs only on {' or '.join(devices)}, which this machine does not have")
 
     def problems(self, size: tuple[int, int] | None = None) -> list[contracts.Problem]:
-        """Return the problems that the component finds in its options, for images of `size`."""
+        """Return the problems that the component reports for its options and images of `size`."""
         context = contracts.RecipeContext(self.dims, size)
         return list(self.component.problems(self.config, context))
 
     def build(self, seed: int = 0) -> Any:
-        """Return a new instance with parameters drawn from `seed`; CannotCheck without its data."""
+        """Return a new instance, with random initial parameters from `seed`.
+
+        Raises CannotCheck if the data set of a data source is missing.
+        """
         try:
             with seeded(seed):
                 built = self.construct()
@@ -154,7 +161,7 @@ class Case:
         return built.to(self.device) if isinstance(built, nn.Module) else built
 
     def construct(self) -> Any:
-        """Return a new instance with parameters drawn from the global random state."""
+        """Return a new instance, with initial parameters from torch's global random generator."""
         # There are three kinds of constructors: of a layer, of a component that takes the sizes of
         # the model, and of one that takes only options.
         make: Any = self.component
@@ -170,7 +177,7 @@ class Case:
         return built
 
     def lively(self, seed: int = 0) -> Any:
-        """Return an instance in evaluation mode, with noise added to all parameters."""
+        """Return a new instance in evaluation mode, with random noise added to all parameters."""
         module = self.build(seed).eval()
         generator = torch.Generator().manual_seed(seed + 1)
         with torch.no_grad():
@@ -179,18 +186,18 @@ class Case:
         return module
 
     def with_at_most(self, **sizes: int) -> "Case":
-        """Return a case with options lowered to at most `sizes`, or itself if that is invalid."""
+        """Return a case whose options are at most `sizes`; unchanged if they would be invalid."""
         given = dict(self.config)
         lower = {name: size for name, size in sizes.items() if (given.get(name) or 0) > size}
         smaller = self.with_config(self.config.model_copy(update=lower))
         return self if smaller.problems(smaller.size) else smaller
 
     def with_config(self, config: ComponentConfig) -> "Case":
-        """Return this case with other options."""
+        """Return a copy of this case with the options `config`."""
         return replace(self, config=config)
 
     def with_dims(self, **sizes: int) -> "Case":
-        """Return this case in a model of other sizes."""
+        """Return a copy of this case with the given model sizes."""
         return replace(self, dims=replace(self.dims, **sizes))
 
 
@@ -199,7 +206,7 @@ DEVICES = ("cpu", "cuda", "mps")
 
 
 def component_fault(component: type[Component]) -> str:
-    """Explain why recipes cannot use `component`; "" if they can. Phrases begin with a verb."""
+    """Return why recipes cannot use `component`, as a phrase with a verb; "" if they can."""
     name = getattr(component, "name", None)
     if not isinstance(name, str):
         return "has no `name`"
@@ -229,7 +236,7 @@ def component_fault(component: type[Component]) -> str:
 
 
 def _may_be_number(annotation: Any) -> bool:
-    """Return True if an option of this type can hold an int or a float."""
+    """Return True if an option of type `annotation` can hold an int or a float."""
     # `float | None` and numbers with limits count; a list of numbers does not.
     parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
     return annotation in (int, float) or any(map(_may_be_number, parts))

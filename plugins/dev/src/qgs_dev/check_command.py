@@ -1,4 +1,4 @@
-"""`qgs check-plugin`: the contract suite on every component of an installed plugin."""
+"""Command `qgs check-plugin`, which runs the contract suite on an installed plugin."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def check_plugin(
     name: Annotated[str, typer.Argument(help="Name of the plugin, as in `plugins: [NAME]`.")],
-    core: Annotated[bool, typer.Option("--core", help="Leave out the slower checks.")] = False,
+    core: Annotated[bool, typer.Option("--core", help="Run the fast checks only.")] = False,
 ) -> None:
     """Test every component of a plugin against its contract.
 
-    Components are checked with their default options and with the plugin's `examples`. The exit
-    code is 1 if one breaks its contract, or cannot be built or called on this machine.
+    Each component is checked with its default options and with the plugin's `examples`. The exit
+    code is 1 if a component breaks its contract, or cannot be built or called on this machine.
     """
     import torch
 
@@ -45,7 +45,7 @@ def check_plugin(
         results += of_case
     unchecked = running.without_case(installed)
     for component in unchecked:
-        fix = "its default options are unusable; list a Config of it in `examples` of the Plugin"
+        fix = "its default options are invalid; list a valid Config in `examples` of the Plugin"
         typer.echo(f"not checked: {component.slot}/{component.name}: {fix}")
     typer.echo(_total(results))
     good = all(result.ok and not result.leaves_unchecked for result in results)
@@ -54,7 +54,7 @@ def check_plugin(
 
 
 def _models_load(installed: InstalledPlugin) -> bool:
-    """Print a line for each model of the plugin; return True if all can be loaded."""
+    """Load each trained model of the plugin and print the result; return True if all load."""
     from qgs.checkpoint.model_file import load
 
     good = True
@@ -69,7 +69,7 @@ def _models_load(installed: InstalledPlugin) -> bool:
 
 
 def _print_case(results: list[CheckResult]) -> None:
-    """Print a line for a case, and one for each failed, skipped or unexpected result."""
+    """Print one line for a case, then one line for each result that is not a pass."""
     verdict = "ok    "
     if any(result.leaves_unchecked for result in results):
         verdict = "not checked"

@@ -39,7 +39,10 @@ QUERY_INPUTS = ("state", "features", "offsets")
 
 
 class Sizes(NamedTuple):
-    """Sizes B, N, V, K and (H, W) of inputs; `image` None stands for the size of the case."""
+    """Sizes of inputs: B scenes, N queries, V views, K Gaussians per query, and images (H, W).
+
+    image: None takes the image size of the case.
+    """
 
     batch: int = 2
     queries: int = 6
@@ -52,36 +55,42 @@ USUAL = Sizes()
 
 
 def many(case: Case) -> Sizes:
-    """Return sizes with more queries, Gaussians and tokens than a window or chunk of 128 holds."""
+    """Return sizes with more than 128 queries, Gaussians and tokens.
+
+    Errors of components that work on chunks of up to 128 then show.
+    """
     image = (64, 96) if case.slot == "cross_attention" else None
     return Sizes(queries=200, views=3, gaussians=1, image=image)
 
 
 def inputs_of(case: Case, sizes: Sizes = USUAL, seed: int = 0) -> Inputs:
-    """Return arguments for the component of `case`, drawn from `seed`."""
+    """Return random arguments for the component of `case`, by name."""
     maker = Maker(case, sizes, seed)
     return {name: getattr(maker, name)() for name in FACTS[case.slot]["arguments"]}
 
 
 def required_fields(case: Case) -> Fields:
-    """Return the fields of the query state that the case requires."""
+    """Return the fields of the query state that the component requires."""
     elsewhere = ("memory.", "rendering.", "gaussians.")
     return {name: spec for name, spec in case.reads.items() if not name.startswith(elsewhere)}
 
 
 def required_places(case: Case) -> set[str]:
-    """Return the names of required state fields that hold points in the world frame."""
+    """Return the names of the required state fields that hold points in the world frame."""
     return {name for name, spec in required_fields(case).items() if is_place(spec)}
 
 
 def memory_width(case: Case) -> int:
-    """Return the width of memory features that the case requires, by default the model's."""
+    """Return the width of memory features that the component requires, or the model's width."""
     features = "memory.features"
     return sizes_of(case.reads.get(features, MEMORY_FIELDS[features]), case.dims)[0]
 
 
 class Maker:
-    """Generator of random inputs with the given sizes. axes: size of each letter of a shape."""
+    """Generator of random inputs of the given sizes.
+
+    axes: size of each dimension, by its letter in slots.toml.
+    """
 
     def __init__(self, case: Case, sizes: Sizes = USUAL, seed: int = 0) -> None:
         height, width = sizes.image or case.size
@@ -100,25 +109,25 @@ class Maker:
         }
 
     def shape(self, axes: str) -> list[int]:
-        """Return the sizes of axes such as "BN3": letters as in slots.toml, and single digits."""
+        """Return the shape for dimensions such as "BN3": letters of slots.toml, or digits."""
         return [self.axes[axis] if axis in self.axes else int(axis) for axis in axes]
 
     def normal(self, axes: str, *more: int) -> Tensor:
-        """Draw numbers from N(0, 1). more: further sizes after those of `axes`."""
+        """Return normal random numbers of shape `axes`, followed by the sizes `more`."""
         shape = [*self.shape(axes), *more]
         return torch.randn(shape, generator=self.generator).to(self.case.device)
 
     def uniform(self, low: float, high: float, axes: str) -> Tensor:
-        """Draw numbers between `low` and `high`."""
+        """Return uniform random numbers between `low` and `high`, of shape `axes`."""
         numbers = torch.rand(self.shape(axes), generator=self.generator)
         return (low + (high - low) * numbers).to(self.case.device)
 
     def in_front(self, points: Tensor) -> Tensor:
-        """Move normally distributed points (..., 3) in front of the cameras."""
+        """Scale and move normally distributed points (..., 3) to the front of the cameras."""
         return 0.4 * points + torch.tensor([0.0, 0.0, 1.5]).to(points)
 
     def field(self, spec: FieldSpec) -> Tensor:
-        """Draw a state field; points in the world frame are in front of the cameras."""
+        """Return a random state field. Points in the world frame are in front of the cameras."""
         values = self.normal("BN", *sizes_of(spec, self.case.dims))
         # One check alone is about points behind the cameras.
         if is_place(spec):
@@ -126,16 +135,16 @@ class Maker:
         return (values if spec.dtype.is_floating_point else values > 0).to(spec.dtype)
 
     def state(self) -> QueryState:
-        """Draw a state: features and the fields that the case requires."""
+        """Return a random query state: features, and the fields that the component requires."""
         required = required_fields(self.case)
         return QueryState(self.features(), {n: self.field(spec) for n, spec in required.items()})
 
     def features(self) -> Tensor:
-        """Draw features (B, N, D)."""
+        """Return random features (B, N, D)."""
         return self.normal("BND")
 
     def offsets(self) -> Tensor:
-        """Draw offsets (B, N, K, 3)."""
+        """Return random offsets (B, N, K, 3)."""
         return self.normal("BNK3")
 
     def cameras(self) -> Cameras:
@@ -156,7 +165,7 @@ class Maker:
         return Cameras(c2w, lens, (height, width)).to(self.case.device)
 
     def views(self) -> Views:
-        """Draw noise images, with times if the component embeds them."""
+        """Return random noise images with cameras, and with times if the component embeds times."""
         views = Views(self.uniform(0, 1, "BV3HW"), self.cameras())
         if not getattr(self.case.config, "time_channels", 0):
             return views
@@ -166,7 +175,7 @@ class Maker:
     photos = views
 
     def memory(self) -> ImageMemory:
-        """Draw an image memory with the camera rays of patches of PATCH pixels."""
+        """Return a random image memory with camera rays of patches of PATCH x PATCH pixels."""
         height, width = self.shape("HW")
         grid = (self.axes["V"], -(-height // PATCH), -(-width // PATCH))
         dims = self.case.dims
@@ -183,7 +192,7 @@ class Maker:
         )
 
     def gaussians(self) -> Gaussians:
-        """Draw Gaussians in front of the cameras; for a renderer, with `sh` and `features`."""
+        """Return random Gaussians before the cameras; with `sh` and `features` for renderers."""
         return Gaussians(
             means=self.in_front(self.normal("BG3")),
             scales=self.uniform(0.05, 0.3, "BG3"),
@@ -195,21 +204,24 @@ class Maker:
         )
 
     def gives(self, name: str) -> bool:
-        """Return True if Gaussians have the part `name`: for renderers, or where required."""
+        """Return True if Gaussians should have the part `name`, such as "sh".
+
+        This holds for renderers, and for components that require the part.
+        """
         return self.case.slot == "renderer" or f"gaussians.{name}" in self.case.reads
 
     def prediction(self) -> LayerPrediction:
-        """Draw Gaussians and a state that they could come from."""
+        """Return a random prediction of a layer: Gaussians and a query state."""
         return LayerPrediction(self.gaussians(), self.state())
 
     def rendering(self) -> Rendering:
-        """Draw noise images; of no views for a loss that needs none."""
+        """Return renderings of random noise, or of no views for a loss that needs no renderings."""
         rendering = self.all_views()
         unseen = getattr(self.case.component, "renderings", "") == "none"
         return map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering
 
     def all_views(self) -> Rendering:
-        """Draw noise images of all views."""
+        """Return renderings of random noise for all views."""
         return Rendering(
             rgb=self.uniform(0, 1, "BV3HW"),
             alpha=self.uniform(0, 1, "BV1HW"),
@@ -218,7 +230,7 @@ class Maker:
         )
 
     def target(self) -> Views:
-        """Draw noise images with masks, and with depth maps for a loss that reads them."""
+        """Return random noise images with masks; with depth maps for a loss that reads depths."""
         views = replace(self.views(), masks=self.uniform(0, 1, "BV1HW").round())
         if not getattr(self.case.component, "reads_depths", False):
             return views
@@ -229,9 +241,9 @@ class Maker:
 
 
 def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
-    """Return the trailing shape of a field in a model of `dims`.
+    """Return the shape of one query's or token's value of a field, in a model of `dims`.
 
-    "4*D" is four times the width. A size whose name `dims` does not have is 4.
+    A size "4*D" is four times the model's width. Unknown names of sizes stand for 4.
     """
     named = {"D": dims.width, "h": dims.heads, "D/h": dims.width // dims.heads}
     sizes = []

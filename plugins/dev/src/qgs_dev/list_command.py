@@ -1,4 +1,4 @@
-"""The commands `qgs list` and `qgs schema`, which show installed components and options."""
+"""Commands `qgs list` and `qgs schema`, which show installed components and their options."""
 
 import json
 from pathlib import Path
@@ -20,9 +20,9 @@ def list_components(
         ),
     ] = None,
 ) -> None:
-    """List installed components by slot and trained models; with NAME, explain all its options.
+    """List installed components by slot, and trained models. With NAME, explain its options.
 
-    This imports every installed plugin. For a NAME such as rooms/locus-64 it imports only `rooms`.
+    All installed plugins are imported; for a NAME such as rooms/locus-64, only the plugin `rooms`.
     """
     from qgs.recipe.registry import load_registry, load_usable_plugins
     from qgs_dev.tables import details, overview
@@ -33,13 +33,13 @@ def list_components(
     for part in details(name, registry) if name else overview(registry):
         Console().print(part, highlight=False)
     for message in broken:
-        Console(stderr=True).print(f"plugin left out: {message}", markup=False)
+        Console(stderr=True).print(f"a plugin is left out: {message}", markup=False)
 
 
 @schema_app.command()
 def schema(
     out: Annotated[
-        Path | None, typer.Option(help="File to write. Default: standard output.")
+        Path | None, typer.Option(help="File to write. Default: print to standard output.")
     ] = None,
 ) -> None:
     """Write the JSON Schema of recipes with all installed components; imports every plugin."""

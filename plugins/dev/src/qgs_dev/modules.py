@@ -1,4 +1,4 @@
-"""Seeds, modes and stored values of modules under check."""
+"""Random seeds, modes and stored values of modules in checks."""
 
 import inspect
 from collections import deque
@@ -17,29 +17,30 @@ TORCH_OWN = frozenset(vars(nn.Module()))
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Run with a fixed torch seed, and restore the global random state afterwards."""
+    """Set torch's random seed inside a `with` block, and restore the random state afterwards."""
     with torch.random.fork_rng(devices=()):
         torch.default_generator.manual_seed(seed)
         yield
 
 
 def each_mode(module: Any) -> Iterator[str]:
-    """Put `module` into each of the two modes in turn, and yield the mode's name."""
+    """Set `module` to evaluation, then to training mode; yield the name of each mode."""
     for mode in ("evaluation", "training"):
         module.train(mode == "training")
         yield mode
 
 
 def tensors_of(module: nn.Module) -> dict[str, Tensor]:
-    """Return parameters and buffers, including buffers that are not saved."""
+    """Return all parameters and buffers by name, including buffers that are not saved."""
     return dict(module.named_parameters()) | dict(module.named_buffers())
 
 
 def attributes(module: nn.Module) -> dict[str, Any]:
-    """Return comparable values of a module's attributes besides parameters, buffers, submodules.
+    """Return the values of a module's other attributes, as copies that can be compared.
 
-    Attributes of its submodules and of all their classes are included. Values of a
-    `cached_property` are not, since they depend on the module alone.
+    Other attributes are all but parameters, buffers and submodules. Attributes of submodules and of
+    their classes are included. Values of a `cached_property` are left out, because they are
+    computed from the module.
     """
     found = {}
     for name, part in module.named_modules():
@@ -59,12 +60,15 @@ def attributes(module: nn.Module) -> dict[str, Any]:
 
 
 def _is_code(value: Any) -> bool:
-    """Return True for a function, a class or a descriptor such as a property."""
+    """Return True for a function, a class, or a descriptor such as a property."""
     return inspect.isroutine(value) or inspect.isclass(value) or hasattr(value, "__get__")
 
 
 def _comparable(value: Any, inside: tuple[int, ...] = ()) -> Any:
-    """Return a copy of `value` to compare with a later one. inside: ids of its containers."""
+    """Return a copy of `value` that can be compared with a later copy.
+
+    inside: ids of the containers around `value`, to stop at cycles.
+    """
     # A module may hold an object that holds the module.
     if id(value) in inside:
         return None

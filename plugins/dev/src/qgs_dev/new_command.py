@@ -1,4 +1,4 @@
-"""The command `qgs new-plugin`, which writes a component, its test and a recipe to change."""
+"""Command `qgs new-plugin`, which writes a plugin template: component, test and recipe."""
 
 import keyword
 import re
@@ -18,10 +18,10 @@ app = typer.Typer(add_completion=False)
 def new_plugin(
     name: Annotated[str, typer.Argument(help="Name of the plugin, as in `type: NAME/component`.")],
     out: Annotated[
-        Path | None, typer.Option(help="Folder to create; it must not exist. Default: ./qgs-NAME.")
+        Path | None, typer.Option(help="New folder for the plugin. Default: ./qgs-NAME.")
     ] = None,
 ) -> None:
-    """Write a plugin to start from: one component, its contract tests, a recipe."""
+    """Write a new plugin from a template: one component, its contract tests, and a recipe."""
     from qgs.files import refuse_existing, write_text
 
     check_name(name)
@@ -44,26 +44,26 @@ def distribution_of(name: str) -> str:
 
 
 def check_name(name: str) -> None:
-    """Raise ValueError for an invalid name of a plugin, or one that is already taken."""
+    """Raise ValueError for a plugin name that is invalid or already taken."""
     module = name.replace("-", "_")
     if not re.fullmatch("[a-z][a-z0-9]*([-_][a-z0-9]+)*", name) or keyword.iskeyword(module):
         raise ValueError(
             f"`{name}` cannot name a plugin: use lower-case letters and digits, a letter first, "
-            "words joined by single hyphens or _, and no keyword of Python"
+            "join words by single hyphens or _, and avoid keywords of Python"
         )
     # The new package must neither hide an installed one nor be hidden by it.
-    other = f"choose another, such as `{name}-things`"
+    other = f"choose another name, such as `{name}-things`"
     if module in sys.stdlib_module_names or module in packages_distributions():
         raise ValueError(f"`{name}` is the name of an installed package; {other}")
     for entry in entry_points(group="qgs.plugins", name=name):
         owner = entry.dist.name if entry.dist else "a plugin"
-        raise ValueError(f"`{name}` is taken by {owner}; {other}")
+        raise ValueError(f"the plugin name `{name}` is taken by {owner}; {other}")
     if name in ("null", "true", "false"):
-        raise ValueError(f"YAML does not read `{name}` as text; {other}")
+        raise ValueError(f"YAML reads `{name}` as a constant, not as text; {other}")
 
 
 def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
-    """Yield the path and the content of every file of a new plugin `name`."""
+    """Yield path and content of every file of a new plugin `name`, filled into the template."""
     from jinja2 import Environment, StrictUndefined
 
     import qgs

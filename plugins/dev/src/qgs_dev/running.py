@@ -1,4 +1,4 @@
-"""The contract suite: runs the checks that checks.toml lists on the components of a plugin."""
+"""Runner of the contract suite: runs the checks in checks.toml on components of a plugin."""
 
 import inspect
 import traceback
@@ -30,7 +30,7 @@ FIRST = (*BASICS, "forward_keeps_no_state", "eval_repeats_bitwise")
 class Check(NamedTuple):
     """One check of the contract.
 
-    variants: True if it runs on every case of a class; other checks run on the first case only.
+    variants: True if the check runs on every case of a component, False if on the first case only.
     """
 
     name: str
@@ -41,12 +41,12 @@ class Check(NamedTuple):
 
     @property
     def contract(self) -> str:
-        """Requirement in one sentence: the first paragraph of the function's docstring."""
+        """Requirement as one sentence: the first paragraph of the check function's docstring."""
         return " ".join(cleandoc(self.function.__doc__ or "").split("\n\n")[0].split())
 
 
 def _listed() -> Iterator[Check]:
-    """Yield the checks of checks.toml; NAME is `check_NAME(case)` in the module of its subject."""
+    """Yield the checks in checks.toml. Check NAME is the function `check_NAME(case)`."""
     subjects = data_file("checks.toml")
     groups = subjects.pop("groups")
     groups["all"] = [*SLOTS]
@@ -69,9 +69,10 @@ CHECKS = {check.name: check for check in _listed()}
 
 
 def checks_for(case: Case, tiers: Iterable[Tier] = TIERS, variant: bool = False) -> list[Check]:
-    """Return the checks for the slot of `case`; those that make others fail come first.
+    """Return the checks for the slot of `case`. Checks whose failure makes others fail come first.
 
-    variant: True if the class had an earlier case; then only the checks of `variants` run.
+    variant: True if the component has had an earlier case; then only checks with `variants` are
+    returned.
     """
     wanted = {*tiers}
     # Otherwise a run without checks would pass.
@@ -91,7 +92,7 @@ Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of a check of a case. message: why the verdict is not "passed"."""
+    """Result of one check on one case. message: reason for a verdict other than "passed"."""
 
     case: Case
     check: Check
@@ -100,7 +101,7 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """True if nothing needs to be fixed."""
+        """True unless the check failed, or passed although a failure was expected."""
         return self.verdict not in ("failed", "unexpected pass")
 
     @property
@@ -111,10 +112,10 @@ class CheckResult:
 
 @dataclass
 class CaseRun:
-    """All checks of one case. After `builds` or `runs` fails, the rest is skipped.
+    """Run of all checks on one case. If `builds` or `runs` fails, the other checks are skipped.
 
-    expected: check -> why it is expected to fail; it is a failure if such a check passes.
-    variant: True if the class had an earlier case; see `Check.variants`.
+    expected: reasons for expected failures, by name of the check. It counts as a failure if such a
+    check passes. variant: True if the component has had an earlier case; see `Check.variants`.
     """
 
     case: Case
@@ -125,7 +126,7 @@ class CaseRun:
         return self.case.label
 
     def results(self, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
-        """Run the checks in order and yield their results."""
+        """Run the checks in order, and yield the result of each."""
         cause = ""
         for check in checks_for(self.case, tiers, self.variant):
             if cause:
@@ -139,9 +140,10 @@ class CaseRun:
             yield result
 
     def check(self, tiers: Iterable[Tier] = TIERS) -> None:
-        """Run all checks inside a pytest test, which fails with the messages of failed checks.
+        """Run all checks inside a pytest test. The test fails with the messages of failed checks.
 
-        The test is skipped if the component cannot be built or called here. tiers: some of TIERS.
+        The test is skipped if the component cannot be built or called on this machine. tiers:
+        groups of checks to run, from TIERS.
         """
         import pytest
 
@@ -155,7 +157,10 @@ class CaseRun:
 
 
 def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
-    """Run `check` on `case`. expected: why it should fail; if given, passing is a failure."""
+    """Run `check` on `case`.
+
+    expected: reason why the check should fail; if it is given, a pass counts as a failure.
+    """
     title = f"{case.label}: {check.name}"
     try:
         check.function(case)
@@ -176,9 +181,10 @@ def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
 
 
 def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) -> None:
-    """Raise ValueError for an expected failure without a reason or of a check that does not run.
+    """Raise ValueError for invalid expected failures.
 
-    expected: name of a check -> why it fails.
+    They are invalid without a reason, or for a check that does not run. expected: reasons by name
+    of the check.
     """
     made = {check.name for run in runs for check in checks_for(run.case, variant=run.variant)}
     for name, why in expected.items():
@@ -190,9 +196,9 @@ def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) ->
 
 
 def with_place(error: BaseException, component: type) -> str:
-    """Return type and message of `error`, and the FILE:LINE of the component that raised it.
+    """Return type and message of `error`, and FILE:LINE in the component's package.
 
-    There is no FILE:LINE for a broken contract, nor for an error from outside the package.
+    FILE:LINE is left out for a ContractError, and for an error from outside this package.
     """
     # Notes say at which point of a check the error happened.
     noted = "".join(f"{note}, " for note in getattr(error, "__notes__", ()))
@@ -213,9 +219,9 @@ DEPTHS = (2, 12)
 
 
 def cases_of(installed: InstalledPlugin) -> list[Case]:
-    """Return a case for each component with default options and for each of the `examples`.
+    """Return a case for each component with its default options, and for each of the `examples`.
 
-    Raises PluginError for an example that is not a Config of one of the plugin's components.
+    Raises PluginError for an example that is not a Config of a component of the plugin.
     """
     plugin = installed.plugin
     for example in plugin.examples:
@@ -229,20 +235,20 @@ def cases_of(installed: InstalledPlugin) -> list[Case]:
 
 
 def without_case(installed: InstalledPlugin) -> list[type[Component]]:
-    """Return the components that have neither an example nor usable default options."""
+    """Return the components without a case: no example, and no valid default options."""
     checked = {case.component for case in cases_of(installed)}
     return [component for component in installed.plugin.components if component not in checked]
 
 
 def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
-    """Return a run for each case of a plugin, to parametrise a pytest test.
+    """Return a CaseRun for each case of a plugin, as parameters of a pytest test.
 
         @pytest.mark.parametrize("run", runs_of("sightline"), ids=str)
         def test_contract(run):
             run.check()
 
-    The first case of a class has all checks, later cases only those of `variants`. Raises
-    PluginError for a plugin that is unusable or has invalid examples or exemptions.
+    The first case of a component runs all checks, later cases run only checks with `variants`.
+    Raises PluginError for a plugin that cannot be loaded, or with invalid examples or exemptions.
     """
     installed = load_plugin(plugin) if isinstance(plugin, str) else plugin
     runs: list[CaseRun] = []
@@ -267,7 +273,7 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
 def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
     """Run all checks on each case of the plugin `name`, and yield the results case by case.
 
-    Raises PluginError for a plugin that is unusable or has invalid examples or exemptions.
+    Raises PluginError for a plugin that cannot be loaded, or with invalid examples or exemptions.
     """
     runs = runs_of(name)
     return (result for run in runs for result in run.results(tiers))
@@ -280,7 +286,7 @@ def _case(config: ComponentConfig) -> Case:
 
 
 def _accepts(case: Case) -> bool:
-    """Return True if `problems` is empty or raises, which the checks of the case report."""
+    """Return True if `problems` reports none, or raises; the checks then report its error."""
     try:
         return not case.problems(case.size)
     except (Exception, SystemExit):

@@ -1,4 +1,4 @@
-"""The JSON Schema of recipes, with which editors complete, check and explain options."""
+"""JSON Schema of recipes, with which editors complete, check and explain options."""
 
 from typing import Any
 
@@ -27,8 +27,8 @@ swap:
 def recipe_schema(registry: Registry) -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of recipes that use the plugins of `registry`.
 
-    No key is required, since overlays leave out keys. Without a `type`, the options of every
-    component of the slot are allowed.
+    No key is required, because an overlay recipe may leave out any key. Where `type` is left out,
+    options of all components of the slot are allowed.
     """
     schema = settings_schema(Layout)
     written = yaml.safe_load(_WRITTEN)
@@ -45,7 +45,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
 
 def _type(name: str, component: type[Component]) -> dict[str, Any]:
-    """Return the schema of `component`: its options and the `type` that selects it."""
+    """Return the schema of a component: its options, and the value `name` of `type`."""
     description = summary_of(component)
     schema = settings_schema(component.Config)
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
@@ -53,7 +53,7 @@ def _type(name: str, component: type[Component]) -> dict[str, Any]:
 
 
 def settings_schema(config: type[ComponentConfig]) -> dict[str, Any]:
-    """Return the schema of options of a section or component, without references."""
+    """Return the schema of the options in `config`, without references to definitions."""
     schema = {"properties": {}} | config.model_json_schema()
     definitions = schema.pop("$defs", {})
     # An overlay sets an option and leaves the rest to its base.
@@ -71,7 +71,7 @@ def settings_schema(config: type[ComponentConfig]) -> dict[str, Any]:
 
 
 def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
-    """Return `schema` with references replaced by the `definitions` that they name."""
+    """Replace all references in `schema` by the definitions that they name."""
     if isinstance(schema, list):
         return [_inlined(item, definitions) for item in schema]
     if not isinstance(schema, dict):

@@ -23,7 +23,7 @@ _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusive
 
 
 def overview(registry: Registry) -> Iterator[Table]:
-    """Yield a table per slot with the names, meanings and origins of installed components."""
+    """Yield one table per slot: names, meanings and plugins of the installed components."""
     for name, slot in SLOTS.items():
         default = f" (default {slot.default})" if slot.default else ""
         components = registry.components(name).items()
@@ -40,7 +40,7 @@ def _origins(title: str, column: str, meanings: Mapping[str, str], registry: Reg
 
 
 def _table(title: str, *rows: Sequence[str]) -> Table:
-    """Return a table with folded cells, headers first."""
+    """Return a table whose long cells are folded. The first of `rows` has the headers."""
     table = Table(title=title or None, title_justify="left")
     for column in rows[0]:
         table.add_column(column, overflow="fold")
@@ -50,10 +50,11 @@ def _table(title: str, *rows: Sequence[str]) -> Table:
 
 
 def details(name: str, registry: Registry) -> Iterator[Table | str]:
-    """Explain a section of settings, a trained model, a component or all components of a slot.
+    """Yield texts and tables that explain `name`.
 
-    name: for example qgs/latent, queries, training or rooms/locus-64. `recipe` stands for the
-    settings at the top level of a recipe. Raises ValueError for an unknown name.
+    name: a component such as qgs/latent, a slot such as queries, a section of settings such as
+    training, or a trained model such as rooms/locus-64. `recipe` stands for the settings at the top
+    level of a recipe. Raises ValueError for an unknown name.
     """
     settings = {".".join(path) or "recipe": config for path, config in SETTINGS.items()}
     models = _models(registry)
@@ -98,7 +99,7 @@ def _fields(word: str, specs: Mapping[str, object]) -> Iterator[str]:
 
 
 def _models(registry: Registry) -> dict[str, Path]:
-    """Return the file of every shipped model by PLUGIN/NAME."""
+    """Return the files of all trained models in plugins, by PLUGIN/NAME."""
     found: dict[str, Path] = {}
     for plugin in registry.plugins.values():
         found |= plugin.models
@@ -110,16 +111,17 @@ def _release(kind: str, registry: Registry) -> str:
 
 
 def recipe_path(slot: str) -> str:
-    """Return the path in a recipe at which components of `slot` are written."""
+    """Return the path in a recipe where components of `slot` are set, such as `model.head`."""
     if slot in MODEL_SLOTS:
         return f"model.{slot}"
     return f"model.decoder.{slot}" if slot in LAYER_SLOTS else slot
 
 
 def option_rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:
-    """Yield name, values, default and meaning of each option.
+    """Yield a table row for each option: name, type, default and meaning.
 
-    Options inside a mapping follow it, written as `option.inner`.
+    properties: JSON schemas by option. Options inside a mapping follow it as `option.inner`. above:
+    prefix of the names.
     """
     for name, option in properties.items():
         default = inline(option["default"]) if "default" in option else "required"
@@ -130,7 +132,7 @@ def option_rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[t
 
 
 def _type(option: Schema) -> str:
-    """Describe the values that a JSON Schema allows."""
+    """Describe the values that the JSON Schema of an option allows, such as "int >= 1"."""
     match option:
         case {"$ref": name}:
             return name.rpartition("/")[2]

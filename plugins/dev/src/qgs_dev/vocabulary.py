@@ -1,6 +1,7 @@
 """Helpers of the checks: trees of tensors, trial runs of a component, and expectations.
 
-Inputs and outputs of components are trees of tensors with dotted names.
+A tree is a nested structure of tensors, such as the inputs of a component. A tensor in a tree has a
+dotted name, such as `state.features`.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -18,28 +19,28 @@ from qgs_dev.modules import each_mode, seeded
 
 
 def leaves(tree: Any) -> dict[str, Tensor]:
-    """Return every tensor of `tree` by dotted name; a single tensor is called `output`."""
+    """Return all tensors of `tree` by dotted name; a single tensor is called `output`."""
     return {name or "output": tensor for name, tensor in named_tensors(tree)}
 
 
 def mapped(tree: Any, function: Callable[[str, Tensor], Tensor]) -> Any:
-    """Return `tree` with `function(name, tensor)` in place of every tensor."""
+    """Return a copy of `tree` with `function(name, tensor)` in place of each tensor."""
     names = iter(leaves(tree))
     return map_tensors(lambda tensor: function(next(names), tensor), tree)
 
 
 def floating(tree: Any) -> dict[str, Tensor]:
-    """Return every floating-point tensor of `tree` by dotted name."""
+    """Return all floating-point tensors of `tree` by dotted name."""
     return {name: tensor for name, tensor in leaves(tree).items() if tensor.is_floating_point()}
 
 
 def cloned(tree: Any) -> Any:
-    """Return a copy that shares no memory and belongs to no autograd graph."""
+    """Return a detached copy of `tree` that shares no memory with it."""
     return map_tensors(lambda x: x.detach().clone(), tree)
 
 
 def tracked(tree: Any) -> Any:
-    """Return a copy whose floating-point tensors require gradients."""
+    """Return a detached copy of `tree` whose floating-point tensors require gradients."""
     return map_tensors(lambda x: x.requires_grad_(x.is_floating_point()), cloned(tree))
 
 
@@ -49,14 +50,14 @@ def cast(tree: Any, dtype: torch.dtype) -> Any:
 
 
 def scene(tree: Any, index: int) -> Any:
-    """Return a batch with only the scene at `index`."""
+    """Return a batch with only scene `index` of the batch `tree`."""
     return map_tensors(lambda x: x[index : index + 1], tree)
 
 
 def masked(tree: Any, mask_BN: Tensor, other: Any) -> Any:
-    """Return `tree` with the numbers of `other` wherever the mask of queries is False.
+    """Return `tree` with values of the tree `other` for queries whose mask is False.
 
-    Tensors belong to queries (B, N, ...) or to their Gaussians (B, N K, ...).
+    Tensors have a value for each query, (B, N, ...), or for each Gaussian, (B, N * K, ...).
     """
     theirs = leaves(other)
 
@@ -68,7 +69,7 @@ def masked(tree: Any, mask_BN: Tensor, other: Any) -> Any:
 
 
 def scalar(tree: Any) -> Tensor:
-    """Return a float64 sum of all floating-point numbers in `tree` with random weights."""
+    """Return the sum of all floating-point numbers in `tree` with random weights, in float64."""
     total = torch.zeros(()).double()
     for index, tensor in enumerate(floating(tree).values()):
         # Equal weights would let errors of opposite signs cancel.
@@ -79,7 +80,7 @@ def scalar(tree: Any) -> Tensor:
 
 
 def gradients(total: Tensor, tree: Any) -> dict[str, Tensor]:
-    """Return the gradient of `total` for every tensor of `tree` that it depends on."""
+    """Return the gradients of `total` by name, for the tensors of `tree` that it depends on."""
     if not total.requires_grad:
         return {}
     given = {name: tensor for name, tensor in floating(tree).items() if tensor.requires_grad}
@@ -88,9 +89,9 @@ def gradients(total: Tensor, tree: Any) -> dict[str, Tensor]:
 
 
 def difference(one: Any, other: Any, rtol: float = 0.0, atol: float = 0.0) -> str:
-    """Describe the first tensor that differs by more than the tolerances; "" if none does.
+    """Describe the first tensor in which two trees differ; "" if they agree.
 
-    Without tolerances, dtypes must agree too.
+    Tensors may differ by the tolerances `rtol` and `atol`. If both are 0, dtypes must agree, too.
     """
     ours = leaves(one)
     theirs = leaves(other)
@@ -109,13 +110,13 @@ def difference(one: Any, other: Any, rtol: float = 0.0, atol: float = 0.0) -> st
 
 
 def described(tensor: Tensor) -> str:
-    """Return shape and dtype, for example `2x6x3 float32`."""
+    """Return shape and dtype of a tensor as text, for example `2x6x3 float32`."""
     shape = "x".join(map(str, tensor.shape)) or "scalar"
     return f"{shape} {str(tensor.dtype).removeprefix('torch.')}"
 
 
 class Trial:
-    """Component of a case with noise added to all parameters, and inputs to call it with."""
+    """Component of a case, with noise added to all parameters, and random inputs for it."""
 
     def __init__(self, case: Case, sizes: Sizes = USUAL, seed: int = 0) -> None:
         self.case = case
@@ -123,16 +124,19 @@ class Trial:
         self.inputs = inputs_of(case, sizes, seed)
 
     def __call__(self, inputs: Inputs | None = None, **replaced: Any) -> Any:
-        """Return the outputs for `inputs`, by default `self.inputs`, with some replaced."""
+        """Return the outputs of the component.
+
+        inputs: None takes `self.inputs`. replaced: inputs to replace, by name.
+        """
         given = {**(inputs or self.inputs), **replaced}
         return self.module(*given.values())
 
     def with_changed(self, change: Callable[[str, Tensor], Tensor]) -> Any:
-        """Return the outputs when `change(name, tensor)` replaces each input tensor."""
+        """Return the outputs for inputs in which `change(name, tensor)` replaces each tensor."""
         return self(mapped(self.inputs, change))
 
     def in_each_mode(self, inputs: Inputs | None = None) -> Iterator[tuple[str, Any]]:
-        """Yield the name of each mode and its outputs, with the same seed in both modes."""
+        """Yield the name of each mode and the outputs in this mode, with the same random seed."""
         for mode in each_mode(self.module):
             # The seed holds for this pass only: the caller keeps its own random state.
             with seeded(0):
@@ -140,9 +144,10 @@ class Trial:
             yield mode, outputs
 
     def tracked(self, inputs: Inputs | None = None) -> Inputs:
-        """Return copies of `inputs`, by default `self.inputs`, that require gradients.
+        """Return copies of the inputs whose tensors require gradients.
 
-        For a renderer, only the camera tensors in `camera_gradients` require them.
+        inputs: None takes `self.inputs`. Of a renderer's cameras, only the tensors in
+        `camera_gradients` require gradients.
         """
         component = self.case.component
         fixed: set[str] = set()
@@ -154,24 +159,24 @@ class Trial:
         )
 
     def state_of(self, outputs: Any) -> Any:
-        """Return the state that a layer or a feedback returns, or all outputs of other slots."""
+        """Return the query state in the outputs of a layer or a feedback; otherwise all outputs."""
         return outputs[0] if self.case.slot in WITH_MEMORY else outputs
 
 
 def expect(holds: Any, seen: str) -> None:
-    """Raise ContractError with the text `seen` unless `holds` is true."""
+    """Raise ContractError with the message `seen` unless `holds` is true."""
     if not holds:
         raise ContractError(seen)
 
 
 def expect_none(names: Iterable[Any], fault: str) -> None:
-    """Raise ContractError with the `names` and their common `fault` if there are any names."""
+    """Raise ContractError with the names and their common `fault`, if there are any names."""
     found = sorted(map(str, names))
     expect(not found, f"{', '.join(found)}: {fault}")
 
 
 def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float = 0.0) -> None:
-    """Raise ContractError unless two trees agree; see `difference`."""
+    """Raise ContractError if two trees differ; see `difference`. where: start of the message."""
     found = difference(one, other, rtol, atol)
     expect(not found, f"{where}, {found}")
 
@@ -183,7 +188,7 @@ def expect_finite(tree: Any, where: str) -> None:
 
 
 def expect_inside(x: Tensor, low: float, high: float, what: str) -> None:
-    """Raise ContractError unless all numbers of `x` are in [low, high]."""
+    """Raise ContractError unless all numbers of `x` are in [low, high]. what: name of `x`."""
     least, most = x.aminmax()
     expect(least >= low and most <= high, f"{what} are {least:.4g} to {most:.4g}")
 
@@ -191,7 +196,10 @@ def expect_inside(x: Tensor, low: float, high: float, what: str) -> None:
 def expect_right_gradient(
     value: Callable[..., Tensor], points: Any, where: str, **tolerances: Any
 ) -> None:
-    """Raise ContractError unless the gradient of `value` at `points` matches finite differences."""
+    """Raise ContractError unless the gradient of the function `value` at `points` is right.
+
+    The gradient is compared with finite differences. tolerances: options of gradcheck.
+    """
     try:
         gradcheck(value, points, **tolerances)
     except GradcheckError as error:

@@ -1,1 +1,1 @@
-"""Studies, benchmarks and published weights."""
+"""Studies, benchmarks, and import of published weights."""

@@ -1,4 +1,4 @@
-"""Trackers for `training.trackers`: TensorBoard and Weights & Biases, through accelerate."""
+"""Trackers for `training.trackers`: TensorBoard and Weights & Biases, by way of accelerate."""
 
 import uuid
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from qgs.train.tracking import Tracker
 
 
 class _OfAccelerate(Tracker):
-    """Tracker of accelerate; subclasses create it in `_tracker`."""
+    """Base of trackers that use a tracker of accelerate, `_tracker`."""
 
     _tracker: Any
     _of_pictures: ClassVar[Mapping[str, str]] = {}
@@ -28,20 +28,20 @@ class _OfAccelerate(Tracker):
         self._tracker.store_init_configuration(plain)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
-        """Log the numbers of a step."""
+        """Log the values of one training step, by name."""
         self._tracker.log(dict(values), step=step)
 
     def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        """Log one picture."""
+        """Log one image (H, W, 3) of a training step."""
         self._tracker.log_images({name: picture[None]}, step=step, **self._of_pictures)
 
     def close(self) -> None:
-        """Write or send the remaining data."""
+        """Finish the log: write or send the remaining data."""
         self._tracker.finish()
 
 
 class TensorBoard(_OfAccelerate):
-    """TensorBoard tracker that writes into RUN/tensorboard."""
+    """TensorBoard tracker, which writes to RUN/tensorboard."""
 
     package = "tensorboard"
     _of_pictures: ClassVar = {"dataformats": "NHWC"}
@@ -53,7 +53,10 @@ class TensorBoard(_OfAccelerate):
 
 
 class WeightsAndBiases(_OfAccelerate):
-    """Weights & Biases tracker in RUN/wandb; a resumed training continues the same wandb run."""
+    """Weights & Biases tracker, which writes to RUN/wandb.
+
+    A resumed training continues the same run of Weights & Biases.
+    """
 
     package = "wandb"
 

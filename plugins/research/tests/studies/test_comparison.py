@@ -54,8 +54,8 @@ def test_what_cannot_be_compared_is_refused():
     halls = replace(second, protocol=Protocol("halls", {"format": 1, "views": "halls"}))
     moved = replace(second, frames={**second.frames, "b": ("0 4", "1 2")})
     notes = (
-        "the protocols differ, so the scores do not measure the same",
-        "judged on other frames",
+        "the protocols differ, so the scores do not measure the same thing",
+        "scenes with different frames",
     )
     for other, note in zip((halls, moved), notes, strict=True):
         must_refuse("across-protocols", compare, [first, other])
@@ -71,12 +71,12 @@ def test_trainings_of_one_recipe_are_one_side_paired_by_seed():
     apart = scores.difference("r/b/2 x 2 seeds", "psnr")
     assert (apart.sample, apart.mean) == ("2 seeds x 2 scenes", pytest.approx(-0.75))
     assert scores.models() == ["r/a/0 x 3 seeds", "r/b/2 x 2 seeds"]
-    assert "r/b/2 x 2 seeds: nothing to pair with (1): r/a/1" in summary(scores).notes
+    assert "r/b/2 x 2 seeds: runs without a partner (1): r/a/1" in summary(scores).notes
     # Nothing is said of those that do not tell how they were trained.
     longer = [replace(run, trained={"steps": "190", "data": "rooms"}) for run in theirs]
     known = [replace(run, trained={"steps": "100", "data": "rooms"}) for run in ours]
     said = summary(compare([*known, *longer])).notes
-    assert "r/b/2 x 2 seeds was trained otherwise than r/a/0 x 3 seeds: steps differ" in said
+    assert "r/b/2 x 2 seeds was trained unlike r/a/0 x 3 seeds: steps differ" in said
     alone = compare([*ours, results("r/c/7", "C", 7, a=9.0, b=11.0), results("d", a=1.0, b=1.0)])
     assert [apart.mean for apart in alone.differences().values()] == [-1.0, -10.0]
 

@@ -1,1 +1,1 @@
-"""The checks of the contract suite by subject; checks.toml lists them."""
+"""Checks of the contract suite, one module for each subject; checks.toml lists them."""

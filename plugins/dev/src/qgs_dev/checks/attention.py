@@ -1,4 +1,4 @@
-"""Checks of encoders and of attention: memos, masks and explanations."""
+"""Checks of encoders and of attention: shared values, masks and explanations."""
 
 import math
 from collections.abc import Iterator
@@ -21,10 +21,10 @@ QUERIES = 6
 
 
 def check_memo_is_of_the_memory_alone(case: Case) -> None:
-    """Require that values in `ImageMemory.once` depend on the memory only, not on state or weights.
+    """Require that values stored with `ImageMemory.once` depend on the memory only.
 
-    A layer must give the same results on a memory that another layer has read as on a fresh one.
-    Do not store results of a layer's own weights there: they belong to that layer alone.
+    They must not depend on the state or on weights of a layer. A layer must give the same results
+    on a new memory and on a memory that another layer has read before.
     """
     first = Trial(case)
     # The first layer fills the memo that the layers below read.
@@ -39,7 +39,7 @@ def check_memo_is_of_the_memory_alone(case: Case) -> None:
 
 
 def check_masked_queries_are_not_read(case: Case) -> None:
-    """Require that queries whose mask is False do not change the results of other queries."""
+    """Require that queries with mask False do not change the results of unmasked queries."""
     sizes = Sizes(queries=5)
     trial = Trial(case, sizes)
     state = trial.inputs["state"]
@@ -57,10 +57,10 @@ def check_masked_queries_are_not_read(case: Case) -> None:
 
 
 def check_explanation_is_a_softmax(case: Case) -> None:
-    """Require that the weights from `explain` are the softmax of content plus geometry over tokens.
+    """Require that weights from `explain` are the softmax of content plus geometry over tokens.
 
-    Content is (B, h, Q, T) for the requested queries, in their order. Geometry is (B, 1, Q, T) or
-    (B, h, Q, T); it is -inf where a token is hidden.
+    Content must be (B, h, Q, T) for B scenes, h heads, the Q requested queries in their order and T
+    tokens. Geometry must be (B, 1, Q, T) or (B, h, Q, T), with -inf where a token is hidden.
     """
     trial = Trial(case)
     given = explanation(trial.module, trial.inputs)
@@ -89,10 +89,11 @@ def check_explanation_is_a_softmax(case: Case) -> None:
 
 
 def check_updates_are_explained(case: Case) -> None:
-    """Require that updates are sums of one value per head and token, weighted as `explain` says.
+    """Require that updates are sums of values with the weights that `explain` returns.
 
-    Updates of many queries, or under several masks, are then linear in the unknown values. There
-    are fewer values than updates, so a least-squares solution must leave no residual.
+    There is one value for each head and token. Updates of many queries, or with several masks, are
+    then linear in the unknown values. There are fewer values than updates, so a least-squares fit
+    of the values must leave no residual.
     """
     count = QUERIES if case.slot == "self_attention" else 60
     module = case.lively().double()
@@ -124,7 +125,10 @@ def check_updates_are_explained(case: Case) -> None:
 
 
 def explanation(module: Any, inputs: Inputs, queries: list[int] | None = None) -> Any:
-    """Return AttentionWeights of `queries`, by default all; None if the component gives none."""
+    """Return what `explain` gives for `queries`, or for all queries if None.
+
+    The result is None if the component explains nothing.
+    """
     chosen = queries or range(inputs["state"].features.shape[1])
     return module.explain(*inputs.values(), torch.tensor([*chosen]))
 
@@ -147,9 +151,10 @@ _ORDER = (
 
 
 def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
-    """Require that `grid` counts the patches of each view, and `patch_rays` are their mean rays.
+    """Require that `grid` is the number of patches, and `patch_rays` are the mean rays of patches.
 
-    Rays have the order of the grid. A memory without rays may have no grid.
+    Rays must be in the order of the grid: by view, row and column. A memory without rays is not
+    checked.
     """
     module = case.lively()
     for where, views in _wide_and_tall(case, case.size):
@@ -163,10 +168,10 @@ def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
 
 
 def check_tokens_are_those_of_the_grid(case: Case) -> None:
-    """Require that a change of one patch changes the token at its place in `grid` most.
+    """Require that a change of one patch changes the token at the same place in `grid` most.
 
-    This holds in the mean over patches. Half a patch off is allowed, since centres of strided
-    convolutions are there. Keys may depend on rays alone. A memory may have no grid.
+    The mean over patches counts. An offset of half a patch is allowed, as strided convolutions
+    have. Keys may depend on rays only. A memory without a grid is not checked.
     """
     # Initial parameters without noise: in a random network every token depends on all patches.
     module = case.build().eval()
@@ -203,9 +208,10 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
 
 
 def check_project_makes_the_memory_again(case: Case) -> None:
-    """Require that `project` of a `tunable` encoder rebuilds a memory from the memory's features.
+    """Require that a `tunable` encoder can rebuild a memory from its features with `project`.
 
-    Other features must give another memory. An encoder that is not tunable must refuse.
+    Changed features must give a changed memory. An encoder that is not `tunable` must raise
+    NotImplementedError.
     """
     trial = Trial(case)
     module = trial.module
@@ -222,7 +228,7 @@ def check_project_makes_the_memory_again(case: Case) -> None:
 
 
 def _wide_and_tall(case: Case, size: tuple[int, int]) -> Iterator[tuple[str, Views]]:
-    """Yield views of `size` (H, W), and of (W, H) if the component accepts that."""
+    """Yield views of `size` (H, W), then of (W, H) if the component accepts this size."""
     for image in dict.fromkeys([size, (size[1], size[0])]):
         if image == size or not case.problems(image):
             where = f"with images of {image[0]} x {image[1]}"
@@ -230,7 +236,7 @@ def _wide_and_tall(case: Case, size: tuple[int, int]) -> Iterator[tuple[str, Vie
 
 
 def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
-    """Return the patch size in pixels that the grid of `memory` implies."""
+    """Return the patch size in pixels that follows from the grid of `memory`."""
     grid = memory.grid
     if grid is None:
         raise CannotCheck("its tokens are not patches: the memory has no grid")
@@ -243,10 +249,10 @@ def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
 
 
 def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int, int, int]) -> str:
-    """Describe how tokens are misplaced in `grid`, and how to fix it; "" if they are not.
+    """Return how tokens are misplaced in `grid`, and how to fix that; "" if they are not misplaced.
 
-    change: (T, M), the change of every token M by each changed patch T. changed: (T,), the tokens
-    of the changed patches, which are at `places`.
+    change: (T, M), the change of each of M tokens by each of T changed patches. changed: (T,),
+    indices of the tokens that belong to the changed patches. places: their view, row and column.
     """
     # Use shares of a token's total change: near borders and after norms, some tokens change more.
     share = change / change.sum(0).clamp_min(1e-30)
@@ -271,7 +277,10 @@ def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int,
 
 
 def _one_patch_each(views: Views, places: Tensor, patch: int) -> Views:
-    """Return a copy of the scene for each of `places`, with other noise in that one patch."""
+    """Return copies of a scene, one for each of `places`, with new noise in the patch at the place.
+
+    patch: side of a patch in pixels.
+    """
     scenes = map_tensors(lambda x: x.repeat(len(places), *[1] * (x.ndim - 1)), views)
     generator = torch.Generator().manual_seed(1)
     for images, (view, row, column) in zip(scenes.images, (places * patch).tolist(), strict=True):
@@ -282,7 +291,7 @@ def _one_patch_each(views: Views, places: Tensor, patch: int) -> Views:
 
 
 def check_unread_cameras_make_no_difference(case: Case) -> None:
-    """Require the same results without cameras if `reads_cameras` is False."""
+    """Require the same results without cameras from a component with `reads_cameras` False."""
     component = case.component
     if not issubclass(component, Encoder | Queries) or component.reads_cameras:
         raise CannotCheck("it reads cameras")

@@ -1,6 +1,7 @@
 """Checks that a component can be built, called with any sizes and strides, and compiled.
 
-They also cover what `Component`, `Config` and `nn.Module` provide unless a class overrides it.
+They include what the bases `Component`, `Config` and `nn.Module` provide, because a class may
+override it.
 """
 
 import random
@@ -64,7 +65,7 @@ SLACK = 2
 
 
 def check_builds(case: Case) -> None:
-    """Require that `problems` accepts the options and that the component can be built from them."""
+    """Require that `problems` reports none for the options, and that the component can be built."""
     found = [f"`{p.option}`: {p.reason}" for p in case.problems(case.size)]
     # A case with invalid options says nothing about the component.
     expect(not found, f"`problems` refuses the options of this case: {', '.join(found)}")
@@ -72,7 +73,7 @@ def check_builds(case: Case) -> None:
 
 
 def check_runs(case: Case) -> None:
-    """Require that a forward pass on ordinary inputs returns the type that the slot prescribes."""
+    """Require that a forward pass on random inputs returns the type that the slot prescribes."""
     output = Trial(case)()
     kind = OUTPUTS.get(case.slot, Tensor)
     expect(isinstance(output, kind), f"it returns {type(output).__name__}, not {kind.__name__}")
@@ -87,7 +88,8 @@ def check_runs(case: Case) -> None:
 def check_sizes_vary(case: Case) -> None:
     """Require correct output shapes for any number of scenes, queries and views.
 
-    One instance must accept all of these. The same holds for another width and number of heads.
+    One instance must accept all these sizes. The check is repeated with another model width and
+    number of heads, for which a second instance is built.
     """
     _expect_shapes(case, [*VARIED, Sizes(image=(case.size[1], case.size[0]))])
     other = case.with_dims(width=48, heads=3)
@@ -119,7 +121,7 @@ def _expect_shapes(case: Case, varied: Iterable[Sizes]) -> None:
 
 
 def _expected_shapes(trial: Trial, sizes: Sizes) -> dict[str, list[int | None]]:
-    """Return the required shape of every output; None stands for a size that is free."""
+    """Return the required shape of every output, by name. None stands for any size."""
     case = trial.case
     maker = Maker(case, sizes)
     maker.axes["M"] = None
@@ -144,7 +146,7 @@ def _expected_shapes(trial: Trial, sizes: Sizes) -> dict[str, list[int | None]]:
 
 
 def check_strides_make_no_difference(case: Case) -> None:
-    """Require the same results for inputs that are not contiguous, such as slices."""
+    """Require that results do not change if inputs are not contiguous in memory, such as slices."""
     trial = Trial(case)
     strided = map_tensors(_with_gaps, trial.inputs)
     # With other strides, sums run in another order.
@@ -152,7 +154,7 @@ def check_strides_make_no_difference(case: Case) -> None:
 
 
 def _with_gaps(tensor: Tensor) -> Tensor:
-    """Return the same numbers with gaps in memory along every dimension."""
+    """Return a copy of `tensor` with gaps in memory along every dimension."""
     room = tensor.new_zeros([size + 1 for size in tensor.shape])
     return room[tuple(slice(size) for size in tensor.shape)].copy_(tensor)
 
@@ -160,7 +162,7 @@ def _with_gaps(tensor: Tensor) -> Tensor:
 def check_compiles(case: Case) -> None:
     """Require that torch.compile keeps results and gradients, and new sizes need no new graphs.
 
-    The traced graphs run eagerly: the check does not test the compiler's code generation.
+    The traced graphs run eagerly, so the check does not test generated code.
     """
     from torch._dynamo.testing import CompileCounterWithBackend
 
@@ -199,7 +201,7 @@ def check_compiles(case: Case) -> None:
 
 
 def _gradients(module: Any, inputs: Inputs, outputs: Any) -> dict[str, Tensor]:
-    """Return the gradients of inputs and parameters, without those that are all zeros."""
+    """Return the gradients of inputs and parameters by name, except gradients of zeros."""
     given = {**inputs, "parameter": dict(module.named_parameters())}
     return {name: x for name, x in gradients(scalar(outputs), given).items() if bool(x.any())}
 
@@ -207,11 +209,11 @@ def _gradients(module: Any, inputs: Inputs, outputs: Any) -> dict[str, Tensor]:
 def check_construction(case: Case) -> None:
     """Require that options survive writing and reading, and modules survive saving and moving.
 
-    Options must be the same after being written as YAML and read again, and after building. A
-    misspelt option is refused with the nearest name. A component with parameters allocates nothing
-    under the meta device. It keeps every tensor as a parameter or a buffer, and draws only from
-    torch's global generator. It gives the same bits from saved weights, and computes on the device
-    that it is moved to.
+    Options must be the same after they are written as YAML and read again, and after a component is
+    built. A misspelt option must be refused with a suggestion. A component with parameters must
+    allocate no memory under the meta device, keep every tensor as a parameter or a buffer, and use
+    only torch's global random generator. From saved weights it must give bitwise equal results, and
+    it must compute on the device to which it is moved.
     """
     _expect_strict_options(case)
     if case.slot != "data":
@@ -250,7 +252,7 @@ def _expect_strict_options(case: Case) -> None:
 
 
 def _configs_in(annotation: Any) -> set[type[BaseModel]]:
-    """Return the configs that an option of this type can hold, nested ones included."""
+    """Return the config classes that an option of type `annotation` can hold, also nested ones."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         inside = [field.annotation for field in annotation.model_fields.values()]
         return {annotation}.union(*map(_configs_in, inside))
@@ -258,7 +260,10 @@ def _configs_in(annotation: Any) -> set[type[BaseModel]]:
 
 
 def _decoded(case: Case, options: dict[str, Any]) -> tuple[ComponentConfig | None, str]:
-    """Return the options that the composer reads from YAML, and its message if it refuses them."""
+    """Write options as YAML and read them again as a recipe does.
+
+    Returns the options or None, and the message of the error or "".
+    """
     problems = Problems()
     node = load_mapping(dump(options), "case", problems)
     config = decode_config(case.component.Config, node, (), problems)
@@ -284,7 +289,10 @@ def _expect_drawn_from_torch(case: Case) -> None:
 
 
 def other_generators() -> tuple[Any, str]:
-    """Return the states of the random generators that components must not use."""
+    """Return the states of the random generators of numpy and of the module random.
+
+    Components must not use these generators.
+    """
     return random.getstate(), str(numpy.random.get_state())
 
 
@@ -325,7 +333,7 @@ def _expect_movable(case: Case) -> None:
 
 @contextmanager
 def _autocast_accepts_meta() -> Iterator[None]:
-    """Let `torch.autocast(x.device.type, enabled=False)` pass on meta, where torch refuses it."""
+    """Allow `torch.autocast("meta", enabled=False)`, which torch refuses otherwise."""
     start = torch.autocast.__init__
 
     def begin(self: Any, device_type: str, *args: Any, **kwargs: Any) -> None:

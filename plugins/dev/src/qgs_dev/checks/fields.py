@@ -1,4 +1,4 @@
-"""Checks that a component reads and writes the state fields that it declares."""
+"""Checks that a component reads and writes exactly the fields that it declares."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -46,10 +46,10 @@ GIVEN = "given_fields"
 
 
 def check_reads_are_declared(case: Case) -> None:
-    """Require that a component reads only fields in `reads`, from the state and the memory.
+    """Require that a component reads only the fields of state and memory in `reads`.
 
-    Testing whether a field exists counts as reading. Pass other fields on with
-    `QueryState.replace`. A loss that declares no renderings must not read one.
+    A test whether a field exists counts as reading. Pass fields on with `QueryState.replace`, which
+    does not read them. A loss whose `renderings` is "none" must not read renderings.
     """
     trial = Trial(case)
     inputs = trial.inputs
@@ -82,7 +82,7 @@ def check_reads_are_declared(case: Case) -> None:
 
 
 class AskedFields(dict[str, Tensor]):
-    """Fields of a state that record in `asked` which names are read."""
+    """Dict of state fields that adds every name that is read to the set `asked`."""
 
     def __init__(self, fields: Mapping[str, Tensor], asked: set[str]) -> None:
         super().__init__(fields)
@@ -97,7 +97,7 @@ class AskedFields(dict[str, Tensor]):
         return super().__contains__(name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return the field `name`, or `default`, and record the name."""
+        """Return the field `name` or `default`, and record the name in `asked`."""
         self.asked.add(name)
         return super().get(name, default)
 
@@ -115,9 +115,10 @@ def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
 
 
 def check_declared_reads_are_used(case: Case) -> None:
-    """Require that every field in `reads` is read, so that no recipe is refused needlessly.
+    """Require that every field in `reads` affects the outputs.
 
-    Features of Gaussians may be read from their rendering.
+    Otherwise recipes without the field would be refused for no reason. Features of Gaussians may be
+    read from their rendering.
     """
     trial = Trial(case)
     # At least one of several draws must differ, since a ReLU may be closed for some.
@@ -129,7 +130,7 @@ def check_declared_reads_are_used(case: Case) -> None:
 
 
 def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
-    """Yield inputs of a trial with other values for a required field."""
+    """Yield the inputs of a trial with several other values of the required field `field`."""
     inputs = trial.inputs
     if field == "memory.grid":
         views, rows, columns = inputs["memory"].grid
@@ -145,10 +146,10 @@ def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
 
 
 def check_writes_are_declared(case: Case) -> None:
-    """Require that written fields are those in `writes`, with the shape and dtype given there.
+    """Require that a component writes exactly the fields in `writes`, with their shape and dtype.
 
-    Components other than queries pass on all other fields unchanged; a refinement also passes on
-    the features.
+    All components but queries must pass on other fields unchanged. A refinement must also pass on
+    the features unchanged.
     """
     trial = Trial(case)
     before: dict[str, Tensor] = {}
@@ -178,7 +179,10 @@ def _same(one: Tensor, other: Tensor) -> bool:
 
 
 def check_unmet_reads_fail_at_compose(case: Case) -> None:
-    """Require that a recipe without a field in `reads` is refused, and that one with all runs."""
+    """Require that recipes are refused if a required field is missing, and only then.
+
+    A recipe that provides all fields in `reads` must be accepted, and must run.
+    """
     needed = required_fields(case)
     for missing in needed:
         refusal = _refusal(case, {name: spec for name, spec in needed.items() if name != missing})
@@ -192,7 +196,7 @@ def check_unmet_reads_fail_at_compose(case: Case) -> None:
 
 
 def _refusal(case: Case, given: Fields) -> str:
-    """Return why a recipe is refused whose queries provide only `given`; "" if it is accepted."""
+    """Return the error of a recipe whose queries provide the fields `given`, or ""."""
     try:
         resolved(case, given)
     except RecipeError as error:
@@ -236,7 +240,10 @@ def resolved(case: Case, given: Fields) -> Recipe:
 
 
 def _given(base: type, provides: Fields, **methods: Any) -> Any:
-    """Return a subclass of a built-in component that provides the fields `provides`."""
+    """Return a subclass of the component class `base` that declares the fields `provides`.
+
+    methods: methods of the subclass.
+    """
     # Make a new class each time; otherwise two cases would share one registry entry.
     written = classmethod(lambda cls, config: provides)
     return type(
@@ -245,7 +252,7 @@ def _given(base: type, provides: Fields, **methods: Any) -> Any:
 
 
 def _head_with(look: Fields) -> Any:
-    """Return a head whose Gaussians have harmonics or features, taken from the queries."""
+    """Return a head whose Gaussians have the parts in `look`, `sh` or `features`."""
 
     def forward(self: GaussianHead, state: QueryState) -> Any:
         x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)
@@ -257,7 +264,7 @@ def _head_with(look: Fields) -> Any:
 
 
 def _encoder_with(case: Case) -> Any:
-    """Return an encoder whose features have the width that the case requires."""
+    """Return an encoder whose memory features have the width that the component requires."""
     wide = torch.arange(memory_width(case))
 
     def forward(self: MultiViewViT, views: Any) -> Any:
@@ -270,7 +277,7 @@ def _encoder_with(case: Case) -> Any:
 
 
 def _queries_with(case: Case, given: Fields) -> Any:
-    """Return queries that provide the fields `given`, expanded from one scene to all."""
+    """Return a queries component that provides the fields `given`, the same in all scenes."""
 
     def start(self: LatentQueries, batch_size: int) -> QueryState:
         maker = Maker(case, Sizes(batch=1, queries=self.count))
@@ -283,7 +290,7 @@ def _queries_with(case: Case, given: Fields) -> Any:
 
 @seeded(0)
 def run_training_step(recipe: Recipe, case: Case) -> None:
-    """Run a forward pass, render one view, compare it with the target, and run the backward pass.
+    """Run one training step without an optimiser: forward pass, rendering, losses, gradients.
 
     Raises ContractError if predictions, images, losses or gradients are not finite.
     """

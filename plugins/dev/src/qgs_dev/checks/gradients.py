@@ -1,6 +1,6 @@
 """Checks of gradients, of finite numbers and of precision.
 
-Under autocast, geometry keeps float32 and learned layers stay close. float64 stays float64.
+Under autocast, geometry must stay float32, and outputs must stay close to those in float32.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -52,8 +52,8 @@ def check_gradients_reach_inputs(case: Case) -> None:
     """Require a gradient for every floating-point input of the slot and every required field.
 
     If a component stops a gradient on purpose, for example that of reference points, list this
-    check and `gradients_match_differences` as expected failures. A component that requires nothing
-    and returns only zeros is an ablation and passes.
+    check and `gradients_match_differences` as expected failures. A component for ablations, which
+    requires no fields and returns only zeros, passes.
     """
     trial = Trial(case)
     missing = {*_read(case)}
@@ -72,7 +72,7 @@ def check_gradients_reach_inputs(case: Case) -> None:
 
 
 def _read(case: Case) -> Iterator[str]:
-    """Yield the dotted names of floating-point inputs that the component of `case` reads."""
+    """Yield the dotted names of the floating-point inputs that a component reads."""
     yield from FACTS[case.slot]["reads"]
     state = "prediction.state" if case.slot == "losses" else "state"
     for name, spec in case.reads.items():
@@ -91,9 +91,9 @@ def _are_zero(outputs: Any) -> bool:
 
 
 def check_terms_have_gradients(case: Case) -> None:
-    """Require that every loss term has a gradient in the prediction or in the rendering.
+    """Require that every loss term has a gradient for the prediction or for the rendering.
 
-    A loss passes if it requires nothing and is zero for all inputs, such as one of weight 0.
+    A loss that requires no fields and is zero for all inputs passes, such as a loss of weight 0.
     """
     trial = Trial(case)
     terms = trial()
@@ -112,8 +112,8 @@ def check_terms_have_gradients(case: Case) -> None:
 def check_gradients_match_differences(case: Case) -> None:
     """Require that float64 gradients agree with finite differences (torch.autograd.gradcheck).
 
-    The check runs in evaluation and in training. For gradients that are stopped on purpose, see
-    `gradients_reach_inputs`.
+    The check runs in evaluation and in training. If a component stops a gradient on purpose, list
+    this check as an expected failure; see `gradients_reach_inputs`.
     """
     small = case.with_dims(width=8, heads=2) if case.has_parameters else case
     small = case if small.problems(small.size) else small
@@ -159,12 +159,12 @@ def check_gradients_match_differences(case: Case) -> None:
 
 
 def check_zeros_stay_finite(case: Case) -> None:
-    """Require finite outputs and gradients for inputs of zeros."""
+    """Require finite outputs and gradients if all inputs are zero."""
     _expect_all_finite(case, "zeros", lambda _, x: torch.zeros_like(x))
 
 
 def check_large_numbers_stay_finite(case: Case) -> None:
-    """Require finite outputs and gradients for inputs of about 1e4."""
+    """Require finite outputs and gradients for inputs that are 1e4 times larger than usual."""
     bounded = ("images", "rgb", "alpha", "opacities")
     _expect_all_finite(
         case, "inputs times 1e4", lambda name, x: x if name.endswith(bounded) else 1e4 * x
@@ -172,7 +172,7 @@ def check_large_numbers_stay_finite(case: Case) -> None:
 
 
 def check_coincident_queries_stay_finite(case: Case) -> None:
-    """Require finite outputs and gradients if all queries, anchors or Gaussians coincide."""
+    """Require finite outputs and gradients if all queries, or all Gaussians, are the same."""
     of_queries = (*QUERY_INPUTS, "gaussians", "prediction")
     _expect_all_finite(
         case,
@@ -184,7 +184,8 @@ def check_coincident_queries_stay_finite(case: Case) -> None:
 def check_points_behind_cameras_stay_finite(case: Case) -> None:
     """Require finite outputs and gradients for points behind cameras or in a camera centre.
 
-    The check applies to components that receive points: Gaussians or required fields of points.
+    The check applies to components with points as inputs: centres of Gaussians, or required state
+    fields that hold points.
     """
     places = required_places(case)
     if not places and case.slot not in ("renderer", "losses"):
@@ -224,7 +225,11 @@ def _expect_all_finite(
     change: Callable[[str, Tensor], Tensor],
     fixed: Collection[str] = ("cameras", "patch_rays"),
 ) -> None:
-    """Expect finite outputs and gradients after a change of all inputs but the `fixed` ones."""
+    """Expect finite outputs and gradients after a change of all inputs.
+
+    change: function of name and tensor that returns the changed tensor. fixed: names of inputs that
+    stay the same. what: description of the change for messages.
+    """
 
     def changed(name: str, x: Tensor) -> Tensor:
         stays = not {*fixed}.isdisjoint(name.split(".")) or not x.is_floating_point()
@@ -256,12 +261,13 @@ NAMES: dict[str, list[str]] = data_file("precision.toml")
 
 
 def check_geometry_is_float32_under_autocast(case: Case) -> None:
-    """Require finite outputs under bfloat16 autocast, and geometry that is computed in float32.
+    """Require that geometry is computed in float32 under bfloat16 autocast.
 
-    Learned layers run in bfloat16. For the same outputs of the layers, geometry must have the
-    values that float32 gives. Geometry means: means, world-frame fields, fields that are read and
-    written again, outputs of a head, the geometry term of attention logits, images and losses.
-    The check runs in training and in evaluation.
+    Learned layers run in bfloat16. If their outputs are replayed in a float32 run, geometry must
+    have the same values in both runs. Geometry includes centres of Gaussians, fields in the world
+    frame, fields that a component reads and writes again, outputs of a head, the geometry term of
+    attention logits, images and losses. All outputs must be finite. The check runs in training and
+    in evaluation.
     """
     trial = Trial(case)
     module = trial.module
@@ -295,14 +301,14 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
 
 
 def _halved(inputs: Inputs) -> Inputs:
-    """Convert features to bfloat16 and let them, but not geometry, require gradients."""
+    """Convert features to bfloat16 tensors that require gradients; leave geometry unchanged."""
     return mapped(
         inputs, lambda name, x: x.bfloat16().requires_grad_() if name in NAMES["halved"] else x
     )
 
 
 def _with_explanation(trial: Trial, inputs: Inputs) -> dict[str, Any]:
-    """Return the outputs, with the geometry term of the logits if an attention has `explain`."""
+    """Return the outputs by name; for attention, with the geometry term that `explain` returns."""
     outputs = leaves(trial(inputs))
     if trial.case.slot in ATTENTION:
         weights = explanation(trial.module, inputs)
@@ -314,7 +320,7 @@ def _with_explanation(trial: Trial, inputs: Inputs) -> dict[str, Any]:
 def check_autocast_is_close(case: Case) -> None:
     """Require that outputs under bfloat16 autocast agree with float32 up to rounding.
 
-    The mean difference may be a tenth of the spread of each output.
+    The mean absolute difference may be at most a tenth of the mean absolute deviation of an output.
     """
     trial = Trial(case)
     inputs = _halved(trial.inputs)
@@ -330,7 +336,7 @@ def check_autocast_is_close(case: Case) -> None:
 
 
 def check_float64_stays_float64(case: Case) -> None:
-    """Require float64 outputs of a float64 component for float64 inputs, in training too."""
+    """Require float64 outputs for float64 parameters and inputs, in evaluation and in training."""
     trial = Trial(case)
     trial.module.double()
     for mode, outputs in trial.in_each_mode(cast(trial.inputs, torch.float64)):
@@ -340,12 +346,12 @@ def check_float64_stays_float64(case: Case) -> None:
 
 
 class LearnedLayers(TorchFunctionMode):
-    """Recorder of the outputs of learned layers in call order, or replayer of recorded ones.
+    """Recorder of the outputs of learned layers in call order; with `replayed`, it replays them.
 
-    A product counts as a learned layer if all its factors require gradients: parameters, features
-    and values computed from them. halved: names of products of float32 tensors, none of them
-    learned, that autocast converted to bfloat16. differs: True if the called layers are not those
-    that were recorded in `replayed`; from the first such layer on, layers return what they compute.
+    A product counts as a learned layer if all its factors require gradients, as parameters,
+    features and values computed from them do. halved: names of products of float32 geometry that
+    autocast computed in bfloat16. differs: True if other layers are called than `replayed` has;
+    from the first such layer on, layers return what they compute.
     """
 
     def __init__(self, replayed: Iterable[tuple[str, Any]] | None = None) -> None:
@@ -356,7 +362,7 @@ class LearnedLayers(TorchFunctionMode):
         self._replayed = None if replayed is None else iter(replayed)
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call `func`; if it is a learned layer, record its output or return the replayed one."""
+        """Call `func`. If it is a learned layer, record its output or replay the recorded one."""
         given = func(*args, **(kwargs or {}))
         name = getattr(func, "__name__", "")
         factors = [x for _, x in named_tensors([args, kwargs or {}])]

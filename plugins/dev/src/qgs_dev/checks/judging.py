@@ -27,19 +27,19 @@ from qgs_dev.vocabulary import (
 )
 
 SIGNS = {"psnr", "alpha", "deviation"}
-"""Required names of signs that training watches."""
+"""Names of the signs (warning values of training) that an objective must return."""
 TAKEN = "name of another number in history.jsonl; rename the term"
 
 
 def check_loss_is_a_mean_over_scenes(case: Case) -> None:
-    """Require that the terms of a batch are the means of the terms of its scenes."""
+    """Require that each loss term of a batch is the mean of the term over its scenes."""
     trial = Trial(case)
     alone = [trial(scene(trial.inputs, index)) for index in range(2)]
     expect_same(_mean(*alone), trial(), "compared with the mean over scenes", 1e-4, 1e-6)
 
 
 def check_masked_queries_are_not_judged(case: Case) -> None:
-    """Require that queries whose mask is False, with opacity 0, change no term."""
+    """Require that queries with mask False, whose Gaussians have opacity 0, change no loss term."""
     trial = Trial(case)
     prediction = trial.inputs["prediction"]
     batch, queries = prediction.state.features.shape[:2]
@@ -58,9 +58,10 @@ def check_masked_queries_are_not_judged(case: Case) -> None:
 
 
 def check_renderings_as_declared(case: Case) -> None:
-    """Require that a loss uses renderings as `renderings` declares: each view, all views or none.
+    """Require that a loss uses renderings as its `renderings` declares.
 
-    Terms must be 0-d and must not have the name of another number of a step.
+    With "each", terms must be means over views. Terms must be 0-d tensors. Their names must differ
+    from those of other numbers in history.jsonl.
     """
     trial = Trial(case)
     terms = trial()
@@ -83,9 +84,10 @@ def _mean(one: dict[str, Tensor], other: dict[str, Tensor]) -> dict[str, Tensor]
 
 
 def check_metric_gives_its_columns(case: Case) -> None:
-    """Require a finite value for each column of a metric that receives only what it `needs`.
+    """Require that a metric returns a finite value for each of its columns.
 
-    The values must be the same each time, and the inputs must not change.
+    The metric receives only the inputs that it lists in `needs`. Values must be the same in each
+    call, and inputs must not change.
     """
     module = _metric(case)
     # Metrics may divide by zero for a perfect image.
@@ -101,7 +103,7 @@ def check_metric_gives_its_columns(case: Case) -> None:
 
 
 def check_truth_scores_best(case: Case) -> None:
-    """Require that the true images score no worse than others, in the sense of `better`."""
+    """Require that a metric scores the true images at least as well as noisy ones."""
     module = _metric(case)
     true, false = (_values(module, _metric_input(case, module, noise)) for noise in (0.0, 0.2))
     for key, column in module.columns().items():
@@ -118,7 +120,10 @@ def _metric(case: Case) -> Metric:
 
 
 def _metric_input(case: Case, module: Metric, noise: float) -> MetricInput:
-    """Return views with images and depth that are off by `noise`, limited to what is needed."""
+    """Return inputs for a metric: images and depth with added noise, only as far as it needs them.
+
+    noise: standard deviation of the noise.
+    """
     maker = Maker(case, Sizes(batch=1))
     target = maker.target()
     depth = maker.uniform(1, 2, "BV1HW")
@@ -143,10 +148,10 @@ def _values(module: Metric, given: MetricInput) -> dict[str, Tensor]:
 
 
 def check_objective_gives_an_outcome(case: Case) -> None:
-    """Require an Outcome whose total is the sum of its terms and has a gradient in the model.
+    """Require an Outcome whose total is the sum of its terms and depends on the model.
 
-    An objective has no parameters. Terms and signs are 0-d and detached. The signs are exactly
-    those that training watches.
+    The total must have a gradient for the model's parameters. An objective must have no parameters
+    of its own. Terms and signs must be 0-d and detached. The signs must be those in SIGNS.
     """
     module = case.build()
     expect(not isinstance(module, nn.Module), "it is an nn.Module; objectives have no parameters")
@@ -176,19 +181,19 @@ def check_objective_gives_an_outcome(case: Case) -> None:
 
 
 def check_objective_repeats(case: Case) -> None:
-    """Require the same results of an objective each time under one seed: it keeps no state."""
+    """Require that an objective gives the same results in two calls with the same seed."""
     module = case.build()
     expect_same(rehearsed(case, module), rehearsed(case, module), "a second call differs")
 
 
 def rehearsed(case: Case, module: Any) -> dict[str, Tensor]:
-    """Return the numbers that an objective gives with a small model."""
+    """Return total, terms and signs that an objective gives with a small model."""
     outcome, _ = _outcome(case, module, 3)
     return cloned({"total": outcome.total, **outcome.terms, **outcome.signs})
 
 
 def _outcome(case: Case, module: Any, views: int) -> tuple[Outcome, nn.Module]:
-    """Return the outcome of an objective and the model that it used."""
+    """Call an objective with a small model; return the outcome and the model."""
     recipe = resolved(case, required_fields(case))
     maker = Maker(case, Sizes(views=views))
     with seeded(0):

@@ -1,7 +1,8 @@
 """Checks of renderers: background, depth, directions, features and gradients.
 
-Finite differences use a scene without jumps. Every Gaussian contributes to every pixel, far above
-`alpha_min`. No Gaussian blocks those behind it or changes its place in the order of depths.
+Gradients are compared with finite differences in a scene where images change smoothly: every
+Gaussian contributes to every pixel, with an alpha far above `alpha_min`, no Gaussian hides another
+one completely, and small steps do not change the order of depths.
 """
 
 from dataclasses import replace
@@ -35,7 +36,7 @@ CAMERA_TENSORS = ("c2w", "intrinsics")
 
 
 def check_no_gaussians_give_the_background(case: Case) -> None:
-    """Require the background as image, with finite gradients, if there are no Gaussians."""
+    """Require that a scene without Gaussians renders as the background, with finite gradients."""
     trial = Trial(case)
     inputs = trial.tracked()
     # Scenes without Gaussians occur: an opacity limit may remove all.
@@ -61,7 +62,7 @@ def check_rendering_is_over_the_background(case: Case) -> None:
 
 
 def check_depth_is_expected(case: Case) -> None:
-    """Require that depth is the mean camera-frame z of Gaussians, weighted as in blending."""
+    """Require that depth is the mean camera-frame z of Gaussians with their blending weights."""
     trial = _broad(case, views=2)
     cameras = trial.inputs["cameras"]
     pair, near, far = (trial.inputs["gaussians"][:, at] for at in ([0, -1], [0], [-1]))
@@ -77,9 +78,10 @@ def check_depth_is_expected(case: Case) -> None:
 
 
 def check_colours_depend_on_the_direction(case: Case) -> None:
-    """Require that `sh` renders each view like Gaussians with the colours seen from that view.
+    """Require that Gaussians with `sh` look like Gaussians with fixed colours in each view.
 
-    Coefficients of zero must change nothing.
+    The fixed colours are those that `sh` gives in the direction from the camera of the view.
+    Coefficients of zero must not change the image.
     """
     trial = Trial(case, Sizes(views=3))
     cameras = trial.inputs["cameras"]
@@ -102,9 +104,9 @@ def check_colours_depend_on_the_direction(case: Case) -> None:
 
 
 def check_features_are_blended_as_colours(case: Case) -> None:
-    """Require that features are blended as colours before a black background, for any number.
+    """Require that features are blended like colours on a black background, for any number.
 
-    Features must change nothing else. Without features of Gaussians, the rendering has none.
+    Features must not change the image. If Gaussians have no features, the rendering must have none.
     """
     trial = Trial(case)
     black = torch.zeros(3).to(case.device)
@@ -125,7 +127,7 @@ def check_features_are_blended_as_colours(case: Case) -> None:
 
 
 def check_render_gradients_match_differences(case: Case) -> None:
-    """Require that gradients in the Gaussians agree with finite differences."""
+    """Require that gradients with respect to Gaussians agree with finite differences."""
     trial = _broad(case)
     given = {"gaussians": tracked(trial.inputs["gaussians"])}
     for name, gradient in gradients(_brightness(trial(**given)), given).items():
@@ -133,10 +135,10 @@ def check_render_gradients_match_differences(case: Case) -> None:
 
 
 def check_camera_gradients_match_differences(case: Case) -> None:
-    """Require that gradients in poses and intrinsics agree with finite differences or are refused.
+    """Require that camera gradients agree with finite differences, or are refused.
 
-    A renderer may raise ValueError if a camera tensor requires a gradient that `camera_gradients`
-    does not list.
+    The gradients are those with respect to poses and intrinsics. A renderer may raise ValueError
+    for a camera tensor that requires a gradient and is not listed in `camera_gradients`.
     """
     component: Any = case.component
     declared = component.camera_gradients
@@ -157,7 +159,7 @@ def check_camera_gradients_match_differences(case: Case) -> None:
 
 
 def _broad(case: Case, seed: int = 0, views: int = 1) -> Trial:
-    """Return a trial with cameras (1, V) in front of broad Gaussians (1, G) in a row."""
+    """Return a trial with V cameras that see broad Gaussians one behind another."""
     sizes = Sizes(batch=1, queries=3, views=views)
     trial = Trial(case, sizes, seed)
     maker = Maker(case, sizes, seed)
@@ -176,10 +178,10 @@ def _broad(case: Case, seed: int = 0, views: int = 1) -> Trial:
 
 
 def _expect_changes(trial: Trial, name: str, gradient: Tensor) -> None:
-    """Expect that small steps of one input change the image as its gradient predicts.
+    """Expect that small changes of the input `name` change the image as its gradient predicts.
 
-    Gaussians move along the gradient and channel by channel. Cameras move along and about each of
-    their axes. Focal lengths and principal points change one by one.
+    Tensors of Gaussians change along the gradient and channel by channel. Cameras move along and
+    turn about each of their axes. Focal lengths and principal points change one by one.
     """
     x = leaves(trial.inputs)[name]
     # Pixels.
@@ -208,7 +210,7 @@ def _expect_changes(trial: Trial, name: str, gradient: Tensor) -> None:
 
 
 def _brightness(rendering: Any) -> Tensor:
-    """Return a smooth scalar function of the colours, alpha, depth and features."""
+    """Return a weighted mean of colours, alpha, depth and features, with smooth weights."""
     total = torch.zeros(()).double()
     for number, (_, image) in enumerate(named_tensors(rendering), 1):
         y, x = (torch.linspace(-1, 1, size, dtype=torch.float64) for size in image.shape[-2:])

@@ -29,8 +29,8 @@ from qgs_dev.vocabulary import (
 def check_head_gives_gaussians(case: Case) -> None:
     """Require unit quaternions, positive scales, opacities in (0, 1) and colours in [0, 1].
 
-    This also holds with initial parameters for ordinary features. `sh` and `features` must exist
-    exactly if the head provides them.
+    The check runs with initial and with perturbed parameters. Gaussians must have `sh` and
+    `features` if the head provides them, and must not have them otherwise.
     """
     trial = Trial(case)
     for factor in (0.0, 1.0, 100.0):
@@ -59,9 +59,10 @@ def _expect_gaussians(trial: Trial, factor: float, where: str) -> None:
 
 
 def check_queries_are_shared_by_scenes(case: Case) -> None:
-    """Require that learned queries start from the same state in any number of scenes.
+    """Require that learned queries start from the same state in every scene.
 
-    `start` must return the state that a forward pass returns.
+    The method `start`, called for one scene, must return the state that a forward pass gives each
+    scene of a batch.
     """
     if not issubclass(case.component, LearnedQueries):
         raise CannotCheck("these queries are not LearnedQueries, so they may read the photos")
@@ -74,9 +75,10 @@ def check_queries_are_shared_by_scenes(case: Case) -> None:
 
 
 def check_queries_resize(case: Case) -> None:
-    """Require that `resized` adapts a state dict with any number of queries to this component.
+    """Require that `resized` adapts a state dict with more or fewer queries to this component.
 
-    The check applies to components whose option `count` is the number of queries.
+    Queries that both have must be kept. The check applies to components whose option `count` is the
+    number of queries.
     """
     module = case.build()
     options = case.config.model_dump(mode="json")
@@ -99,9 +101,10 @@ def check_queries_resize(case: Case) -> None:
 
 
 def check_supervision_weights(case: Case) -> None:
-    """Require non-negative weights of existing layers, in ascending order, that sum to 1.
+    """Require that supervision weights are non-negative, sum to 1 and belong to existing layers.
 
-    This also holds with rounds of feedback. The end of every round must have a weight.
+    Layers must be in ascending order. With rounds of feedback, the last layer of every round must
+    have a weight.
     """
     depth = case.dims.depth
     for rounds in ([], [depth + 1, depth + 2]):
@@ -116,9 +119,10 @@ def check_supervision_weights(case: Case) -> None:
 
 
 def check_feedback_compares_the_photos(case: Case) -> None:
-    """Require that `compared` views have the poses, rays and mean colours of the photos.
+    """Require that `compared` returns views with the poses, rays and mean colours of the photos.
 
-    `rounds` and the results of `drawn` must not be negative. A round must repeat existing layers.
+    `rounds` and `drawn`, the numbers of rounds, must not be negative. A round must repeat at most
+    as many layers as the decoder has.
     """
     trial = Trial(case)
     module = trial.module
@@ -139,7 +143,7 @@ def check_feedback_compares_the_photos(case: Case) -> None:
 
 
 def _corners(cameras: Cameras) -> Tensor:
-    """Return x / z and y / z of the rays through two opposite image corners, (..., 4)."""
+    """Return x / z and y / z of the rays through two opposite image corners, shape (..., 4)."""
     focal = cameras.intrinsics[..., :2]
     principal = cameras.intrinsics[..., 2:]
     size = torch.tensor(cameras.size[::-1]).to(focal)
@@ -147,9 +151,9 @@ def _corners(cameras: Cameras) -> Tensor:
 
 
 def check_scenes_repeat(case: Case) -> None:
-    """Require the same name, cameras and images of a scene each time.
+    """Require that a scene has the same name, cameras and images each time the data are opened.
 
-    Images have the size of the cameras and values in [0, 1].
+    Images must be float32, of the cameras' size, with values in [0, 1].
     """
     first, second = (case.build().scenes("train")[0] for _ in range(2))
     expect(first.name == second.name, f"scene 0 is first `{first.name}`, then `{second.name}`")
@@ -164,7 +168,11 @@ def check_scenes_repeat(case: Case) -> None:
 
 
 def check_scenes_are_as_listed(case: Case) -> None:
-    """Require correct `names`, each scene once in `groups`, and held-out frames that exist."""
+    """Require that `names`, `groups` and held-out frames agree with the scenes of a split.
+
+    `names` must list the names of all scenes, `groups` must hold each scene once, and held-out
+    frames must exist.
+    """
     source = case.build()
     for split in get_args(Split):
         where = f"in the {split} split"
@@ -185,10 +193,10 @@ def check_scenes_are_as_listed(case: Case) -> None:
 
 
 def check_optimizer_steps(case: Case) -> None:
-    """Require that steps change exactly the parameters that have gradients.
+    """Require that steps change all parameters with a gradient, and no others.
 
-    Learning rates must be finite. Groups must hold all given parameters, with the `factor` of their
-    learning rate.
+    Learning rates must be finite. Parameter groups must hold all given parameters, and must have
+    the key `factor`, by which the learning rate is multiplied.
     """
     run = _Optimization(case)
     groups = run.torch_optimizer.param_groups
@@ -207,9 +215,10 @@ def check_optimizer_steps(case: Case) -> None:
 
 
 def check_optimizer_continues(case: Case) -> None:
-    """Require that an optimiser continues to the bit after its state is restored.
+    """Require bitwise equal results when training continues from a restored optimiser state.
 
-    The state is its own `state` and the values that torch's optimiser keeps per parameter.
+    The state consists of the optimiser's `state` and of the values that torch's optimiser keeps for
+    each parameter.
     """
     straight, first, second = (_Optimization(case) for _ in range(3))
     straight.step(range(6))
@@ -226,7 +235,7 @@ def check_optimizer_continues(case: Case) -> None:
 
 
 class _Optimization:
-    """Optimiser of three parameters: one decays, one does not, one gets no gradient."""
+    """Optimiser of three parameters: with weight decay, without it, and without a gradient."""
 
     def __init__(self, case: Case) -> None:
         generator = torch.Generator().manual_seed(0)
@@ -241,7 +250,7 @@ class _Optimization:
         )
 
     def step(self, steps: Iterable[int]) -> None:
-        """Run steps as training does, with other gradients in every step."""
+        """Take optimiser steps as training does, with random gradients for each step."""
         for step in steps:
             rate = self.optimizer.learning_rate(step, float(step))
             expect(0 <= rate < math.inf, f"the learning rate of step {step} is {rate}")

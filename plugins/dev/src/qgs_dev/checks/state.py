@@ -29,11 +29,11 @@ ROUNDING = 1e-8
 
 @seeded(0)
 def check_parameters_learn(case: Case) -> None:
-    """Require a finite, non-zero gradient of every trainable parameter within two optimiser steps.
+    """Require that every trainable parameter gets a finite, non-zero gradient within two steps.
 
-    A gradient below ROUNDING times the largest gradient is a rounding error. A component that draws
-    random numbers in training, for example to skip a layer, has twelve steps. If weights of a
-    release have no effect, the module that has them lists their names in `unlearned`.
+    Gradients below ROUNDING times the largest one count as zero. A component that uses random
+    numbers in training, for example to skip a layer, has twelve steps. A module with parameters
+    that have no effect, for compatibility with published weights, lists their names in `unlearned`.
     """
     module = case.build().double().train()
     unlearned = {
@@ -72,7 +72,7 @@ def check_parameters_learn(case: Case) -> None:
 
 
 def check_state_dict_keys(case: Case) -> None:
-    """Require the names and shapes in the state dict that the case expects, if it does."""
+    """Require that the state dict has the names and shapes in `Case.state_dict`, if it is given."""
     if case.state_dict is None:
         return
     shapes = {name: tuple(x.shape) for name, x in case.build().state_dict().items()}
@@ -82,7 +82,7 @@ def check_state_dict_keys(case: Case) -> None:
 
 
 def check_inputs_are_not_changed(case: Case) -> None:
-    """Require that forward and backward passes change neither values nor names of inputs."""
+    """Require that forward and backward passes do not change the inputs."""
     trial = Trial(case)
     for mode in each_mode(trial.module):
         inputs = trial.tracked()
@@ -95,10 +95,11 @@ def check_inputs_are_not_changed(case: Case) -> None:
 
 
 def check_outputs_share_no_memory(case: Case) -> None:
-    """Require that computed outputs share no memory with inputs, parameters or buffers.
+    """Require that outputs share no memory with inputs, parameters or buffers.
 
-    A refinement, a layer and a feedback may pass on fields that they do not provide. A layer and a
-    feedback may also pass on the memory, and a feedback the features.
+    Inputs that a component passes on unchanged are exempt: for a refinement, fields that it does
+    not provide and the features; for a layer, such fields and the image memory; for a feedback,
+    such fields, the features and the image memory.
     """
     trial = Trial(case)
     outputs = leaves(trial())
@@ -115,11 +116,11 @@ def check_outputs_share_no_memory(case: Case) -> None:
 
 
 def check_forward_keeps_no_state(case: Case) -> None:
-    """Require that a forward pass changes no parameter, buffer or attribute, private ones included.
+    """Require that a forward pass changes no parameter, buffer or attribute, public or private.
 
-    This holds in training and in evaluation; the next pass must give the same as a first one. Use
-    `ImageMemory.once` to compute a value once for all layers. Use a function of the sizes for
-    values that depend on sizes alone.
+    The check runs in training and in evaluation. A second pass must give the same results as the
+    first pass of a new instance. To share a value among layers, use `ImageMemory.once`. To cache a
+    value that depends on sizes only, use a cached function of the sizes.
     """
     trial = Trial(case)
     module = trial.module
@@ -143,7 +144,7 @@ def check_forward_keeps_no_state(case: Case) -> None:
 def check_eval_repeats_bitwise(case: Case) -> None:
     """Require bitwise equal outputs for equal inputs in evaluation, without random numbers.
 
-    Every global random state must stay the same.
+    The states of all global random generators must not change.
     """
     trial = Trial(case)
     others = other_generators()
@@ -156,7 +157,7 @@ def check_eval_repeats_bitwise(case: Case) -> None:
 
 
 def check_training_draws_from_torch(case: Case) -> None:
-    """Require that training draws only from torch's global generator and never seeds it."""
+    """Require that training uses only torch's global random generator, and never seeds it."""
     module = case.lively().train()
     before = other_generators()
     first, other, again = (_outputs(module, inputs_of(case), seed) for seed in (1, 2, 1))
@@ -167,17 +168,18 @@ def check_training_draws_from_torch(case: Case) -> None:
 
 
 def _outputs(module: Any, inputs: Inputs, seed: int) -> tuple[Any, torch.Tensor]:
-    """Return the outputs of a forward pass under `seed`, and torch's random state after it."""
+    """Return the outputs of a forward pass with torch's `seed`, and the random state after it."""
     with seeded(seed), torch.no_grad():
         outputs = cloned(module(*inputs.values()))
         return outputs, torch.get_rng_state()
 
 
 def check_scheduled_options_are_read_anew(case: Case) -> None:
-    """Require that a changed option in `scheduled` takes effect in the next call.
+    """Require that a change of a scheduled option takes effect in the next call.
 
-    The result must be that of a component built with the new value. The fields that a component
-    `reads` and `writes` must not depend on the option.
+    Scheduled options are those in `scheduled`. The result must be that of a component built with
+    the new value. The fields that the component requires and provides must not depend on such an
+    option.
     """
     for option in sorted(case.component.scheduled):
         other = case.with_config(_with_another(case.config, option))
@@ -195,7 +197,10 @@ def check_scheduled_options_are_read_anew(case: Case) -> None:
 
 
 def _with_another(config: ComponentConfig, option: str) -> ComponentConfig:
-    """Return `config` with half or twice a number, or 0.5 for 0; itself if neither is allowed."""
+    """Return `config` with another valid value of `option`; unchanged if no value tried is valid.
+
+    Half and twice the value are tried, or 0.5 and 1 for a value of 0.
+    """
     value = getattr(config, option)
     for other in (value / 2, 2 * value) if value else (0.5, 1):
         try:

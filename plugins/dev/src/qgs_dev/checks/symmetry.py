@@ -1,4 +1,4 @@
-"""Checks of symmetry: independent scenes, no order of queries or views, any world frame."""
+"""Checks that results do not depend on other scenes, on orders, or on the world frame."""
 
 from collections.abc import Callable, Collection
 from typing import Any
@@ -42,10 +42,11 @@ POSE = (
 
 
 def check_batch_independence(case: Case) -> None:
-    """Require that results for a scene do not depend on other scenes, in training too.
+    """Require that results for a scene do not depend on other scenes of the batch.
 
-    The gradient in other scenes must be exactly zero. Results must be the same beside other scenes
-    and alone.
+    Gradients of a scene's results with respect to other scenes must be exactly zero, in evaluation
+    and in training. Results must be the same in a batch with other scenes; in evaluation, also
+    alone.
     """
     sizes = many(case)
     trial = Trial(case, sizes)
@@ -72,9 +73,9 @@ def check_batch_independence(case: Case) -> None:
 
 
 def check_query_permutation(case: Case) -> None:
-    """Require that permuting the queries and their fields permutes the results for them.
+    """Require that a permutation of the queries permutes the results in the same way.
 
-    Renderings and losses must not change.
+    Fields and Gaussians are permuted with their queries. Renderings and losses must not change.
     """
     order = _shuffled(many(case).queries)
 
@@ -92,8 +93,8 @@ def check_query_permutation(case: Case) -> None:
 def check_view_permutation(case: Case) -> None:
     """Require that the order of views does not matter, unless `ordered_views` is declared.
 
-    An encoder or a cross-attention may declare it; then the order must matter. Tokens without a
-    grid, such as learned latents, keep their places.
+    An encoder or a cross-attention may declare `ordered_views`; then the order must matter. Tokens
+    of a memory without a grid, such as learned latents, must not be permuted.
     """
     order = _shuffled(many(case).views)
 
@@ -121,7 +122,7 @@ def check_view_permutation(case: Case) -> None:
 
 
 def _shuffled(count: int) -> list[int]:
-    """Return a permutation that moves every item."""
+    """Return a random permutation of `count` items that moves every item."""
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0)).tolist()
     # One cycle through all places moves every item; a fixed item would hide errors.
     return [order[(order.index(place) + 1) % count] for place in range(count)]
@@ -134,10 +135,11 @@ def _difference_after(
     outputs_too: bool,
     part: int,
 ) -> str:
-    """Describe how outputs after a permutation of the inputs `names` are wrong; "" if they agree.
+    """Compare outputs with the expected ones after a permutation of the inputs `names`.
 
-    outputs_too: permute the expected outputs. part: index of the part to permute, 0 for the state
-    and 1 for the memory.
+    Returns a description of the first difference, or "". outputs_too: True if the outputs should be
+    permuted, too. part: which output of a layer should be permuted, 0 for the state and 1 for the
+    memory.
     """
     trial = Trial(case, many(case))
     moved = {name: permute(x) if name in names else x for name, x in trial.inputs.items()}
@@ -151,7 +153,7 @@ def _difference_after(
 
 
 def check_world_frame_makes_no_difference(case: Case) -> None:
-    """Require that moving Gaussians, fields and cameras together changes no image or loss."""
+    """Require that moving Gaussians, fields and cameras by one rigid motion changes no result."""
     trial = Trial(case)
     pose = torch.tensor(POSE).to(case.device)
     places = required_places(case)

@@ -1,4 +1,4 @@
-"""The command `qgs bench`: size, latency and memory of models as tables and a JSON report."""
+"""Command `qgs bench`: size, latency and memory of models, as tables and a JSON report."""
 
 from pathlib import Path
 from typing import Annotated, TypeAlias, get_args
@@ -10,38 +10,38 @@ from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_th
 app = typer.Typer(help="Measure speed, memory and size of models.")
 
 InputViews: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Input views. Default: the recipe's.")
+    int | None, typer.Option(min=1, help="Number of input photos. Default: that of the recipe.")
 ]
 Memory: TypeAlias = Annotated[
-    bool, typer.Option("--memory", help="Also measure peak memory, each in a fresh process.")
+    bool, typer.Option("--memory", help="Also measure peak memory, in fresh processes.")
 ]
 Report: TypeAlias = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="New file for a JSON report with all samples.")
+    Path | None, typer.Option(metavar="FILE", help="New file for a JSON report with all times.")
 ]
 
 
 @app.command()
 def bench(
-    recipes: Annotated[list[Path], typer.Argument(help="Recipe files; ratios are to the first.")],
+    recipes: Annotated[
+        list[Path], typer.Argument(help="Recipe files. Ratios are relative to the first.")
+    ],
     overrides: Overrides = None,
     views: InputViews = None,
     size: Size = None,
     batch: Annotated[int, typer.Option(min=1, help="Scenes per batch.")] = 1,
-    precision: Annotated[str, typer.Option(help="float32 or bf16 (autocast).")] = "float32",
+    precision: Annotated[str, typer.Option(help="float32, or bf16 for autocast.")] = "float32",
     step: Annotated[bool, typer.Option("--step", help="Also measure training steps.")] = False,
     memory: Memory = False,
-    renderer: Annotated[
-        bool, typer.Option("--renderer", help="Also measure the renderer.")
-    ] = False,
-    rounds: Annotated[int, typer.Option(min=1, help="Samples of each latency.")] = 10,
-    warmup: Annotated[int, typer.Option(min=0, help="Calls before the first sample.")] = 2,
+    renderer: Annotated[bool, typer.Option("--renderer", help="Also measure rendering.")] = False,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of measured calls.")] = 10,
+    warmup: Annotated[int, typer.Option(min=0, help="Number of calls before measuring.")] = 2,
     json: Report = None,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Measure size, latency and memory of models, for any number of recipes.
+    """Measure size, latency and memory of the models of one or more recipes.
 
-    Weights, photos and poses are random. Latency and FLOPs go to the Gaussians.
+    Weights, photos and poses are random. Latency and FLOPs are those from photos to Gaussians.
     """
     from rich.console import Console
 

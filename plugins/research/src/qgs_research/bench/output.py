@@ -1,4 +1,4 @@
-"""Tables of measurements."""
+"""Tables that `qgs bench` prints."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -18,12 +18,13 @@ TITLES = {
 
 
 def show(report: Mapping[str, Any], console: Console) -> None:
-    """Print a table of the models, then one table per measured quantity."""
+    """Print a table of the models, then a table for each measured quantity."""
     entries = report["recipes"]
     base = entries[0]
     of = "{device} ({processor}, {threads} threads), torch {torch}".format(**report["machine"])
     rounds = "{rounds} rounds after {warmup} of warm-up".format(**report)
-    console.print(f"{base['precision']}, {of}; {rounds}, ratios to the first recipe", markup=False)
+    settings = f"{base['precision']}, {of}; {rounds}"
+    console.print(f"{settings}; ratios are relative to the first recipe", markup=False)
     names = [escape(name) for name in short_names([entry["recipe"] for entry in entries])]
 
     def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -53,7 +54,7 @@ def _size_cells(entry: Mapping[str, Any]) -> tuple[str, ...]:
     parameters = entry["parameters"]
     return (
         " x ".join(map(str, (entry["views"], *entry["size"]))),
-        f"{entry['gaussians']:,}" if entry["gaussians"] else "by the views",
+        f"{entry['gaussians']:,}" if entry["gaussians"] else "per view",
         f"{parameters['count']:,}",
         f"{parameters['ratio']:.3f}",
         f"{parameters['weight_bytes'] / MEBIBYTE:,.2f}",
@@ -69,7 +70,7 @@ def _memory_cells(peak: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def _cells(found: Mapping[str, float], scale: float) -> tuple[str, str]:
-    """Return median and quartiles as texts with four digits."""
+    """Format the median, and the range of the quartiles, with four digits."""
     shown = []
     for quartile in ("lower_quartile", "median", "upper_quartile"):
         value = found[quartile] * scale

@@ -1,4 +1,4 @@
-"""Measurement of recipes: first memory, each in its own process, then seconds, in turns."""
+"""Measurement of recipes: memory in separate processes, then latency in alternating rounds."""
 
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -38,20 +38,23 @@ def measure_recipes(
     overrides: Sequence[str],
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Measure size and forward latency of all recipes, with initial weights.
+    """Measure size and forward latency of the models of all recipes, with initial weights.
 
-    All models stay in memory while latencies are measured, because each round runs all of them.
+    All models are in memory at once, because each round runs all of them.
 
     Args:
         names: recipes, as for `resolve`.
         work: fields of the workload, as for `workload_of`.
-        step, memory, renderer: also measure training steps, peak memory or the renderer.
-        rounds: samples of each latency, after `warmup` calls.
-        overrides: changes to all recipes.
-        say: called with a description of the next measurement.
+        step: True also measures training steps.
+        memory: True also measures peak memory.
+        renderer: True also measures rendering.
+        rounds: number of measured calls of each operation, after `warmup` unmeasured calls.
+        overrides: options to set in all recipes.
+        say: function that is called with a description of each measurement before it starts.
 
-    Returns the report as plain values for JSON: seconds with every sample, bytes, and ratios to the
-    first recipe, round by round. Raises the errors of the models and of `peak_memory`.
+    Returns the report as plain values for JSON: all measured seconds, bytes, and ratios to the
+    first recipe, which are computed in each round. Raises the errors of the models and of
+    `peak_memory`.
     """
     recipes = [resolve(name, overrides) for name in names]
     works = [workload_of(recipe, **work) for recipe in recipes]
@@ -89,7 +92,10 @@ def measure_recipes(
 
 
 def _sizes(model: QueryGaussianModel) -> dict[str, Any]:
-    """Return numbers of queries, Gaussians (None if views decide), parameters and weight bytes."""
+    """Return the numbers of queries, Gaussians, parameters and bytes of weights.
+
+    The number of Gaussians is None if it depends on the number of input photos.
+    """
     queries = model.queries.count
     return {
         "queries": queries,
@@ -102,9 +108,9 @@ def _sizes(model: QueryGaussianModel) -> dict[str, Any]:
 
 
 def forward_flops(recipe: Recipe, workload: Workload) -> int:
-    """Return the floating-point operations of matrix products and convolutions in a forward pass.
+    """Return the number of floating-point operations in a forward pass.
 
-    They are counted from shapes. A multiplication and an addition count as two.
+    Matrix products and convolutions are counted, from shapes. A multiply-add counts as two.
     """
     # On the meta device nothing is computed, and attention is matrix products, which are counted;
     # kernels of our own would not be. The counter hooks into modules, which needs gradients to be
@@ -117,7 +123,7 @@ def forward_flops(recipe: Recipe, workload: Workload) -> int:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """Return processor, threads and versions for the report."""
+    """Return the device, processor, number of threads and versions for the report."""
     return {
         "device": device,
         "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
@@ -128,7 +134,7 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def quartiles(samples: Sequence[float]) -> dict[str, float]:
-    """Return quartiles by name (linear interpolation)."""
+    """Return lower quartile, median and upper quartile of `samples`, by name."""
     names = ("lower_quartile", "median", "upper_quartile")
     return dict(zip(names, np.quantile(samples, (0.25, 0.5, 0.75)).tolist(), strict=True))
 
@@ -138,9 +144,9 @@ def in_turn(
     rounds: int,
     warmup: int,
 ) -> list[list[float]]:
-    """Return the seconds of each task in every round, after `warmup` unmeasured calls.
+    """Call all tasks in each round, and return the seconds of each task in each round.
 
-    The clock of torch.utils.benchmark waits for a GPU.
+    The first `warmup` rounds are not measured. On a GPU, the clock waits for the end of the work.
     """
     columns: list[list[float]] = [[] for _ in tasks]
     for _ in range(warmup + rounds):

@@ -1,4 +1,4 @@
-"""Inputs of a given size, and operations to call repeatedly."""
+"""Benchmark inputs of a given size, and operations to measure."""
 
 import sys
 from collections.abc import Callable
@@ -25,8 +25,8 @@ from qgs.types import Cameras, Gaussians, Views
 class Workload:
     """Size of the inputs of a measurement.
 
-    views, targets: number of photos read and rendered per scene. size: (H, W) of both in pixels.
-    batch: scenes per call. precision: float32, or bf16 for autocast.
+    views: number of input photos per scene. targets: number of rendered photos per scene. size: (H,
+    W) of all photos in pixels. batch: scenes per call. precision: float32, or bf16 for autocast.
     """
 
     views: int
@@ -40,9 +40,11 @@ class Workload:
 def workload_of(
     recipe: Recipe, views: int | None = None, size: tuple[int, int] | None = None, **more: Any
 ) -> Workload:
-    """Return the workload of `recipe`, by default with its `views` and `data.image_size`.
+    """Return the workload for `recipe`.
 
-    more: further fields. Raises ValueError if neither the recipe nor `size` gives the image size.
+    views: number of input photos; None takes that of the recipe. size: (H, W) in pixels; None takes
+    `data.image_size`. more: values of other fields of `Workload`. Raises ValueError if the image
+    size is unknown.
     """
     if size is None and recipe.data_config:
         size = recipe.data_config.image_size
@@ -55,10 +57,10 @@ def workload_of(
 
 
 def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
-    """Return random photos with times, from cameras on an arc that look at its centre (0, 0, 1).
+    """Return `count` random photos (noise) for each of `batch` scenes, with cameras and times.
 
-    The pose of the first camera is the identity. The field of view is about 53 degrees across the
-    longer side.
+    Cameras are on an arc and look at its centre (0, 0, 1). The pose of the first camera is the
+    identity. The field of view is about 53 degrees along the longer side of a photo.
     """
     # All recipes and processes get equal photos.
     generator = torch.Generator().manual_seed(seed)
@@ -83,10 +85,11 @@ Operation: TypeAlias = Literal["forward", "render", "step"]
 def make_task(
     operation: Operation, recipe: Recipe, model: QueryGaussianModel, workload: Workload
 ) -> Task:
-    """Return `operation` as a function without arguments that changes at most the weights.
+    """Return a function without arguments that executes `operation` once.
 
-    forward: photos to the last layer's Gaussians, without gradients. render: those Gaussians at the
-    target cameras, without gradients. step: a whole training step.
+    forward: from photos to the Gaussians of the last layer, without gradients. render: rendering of
+    these Gaussians at the target cameras, without gradients. step: a whole training step, which
+    changes the weights.
     """
     inputs, targets = (
         posed_photos(workload.batch, count, workload.size, seed).to(workload.device)
@@ -123,10 +126,10 @@ def make_task(
 
 @dataclass(frozen=True)
 class Peak:
-    """Peak memory of an operation.
+    """Peak memory of an operation, in bytes.
 
-    peak_bytes: on a CPU the largest resident set of the process, on a GPU the most that torch
-    allocated. idle_bytes: memory before the model was built.
+    peak_bytes: on a CPU, the largest resident set size of the process; on a GPU, the largest memory
+    that torch allocated. idle_bytes: memory in use before the model was built.
     """
 
     peak_bytes: int
@@ -134,7 +137,7 @@ class Peak:
 
 
 def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, threads: int) -> Peak:
-    """Build the model in a fresh process, run `operation` there, and return the peak.
+    """Run `operation` once in a fresh process and return its peak memory.
 
     Raises ChildProcessError if the process was killed, and the errors of the model.
     """
@@ -150,7 +153,7 @@ def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, thread
 
 
 def measure(tree: dict[str, Any], operation: Operation, workload: Workload, threads: int) -> Peak:
-    """Return the peak of this process; see `peak_memory`."""
+    """Run `operation` in this process and return its peak memory; see `peak_memory`."""
     torch.set_num_threads(threads)
     recipe = resolve(tree)
     on_gpu = workload.device == "cuda"
@@ -170,7 +173,11 @@ def measure(tree: dict[str, Any], operation: Operation, workload: Workload, thre
 
 
 def resident_bytes(field: str) -> int:
-    """Return resident bytes now (VmRSS) or their peak (VmHWM); outside Linux always the peak."""
+    """Return the resident memory of this process in bytes.
+
+    field: VmRSS for the present memory, VmHWM for the peak. Other systems than Linux always return
+    the peak.
+    """
     status = Path("/proc/self/status")
     if status.exists():
         lines = status.read_text().splitlines()

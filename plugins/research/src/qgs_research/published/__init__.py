@@ -1,1 +1,1 @@
-"""Published weights become checkpoints of qgs: `importing` is `qgs import` in Python."""
+"""Import of published weights as checkpoints of qgs."""

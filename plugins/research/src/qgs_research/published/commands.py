@@ -1,4 +1,4 @@
-"""The commands `qgs import` and `qgs export`."""
+"""Commands `qgs import` and `qgs export`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +8,7 @@ import typer
 from qgs.cli.options import Checkpoint, Overrides
 
 app = typer.Typer(help="Turn published weights into checkpoints.")
-export_app = typer.Typer(help="Write checkpoints again.")
+export_app = typer.Typer(help="Copy checkpoints, also in half precision.")
 
 
 @app.command()
@@ -17,16 +17,16 @@ def import_(
         Path, typer.Argument(help="Published weights: .safetensors, or .pt .pth .bin .ckpt.")
     ],
     recipe: Annotated[
-        str, typer.Option(help="Recipe of the model. auto: derive it from the weights.")
+        str, typer.Option(help="Recipe of the model. auto derives it from the weights.")
     ],
-    out: Annotated[Path, typer.Option(help="New checkpoint; never overwritten.")],
+    out: Annotated[Path, typer.Option(help="New file for the checkpoint; must not exist.")],
     overrides: Overrides = None,
 ) -> None:
     """Turn published weights into a checkpoint. An unknown tensor is an error.
 
-    `--recipe auto` also writes the recipe that fits, changed by every --set, beside the checkpoint
-    as .yaml. A recipe without data has no image size: give `--set data.type=qgs/photos --set
-    data.path=PHOTOS --set data.image_size=[256,256]`, or later `qgs reconstruct --size`.
+    `--recipe auto` also writes the derived recipe, with all options of --set, to a .yaml file
+    beside the checkpoint. A recipe without data has no image size: give `--set data.type=qgs/photos
+    --set data.path=PHOTOS --set data.image_size=[256,256]`, or later `qgs reconstruct --size`.
     """
     from qgs.recipe import resolve
     from qgs_research.published.importing import import_weights
@@ -39,12 +39,12 @@ def import_(
 @export_app.command()
 def export(
     checkpoint: Checkpoint,
-    out: Annotated[Path, typer.Option(help="New .safetensors file; never overwritten.")],
+    out: Annotated[Path, typer.Option(help="New .safetensors file; must not exist.")],
     half: Annotated[
         bool, typer.Option("--half", help="Store float16; loading converts to float32.")
     ] = False,
 ) -> None:
-    """Copy a checkpoint into one new file; --half halves its size."""
+    """Copy a checkpoint to a new file. With --half, weights are float16, at half the size."""
     from qgs_research.published.importing import export_checkpoint
 
     export_checkpoint(checkpoint, out, half)

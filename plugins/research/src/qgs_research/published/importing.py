@@ -1,6 +1,6 @@
 """Import of published weights as checkpoints, and export of checkpoints.
 
-Every published tensor is used, dropped by name, or an error.
+A published tensor that is neither used nor listed as unused by its layout is an error.
 """
 
 import os
@@ -30,10 +30,10 @@ from qgs_research.published.weight_files import WeightFile, read_weight_file
 
 
 class Transfer(NamedTuple):
-    """Result of `import_weights`. report: lines of text.
+    """Result of `import_weights`: the recipe of the model, and a report as lines of text.
 
-    The report says how the file was read and converted, which tensors are unused and which options
-    the weights do not determine. It lists those options that differ from the published model.
+    The report says how the file was read and converted, which tensors are unused, and where options
+    that weights do not determine differ from the published model.
     """
 
     recipe: Recipe
@@ -49,11 +49,12 @@ def import_weights(
 ) -> Transfer:
     """Write a checkpoint of `recipe` with published weights.
 
-    recipe: None derives it from the weights, changes it by `overrides` (for example
-        "data.image_size=[64, 64]") and writes it beside `out` as .yaml.
-    out: a new .safetensors file.
-    Raises FileNotFoundError, FileExistsError, ValueError for another suffix, RecipeError about
-    `overrides`, CheckpointError and PublishedError. After an error no file is written.
+    weights: file of published weights. recipe: None derives the recipe from the weights, changes it
+    by `overrides`, for example "data.image_size=[64, 64]", and writes it to a .yaml file beside
+    `out`. out: path of a new .safetensors file. Raises FileNotFoundError, FileExistsError,
+    ValueError for a wrong suffix of `out`, RecipeError for wrong `overrides`, CheckpointError for
+    unreadable weights and PublishedError for weights that do not fit. After an error no file is
+    left.
     """
     out = new_checkpoint_path(out)
     # A given recipe needs no second file.
@@ -68,7 +69,7 @@ def import_weights(
         recipe = resolve(tree, overrides)
         lines = [
             f"# Derived from {file.path.name}, weights of {layout.name} ({layout.source}).",
-            "# Shapes do not determine the following; the published values are used:",
+            "# Shapes do not determine these options; the published values are used:",
             *(f"#   {choice}" for choice in layout.undecided),
             *(f"# Overridden: {override}" for override in overrides),
         ]
@@ -91,21 +92,21 @@ def import_weights(
     report = [*file.notes, *converted, used]
     dropped = [tensor for tensor in names.unused if tensor in file.tensors]
     if dropped:
-        report.append(f"dropped {len(dropped)} tensors that {name} never reads:")
+        report.append(f"dropped {len(dropped)} tensors that the code of {name} never reads:")
         report += [f"  {tensor}" for tensor in dropped]
     if settings:
         report.append(f"options that weights do not determine differ from {name}:")
         report += [f"  {path}: {a} ({name}: {b})" for path, (a, b) in settings.items()]
     report.append(f"wrote {out}")
     if recipe_file:
-        report.append(f"wrote {recipe_file}; its head lists options that shapes do not determine")
+        report.append(f"wrote {recipe_file}; its head lists options that weights do not determine")
     return Transfer(recipe, report)
 
 
 def _without_prefix(file: WeightFile) -> WeightFile:
-    """Return `file` without a prefix of all names, and with a note, if published names remain.
+    """Remove a common prefix of all names if the remaining names are known, and note it.
 
-    Training frameworks prepend the attribute that holds the model (`model.`, `module.`).
+    Training frameworks prepend the attribute that holds the model, such as `model.` or `module.`.
     """
     # A common prefix is a prefix of any name, so the first name is enough.
     modules = next(iter(file.tensors)).split(".")[:-1]
@@ -119,9 +120,10 @@ def _without_prefix(file: WeightFile) -> WeightFile:
 
 
 def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list[str]]:
-    """Return contiguous float32 tensors under our names, and a note about conversions.
+    """Return contiguous float32 tensors by their names in qgs, and notes about conversions.
 
-    Raises PublishedError for weights that are not real numbers, and for NaN and infinity.
+    Raises PublishedError for weights that are not floating-point numbers, and the error of
+    `refuse_nonfinite` for NaN and infinity.
     """
     given = names.from_published(file.tensors, file.path)
     others = {name: t.dtype for name, t in given.items() if t.dtype != torch.float32}
@@ -131,7 +133,8 @@ def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list
     strange = [names.published[n] for n, dtype in others.items() if not dtype.is_floating_point]
     if strange:
         raise PublishedError(
-            f"{file.path} holds weights that are not real numbers: {listed(strange)} ({report})"
+            f"{file.path} holds weights that are not floating-point numbers: {listed(strange)} "
+            f"({report})"
         )
     tensors: dict[str, Tensor] = {}
     stored: set[int] = set()
@@ -145,9 +148,9 @@ def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list
 
 
 def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool) -> None:
-    """Write a checkpoint again. half: store real numbers as float16, and the rest unchanged.
+    """Copy a checkpoint to a new file. half: True stores floating-point weights as float16.
 
-    Raises the errors of `CheckpointFile`, and CheckpointError if float16 cannot hold a weight.
+    Raises the errors of `CheckpointFile`, and CheckpointError if a weight is too large for float16.
     """
     out = new_checkpoint_path(out)
     with CheckpointFile(name) as file:
@@ -166,11 +169,14 @@ def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool)
 
 
 def new_checkpoint_path(path: str | Path) -> Path:
-    """Return `path`; raise ValueError for a wrong suffix, FileExistsError if it exists."""
+    """Return `path`, after a check that it is free and ends in .safetensors.
+
+    Raises ValueError for another suffix, and FileExistsError for an existing file.
+    """
     path = Path(path)
     if path.suffix.lower() != ".safetensors":
         raise ValueError(
-            f"{path}: checkpoints are safetensors files; let the name end in .safetensors"
+            f"{path}: checkpoints are safetensors files; choose a name that ends in .safetensors"
         )
     refuse_existing(path)
     return path

@@ -1,4 +1,4 @@
-"""Published codebases: names of their parameters, and recipes derived from shapes."""
+"""Published codebases: their parameter names, and recipes derived from shapes of weights."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from qgs_research.published.weight_layout import LayoutError, WeightLayout, rena
 
 # TokenGS comes first, because it is the most general.
 LAYOUTS = (TOKENGS, LOCUSGS, MVSPLAT, DEPTHSPLAT, TOKENGS_2026_6)
-"""The published codebases."""
+"""All published codebases whose weights can be imported."""
 
 
 class PublishedError(ValueError):
@@ -27,11 +27,11 @@ class PublishedError(ValueError):
 
 @dataclass(frozen=True)
 class Names:
-    """Names of the parameters of a recipe's model, ours and the published ones.
+    """Parameter names of a recipe's model, in qgs and in the published weights.
 
-    shapes: shape of each of our parameters. published: our name -> published name, both unique.
-    unnamed: our names without a published name. unused: further names that a published file may
-    hold; the published code ignores them.
+    shapes: shapes by name in qgs. published: published names by name in qgs. unnamed: names in qgs
+    without a published name. unused: names of tensors that a published file may hold, but that the
+    published code ignores.
     """
 
     layout: WeightLayout
@@ -43,26 +43,27 @@ class Names:
     def from_published(
         self, weights: Mapping[str, Tensor], origin: object = "the file"
     ) -> dict[str, Tensor]:
-        """Return a published state dict under our names and without the `unused` tensors.
+        """Translate a published state dict to the names in qgs, without the `unused` tensors.
 
-        Raises PublishedError with all differences in names and shapes.
+        Raises PublishedError that lists all differences in names and shapes. origin: name of the
+        file in this message.
         """
         wanted = {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
-        found = [f"no published name: {name}" for name in self.unnamed]
+        found = [f"{name} has no published name" for name in self.unnamed]
         given = {name: w for name, w in weights.items() if name not in self.unused}
         if found := found + differing_tensors(shapes_of(given), wanted):
             raise PublishedError(
                 f"{origin} does not fit the recipe of a {self.layout.name}; "
-                f"`--recipe auto` writes one that fits. {len(found)} differences:\n  "
+                f"`--recipe auto` writes a recipe that fits. {len(found)} differences:\n  "
                 + listed(found, 20, "\n  ")
             )
         return {ours: weights[theirs] for ours, theirs in self.published.items()}
 
 
 def names_of(recipe: Recipe) -> Names:
-    """Return both names of all parameters of `recipe`, by the first layout that fits it.
+    """Return the parameter names of `recipe` in qgs and in the first layout that fits it.
 
-    Raises PublishedError with the components that each layout does not know.
+    Raises PublishedError that lists the components that each layout does not know.
     """
     reasons = []
     # Use only plugins of this recipe, because others could claim its names.
@@ -75,7 +76,7 @@ def names_of(recipe: Recipe) -> Names:
 
 
 def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
-    """Describe the components of `recipe` that a codebase does not know, one line each."""
+    """Return one line for each component of `recipe` that a published codebase does not have."""
     found: dict[str, None] = {}
     types: dict[str, set[str]] = {}
     for path, chosen in recipe.parts.items():
@@ -107,17 +108,17 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
 
 
 def recognise(shapes: Shapes) -> WeightLayout | None:
-    """Return the layout that fits a state dict best, or None."""
+    """Return the layout whose marks are all in a state dict, or None."""
     found = [layout for layout in LAYOUTS if set(layout.marks) <= set(shapes)]
     # A later release of a codebase has all names of the earlier one.
     return max(found, key=lambda layout: len(layout.marks), default=None)
 
 
 def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str, Any]]:
-    """Return the layout of a state dict and the recipe that fits its sizes, as a plain mapping.
+    """Return the layout of a state dict, and a recipe that fits it, as a plain mapping.
 
-    Raises PublishedError about `origin` if no layout knows the names, or if no recipe fits the
-    names and shapes.
+    origin: name of the file for messages. Raises PublishedError if no layout has these names, or if
+    no recipe fits the names and shapes.
     """
     layout = recognise(shapes)
     if layout is None:

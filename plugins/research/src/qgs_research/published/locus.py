@@ -1,4 +1,4 @@
-"""Layout of LocusGS: published names of weights, and the recipe that fits a state dict."""
+"""Published weights of LocusGS: parameter names, and the recipe that fits a state dict."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Layouts of MVSplat and DepthSplat: published names of weights, and recipes that fit."""
+"""Published weights of MVSplat and DepthSplat: parameter names, and recipes that fit."""
 
 from typing import Any
 
@@ -16,13 +16,13 @@ _VIT = _PREDICTOR + "pretrained."
 _UPSAMPLER = "encoder.feature_upsampler."
 _HEAD = "encoder.gaussian_head.2.weight"
 _HEAD_WIDTH = 64
-"""Channels per head of every DINOv2."""
+"""Channels per attention head in every DINOv2 model."""
 _BLOCKS = {12: [2, 5, 8, 11], 24: [4, 11, 17, 23]}
-"""Blocks that are read, by depth of the ViT."""
+"""Indices of the ViT blocks whose outputs are used, by number of blocks."""
 _CNN_WIDTHS = [64, 96, 128]
-"""Published channels of the stages of MVSplat's CNN."""
+"""Channels of the three stages of MVSplat's CNN."""
 _HARMONICS = (4, 9, 16, 25)
-"""Number of harmonics per colour channel for degrees 1 to 4."""
+"""Number of spherical harmonics per colour channel, for degrees 1 to 4."""
 _EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement"))
 
 
@@ -39,15 +39,18 @@ def _recipe(model: dict[str, Any]) -> dict[str, Any]:
 
 
 def _stages(shapes: Shapes, cnn: str) -> list[int]:
-    """Return the channels of the three stages of the CNN stored as `cnn`."""
+    """Return the channels of the three stages of a CNN. cnn: prefix of its parameter names."""
     return [size_at(shapes, f"{cnn}layer{n}.0.conv1.weight", 0) for n in (1, 2, 3)]
 
 
 def _unet_levels(shapes: Shapes, name: str) -> int:
-    """Return the number of levels of the U-Net `name`; each has two blocks on the way up."""
+    """Return the number of levels of a U-Net with two output blocks per level.
+
+    name: prefix of its parameter names. Raises LayoutError for an odd number of blocks.
+    """
     numbers = {key[len(name) :].split(".")[1] for key in shapes if key.startswith(name + "output")}
     if not numbers or len(numbers) % 2:
-        raise LayoutError(f"there are {len(numbers)} {name}output_blocks, not two for each level")
+        raise LayoutError(f"{name}output_blocks has {len(numbers)} blocks, not two for each level")
     return len(numbers) // 2
 
 
@@ -82,9 +85,9 @@ def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
 
 
 def depthsplat_encoder(shapes: Shapes) -> dict[str, Any]:
-    """Return the options of the encoder, read off the shapes of published weights.
+    """Return the options of DepthSplat's encoder that fit the shapes of published weights.
 
-    Raises LayoutError for shapes that no release has.
+    Raises LayoutError for a number of scales or blocks that no published model has.
     """
     scales = layer_count(shapes, _PREDICTOR + "regressor.")
     width = size_at(shapes, _VIT + "norm.weight", 0)
@@ -122,7 +125,7 @@ def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
     raw = size_at(shapes, _HEAD, 0)
     two = encoder["scales"] == 2
     if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
-        raise LayoutError(f"{_HEAD}: {raw} channels are not 10 plus the harmonics of a degree")
+        raise LayoutError(f"{_HEAD}: {raw} channels are not 10 + 3 (degree + 1)^2")
     # One layer for each depth, so that both depths can be supervised.
     decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
     supervision = {"type": "mvsplat/decayed", "layers": [1, 2]}

@@ -1,4 +1,4 @@
-"""Layout of TokenGS: published names of weights, and the recipe that fits a state dict."""
+"""Published weights of TokenGS: parameter names, and the recipe that fits a state dict."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ DECODER = "enc_dec_backbone.decoder_blocks."
 
 
 def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
-    """Return the part of `model` that TokenGS and models built on it share; raises LayoutError.
+    """Return the options of `model` that TokenGS shares with models built on it.
 
-    queries: the `type` of the queries.
+    queries: component type of `model.queries`. Raises LayoutError for shapes that do not fit.
     """
     count = size_at(shapes, "gs_tokens", 0)
     width = size_at(shapes, "gs_tokens", 1)
@@ -50,7 +50,7 @@ def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
 
 
 def read_tokengs(shapes: Shapes) -> dict[str, Any]:
-    """Return the recipe of a TokenGS from its names and shapes; raises LayoutError."""
+    """Return the recipe that fits the weights of a TokenGS. Raises LayoutError if none fits."""
     model = backbone(shapes, "qgs/latent")
     model["decoder"] |= {
         "cross_attention": {"type": "qgs/content"},

@@ -1,4 +1,4 @@
-"""Layout of TokenGS 2026.6: published names of weights, and the recipe that fits."""
+"""Published weights of TokenGS 2026.6: parameter names, and the recipe that fits."""
 
 from typing import Any
 
@@ -36,17 +36,17 @@ def _read(shapes: Shapes) -> dict[str, Any]:
 
 
 def _channels(shapes: Shapes, module: str) -> int:
-    """Return the channels of a time embedding, or 0 without one."""
+    """Return the channels of the time embedding in `module`, or 0 if it has none."""
     name = f"{module}.proj.weight"
     return size_at(shapes, name, 1) if name in shapes else 0
 
 
 def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
-    """Return options of the encoder of `depth` blocks that TokenGS does not have."""
+    """Return the encoder options that TokenGS 2026.6 adds to TokenGS. depth: number of blocks."""
     scales = layer_count(shapes, READOUT)
     if scales > depth:
         raise LayoutError(
-            f"{READOUT}: {scales} norms (one per block read) do not fit {depth} blocks"
+            f"{READOUT}: {scales} norms, one for each used block, do not fit {depth} blocks"
         )
     step = 2 if 2 * scales <= depth + 1 else 1
     found: dict[str, Any] = {"blocks": list(range(depth - step * (scales - 1), depth + 1, step))}

@@ -1,4 +1,4 @@
-"""Files of published weights: flat state dicts in safetensors or in torch's formats."""
+"""Reader of published weights: flat state dicts in safetensors files or torch files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,14 +13,15 @@ from qgs.wording import listed
 
 TORCH = (".pt", ".pth", ".bin", ".ckpt")
 NESTING = ("model", "state_dict", "module")
-"""Keys under which training scripts store the state dict, beside other values."""
+"""Keys under which training scripts store the state dict in a file with other values."""
 
 
 @dataclass(frozen=True)
 class WeightFile:
-    """Flat state dict. tensors: by name, memory-mapped if the format allows it.
+    """Flat state dict of a file.
 
-    notes: sentences that say how it was found in the file.
+    tensors: tensors by name, memory-mapped if the format allows it. notes: lines that say how the
+    state dict was found in the file.
     """
 
     path: Path
@@ -29,27 +30,28 @@ class WeightFile:
 
 
 def read_weight_file(path: str | Path) -> WeightFile:
-    """Return the state dict in a file; memory-mapped pages are read when they are used.
+    """Open the state dict in a file. Memory-mapped tensors are read when they are used.
 
-    Raises FileNotFoundError, and CheckpointError unless the file holds a state dict of tensors.
+    Raises FileNotFoundError for a missing file, and CheckpointError for a file that does not hold a
+    state dict of tensors.
     """
     path = Path(path)
     notes = list[str]()
     if not path.is_file():
-        raise FileNotFoundError(f"no file of weights at {path}")
+        raise FileNotFoundError(f"there is no file of weights {path}")
     if path.suffix.lower() == ".safetensors":
         with TensorFile(path) as file:
             # An import would lose its recipe.
             if "qgs.recipe" in file.metadata:
                 raise CheckpointError(
-                    f"{path} is already a qgs checkpoint; import files of published weights only"
+                    f"{path} is already a qgs checkpoint, so there is nothing to import"
                 )
             tensors = file.read()
     elif path.suffix.lower() in TORCH:
         tensors = _read_torch(path, notes)
     else:
         known = ", ".join((".safetensors", *TORCH))
-        raise CheckpointError(f"{path}: the name of a file of weights must end in {known}")
+        raise CheckpointError(f"{path}: the name of a file of weights must end in one of {known}")
     if not tensors:
         raise CheckpointError(f"{path} holds no tensors")
     return WeightFile(path, tensors, tuple(notes))
@@ -61,9 +63,9 @@ def _read_torch(path: Path, notes: list[str]) -> dict[str, Tensor]:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except Exception as error:  # whatever torch raises about a file that it cannot read
         raise CheckpointError(
-            f"{path} is not a complete torch file of plain tensors ({type(error).__name__}); it is "
-            "cut off, or holds Python objects, which could run code. Copy it again, or save only "
-            "`model.state_dict()`"
+            f"{path} cannot be read as a torch file of tensors ({type(error).__name__}): it is "
+            "incomplete, or it holds Python objects, which could run code. Copy it again, or save "
+            "only `model.state_dict()`"
         ) from error
     try:
         return _state_dict(content, path, notes)
@@ -74,9 +76,9 @@ def _read_torch(path: Path, notes: list[str]) -> dict[str, Tensor]:
 
 
 def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]:
-    """Return the tensors of a state dict, flat or below the keys in NESTING."""
+    """Return the state dict in `content`: `content` itself, or the value of a key in NESTING."""
     if not isinstance(content, Mapping):
-        raise CheckpointError(f"{path} holds {type(content).__name__}, not a state dict")
+        raise CheckpointError(f"{path} holds a {type(content).__name__}, not a state dict")
     # A training script stores other values too, usually one level above the weights.
     others = [str(key) for key, value in content.items() if not isinstance(value, Tensor)]
     if not others:
@@ -85,9 +87,9 @@ def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]
     # The user must choose between two state dicts, for example one of a moving average.
     if len(inner) != 1:
         raise CheckpointError(
-            f"{path} holds entries that are not tensors ({listed(others)}); exactly one of "
-            f"{', '.join(NESTING)} may hold a state dict, found {', '.join(inner) or 'none'}. "
-            "Save only the state dict"
+            f"{path} holds entries that are not tensors ({listed(others)}), and a state dict is "
+            f"expected under exactly one of the keys {', '.join(NESTING)}, but found under "
+            f"{', '.join(inner) or 'none'}. Save only the state dict"
         )
     left = [str(key) for key in content if key != inner[0]]
     beside = f"; left out: {listed(left)}" if left else ""

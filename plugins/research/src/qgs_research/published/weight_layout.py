@@ -1,4 +1,4 @@
-"""Description of the weights that another codebase publishes: names, and recipes that fit."""
+"""Description of published weights of another codebase: parameter names, and fitting recipes."""
 
 import math
 import re
@@ -12,14 +12,14 @@ from qgs.checkpoint.tensors import Shapes
 
 
 class LayoutError(ValueError):
-    """Error for published names and shapes that fit no recipe; the message says why."""
+    """Error for published weights that fit no recipe."""
 
 
 def renamed(name: str, ours: str, theirs: str) -> str | None:
-    """Return `name` with `ours` replaced by `theirs`; None if `ours` does not match.
+    """Translate a parameter name by the rule `ours` -> `theirs`; None if it does not match.
 
-    `{}` stands for the number of a layer. If `ours` ends with a dot it is a module, and the rest of
-    the name stays the same.
+    `{}` in a rule stands for the number of a layer. If `ours` ends with a dot, it names a module,
+    and the rest of the name is kept.
     """
     # Only `{}` is a placeholder: dots in a name are plain dots.
     pattern = re.escape(ours).replace(r"\{\}", r"(\d+)")
@@ -31,20 +31,21 @@ def renamed(name: str, ours: str, theirs: str) -> str | None:
 
 @dataclass(frozen=True)
 class WeightLayout:
-    """Names and shapes in the state dicts of one published codebase; see `layout`.
+    """Parameter names and shapes in the state dicts of one published codebase; see `layout`.
 
-    name: name of the published model. plugin: plugin with its components.
-    source: where it is published.
-    components: slot -> component types of the codebase; other slots may hold any component.
-    renames: our name -> published name of modules and parameters, see `renamed`; the first that
-        matches counts.
-    marks: published names that identify this layout; its files have all of them.
-    unused: pairs of a published name and a parameter stored with it that the published code
+    name: name of the published model. plugin: qgs plugin with the model's components.
+    source: where the weights are published.
+    components: component types that the codebase has, by slot. Slots that are not listed may hold
+        any component.
+    renames: rules from names in qgs to published names, see `renamed`. The first rule that matches
+        is used.
+    marks: published names that identify this codebase. All its files contain all of them.
+    unused: rules from a published name to a second stored parameter, which the published code
         ignores.
-    read: function from names and shapes of a state dict to a recipe that fits, a mapping with
-        `recipe: 1`; raises LayoutError.
-    undecided: texts about options that names and shapes leave open, with the published value that
-        `read` chooses.
+    read: function that takes names and shapes of a state dict and returns a recipe that fits, as a
+        plain mapping. It raises LayoutError if none fits.
+    undecided: texts about options that names and shapes do not determine, with the published value
+        that `read` chooses.
     """
 
     name: str
@@ -58,7 +59,7 @@ class WeightLayout:
     unused: Sequence[tuple[str, str]] = ()
 
     def published_name(self, ours: str) -> str | None:
-        """Return the published name of our parameter `ours`, or None."""
+        """Return the published name of the parameter that qgs calls `ours`, or None."""
         names = (renamed(ours, *rule) for rule in self.renames.items())
         return next((name for name in names if name is not None), None)
 
@@ -68,7 +69,10 @@ def layout(
     read: Callable[[Shapes], dict[str, Any]],
     base: WeightLayout | None = None,
 ) -> WeightLayout:
-    """Return the layout in NAME.toml. base: a layout whose renames hold where it has no others."""
+    """Load the layout in `name`.toml.
+
+    read: see `WeightLayout`. base: layout from which missing entries of `renames` are taken.
+    """
     text = Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8")
     fields = tomllib.loads(text)
     if base:
@@ -77,30 +81,36 @@ def layout(
 
 
 def layer_count(shapes: Shapes, prefix: str) -> int:
-    """Return the number of layers stored as `prefix`N., which is the largest N plus one."""
+    """Return the number of layers whose parameter names start with `prefix` and a layer number."""
     pattern = re.compile(re.escape(prefix) + r"(\d+)\.")
     # If a layer is missing from the file, a later step refuses the file.
     return max((int(match[1]) + 1 for name in shapes if (match := pattern.match(name))), default=0)
 
 
 def size_at(shapes: Shapes, name: str, axis: int) -> int:
-    """Return the size of an axis of a published parameter; raises LayoutError without it."""
+    """Return the size of an axis of a published parameter.
+
+    Raises LayoutError if the parameter or the axis is missing.
+    """
     if name not in shapes:
-        raise LayoutError(f"{name} is missing; its shape gives a size of the model")
+        raise LayoutError(f"{name} is missing; its shape determines a size of the model")
     if not -len(shapes[name]) <= axis < len(shapes[name]):
         raise LayoutError(f"{name} has the shape {shapes[name]}, without axis {axis}")
     return shapes[name][axis]
 
 
 def whole_ratio(size: int, unit: int, what: str) -> int:
-    """Return size / unit; raises LayoutError about `what` if that is not a whole number."""
+    """Return size / unit. Raises LayoutError about `what` if the ratio is not an integer."""
     if unit < 1 or size % unit or not size:
         raise LayoutError(f"{what}: {size} is no multiple of {unit}")
     return size // unit
 
 
 def real_ratio(size: int, unit: int, what: str) -> float:
-    """Return a ratio such that int(ratio * unit) is `size`; raises LayoutError without one."""
+    """Return a ratio such that int(ratio * unit) equals `size`.
+
+    Raises LayoutError about `what` if `size` or `unit` is 0.
+    """
     if unit < 1 or not size:
         raise LayoutError(f"{what}: {size} is no multiple of {unit}")
     # A published width need not be a multiple; rounding down must give it back.

@@ -21,16 +21,16 @@ def compare(
         list[str], typer.Argument(metavar="RUN...", help="Run folders, or folders of `qgs eval`.")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Write comparison.json and comparison.md there.")
+        Path | None, typer.Option(help="Folder for comparison.json and comparison.md.")
     ] = None,
     across_protocols: Annotated[
         bool, typer.Option("--across-protocols", help="Allow results of different protocols.")
     ] = False,
 ) -> None:
-    """Compare the results of the first RUN with each other RUN, scene by scene.
+    """Compare every RUN with the first one, scene by scene.
 
-    The command reads results and evaluates nothing. Runs of one recipe with several seeds are
-    compared as one model.
+    The command reads stored results and evaluates no model. Runs of one recipe that differ only in
+    their seed are compared as one model.
     """
     from qgs.evaluate.results import as_json
     from qgs.files import write_text
@@ -49,9 +49,9 @@ def compare(
 @app.command()
 def study(
     file: Annotated[
-        str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
+        str, typer.Argument(metavar="STUDY", help="Study file, or name of a study in qgs.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the study; finished runs there are kept.")],
+    out: Annotated[Path, typer.Option(help="Folder of the study. Finished runs in it are kept.")],
     workers: Annotated[
         int, typer.Option(min=0, help="Runs in parallel. 0: train nothing, only report.")
     ] = 1,
@@ -59,14 +59,14 @@ def study(
         int | None, typer.Option(min=1, help="CPU threads per run. Default: cores / workers.")
     ] = None,
     only: Annotated[
-        int | None, typer.Option(min=0, help="Train only the missing run of this number, from 0.")
+        int | None, typer.Option(min=0, help="Train only this run, a number from 0.")
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Train every variant with every seed, evaluate all by one protocol, and compare the scores.
+    """Train every variant with every seed, evaluate all runs alike, and compare the scores.
 
     The whole study is checked before training. To continue after a stop, repeat
-    the command. OUT/table.md has the answer, OUT/results.json the numbers.
+    the command. It writes the answer to OUT/table.md and all numbers to OUT/results.json.
 
         study: 1
         base: tiny/locus.yaml
@@ -102,7 +102,7 @@ def diff(
 ) -> None:
     """Show which slots and options of two recipes differ, and their numbers of parameters.
 
-    "-" stands for an option that the component of a recipe does not have.
+    "-" marks an option that does not exist in one of the recipes.
     """
     from rich.markup import escape
 

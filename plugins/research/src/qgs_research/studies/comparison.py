@@ -1,6 +1,7 @@
-"""Comparison for `qgs compare`: the first result against each of the others.
+"""Comparison of stored results for `qgs compare`. The first result is the reference.
 
-Several trainings of one recipe count as one side; its interval then covers trainings too.
+Trainings of one recipe with several seeds count as one side; intervals then cover trainings as well
+as scenes.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -21,10 +22,10 @@ from qgs_research.studies.tables import (
 
 
 def compare(results: Sequence[StoredResults], across_protocols: bool = False) -> Scores:
-    """Return the scores of `results`; the side of the first result is the reference.
+    """Return the scores of `results`. The side of the first result is the reference.
 
-    Raises ValueError for fewer than two results, for a folder given twice, and without a common
-    scene. Different protocols or frames raise ValueError unless `across_protocols` is True.
+    Raises ValueError for fewer than two results, for a folder given twice, and if no scene is
+    common. Unless `across_protocols` is True, raises ValueError for different protocols or frames.
     """
     names = [result.name for result in results]
     if len(names) < 2 or len(set(names)) < len(names):
@@ -46,7 +47,10 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
 
 
 def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
-    """Return results by side and seed; trainings of one recipe are one side if there are others."""
+    """Group results by side and seed.
+
+    Trainings of one recipe are one side. If all results are of one recipe, each is its own side.
+    """
     groups: dict[Any, list[StoredResults]] = {}
     for number, result in enumerate(results):
         # Results without a run folder have no recipe, so each is a side of its own.
@@ -64,7 +68,11 @@ def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
 
 
 def _paired(reference: Runs, runs: Runs) -> Runs:
-    """Return `runs` unchanged if seeds are shared, otherwise under seeds of the reference."""
+    """Return `runs` by the seed of the reference with which each is paired.
+
+    Runs keep their own seeds if enough of them are seeds of the reference. Otherwise they are
+    paired in order.
+    """
     # Trainings with equal seeds saw the same data in the same order.
     if len(reference.keys() & runs.keys()) >= min(2, len(reference), len(runs)):
         return runs
@@ -74,7 +82,7 @@ def _paired(reference: Runs, runs: Runs) -> Runs:
 
 
 def _refuse_unlike(reference: str, first: Runs, name: str, second: Runs) -> None:
-    """Raise ValueError if the results of two sides do not measure the same."""
+    """Raise ValueError if two sides were evaluated by other protocols or on other frames."""
     results = [*first.values(), *second.values()]
     ours = results[0].protocol
     theirs = results[-1].protocol
@@ -82,26 +90,26 @@ def _refuse_unlike(reference: str, first: Runs, name: str, second: Runs) -> None
         keys = sorted({*ours.content, *theirs.content})
         unequal = [key for key in keys if ours.content.get(key) != theirs.content.get(key)]
         raise ValueError(
-            f"{reference} was evaluated by {ours}, {name} by {theirs}, which differ in "
-            f"{listed(unequal)}. Evaluate both by one protocol, or compare anyway with "
+            f"{reference} was evaluated by {ours}, {name} by {theirs}; these protocols "
+            f"differ in {listed(unequal)}. Evaluate both by one protocol, or compare anyway with "
             "--across-protocols"
         )
     if moved := moved_scenes(results):
         raise ValueError(
             f"{reference} and {name} were evaluated on different frames of {len(moved)} scenes, "
             f"although their protocols agree: {listed(moved)}. The data or the choice of views "
-            "changed in between: evaluate both again, or add --across-protocols"
+            "changed in between. Evaluate both again, or compare anyway with --across-protocols"
         )
 
 
 def summary(scores: Scores) -> Summary:
-    """Return a table for each metric, and notes."""
+    """Return a table for each metric, and notes below the tables."""
     tables = [("", table_rows(scores, MAIN, metric)) for metric in scores.columns]
     return Summary(answer="", tables=tables, notes=[*_notes(scores)])
 
 
 def record(scores: Scores) -> dict[str, Any]:
-    """Return the scores as plain values for JSON."""
+    """Return the content of comparison.json: a record for each model and metric, and notes."""
     return {
         "reference": scores.reference,
         "table": [*table_records(scores)],
@@ -110,8 +118,8 @@ def record(scores: Scores) -> dict[str, Any]:
 
 
 def _notes(scores: Scores) -> Iterator[str]:
-    """Yield notes below the tables."""
-    yield f"difference: minus {scores.reference}, over scenes that both have"
+    """Yield the notes to show below the tables."""
+    yield f"difference: score minus score of {scores.reference}, over common scenes"
     yield from interval_notes([*scores.differences().values()])
     yield from training_notes(scores)
     for sha256 in sorted(scores.protocols(MAIN)):
@@ -121,19 +129,19 @@ def _notes(scores: Scores) -> Iterator[str]:
             if names:
                 yield f"{name}: {words} ({len(names)}): {listed(sorted(names))}"
     if len(scores.protocols(MAIN)) > 1:
-        yield "the protocols differ, so the scores do not measure the same"
+        yield "the protocols differ, so the scores do not measure the same thing"
 
 
 def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
-    """Return the results that the differences of a side leave out, by reason."""
+    """Return the runs and scenes that the difference of a side leaves out, by reason."""
     runs = scores.stored[name, MAIN]
     reference = scores.stored[scores.reference, MAIN]
     results = [*reference.values(), *runs.values()]
     unpaired = runs.keys() ^ reference.keys()
     scenes = dict.fromkeys(scene for result in results for scene in result.scenes)
     return {
-        "no score of": results[-1].missing,
-        "nothing to pair with": [{**reference, **runs}[key].name for key in unpaired],
+        "scenes without a score": results[-1].missing,
+        "runs without a partner": [{**reference, **runs}[key].name for key in unpaired],
         "scenes not in both": scenes.keys() - common_scenes(results),
-        "judged on other frames": moved_scenes(results),
+        "scenes with different frames": moved_scenes(results),
     }

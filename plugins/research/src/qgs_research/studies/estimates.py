@@ -1,8 +1,8 @@
-"""Means over seeds and scenes, their intervals, and their format in tables.
+"""Means over seeds and scenes, with confidence intervals, and their format in tables.
 
-Intervals treat both trainings and scenes as random, so they hold for other seeds and other scenes
-of the same kind (`interval`). Differences are paired by seed and by scene: trainings with the same
-seed saw the same data in the same order.
+Intervals treat both trainings and scenes as random samples, so they hold for new seeds and new
+scenes of the same kind; see `interval`. Differences are paired by seed and by scene, because
+trainings with the same seed saw the same data in the same order.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,15 +22,15 @@ CONFIDENCE = 0.95
 SEED = 0
 
 Runs: TypeAlias = Mapping[int, StoredResults]
-"""Results of the trainings of one model, by seed."""
+"""Results of one model, by training seed."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean, or weighted sum of means, over the seeds and scenes that all parts have.
+    """Mean over seeds and scenes, or a weighted sum of such means.
 
-    values: (S, C), by seed and scene. interval: see the module; None for one scene. For one seed it
-    covers scenes alone.
+    values: scores (S, C) by seed and scene. interval: confidence interval of the mean; None for one
+    scene. For one seed it covers only the choice of scenes, not that of the training.
     """
 
     seeds: Sequence[int]
@@ -39,12 +39,12 @@ class Estimate:
 
     @property
     def mean(self) -> float:
-        """Mean over seeds with equal weights."""
+        """Mean over seeds of the means over scenes."""
         return float(self.values.mean(1).mean())
 
     @property
     def deviation(self) -> float | None:
-        """Standard deviation over seeds; None for one seed."""
+        """Standard deviation over seeds of the means over scenes; None for one seed."""
         # This is the deviation of a sample, because seeds stand for all possible seeds.
         return float(self.values.mean(1).std(ddof=1)) if len(self.seeds) > 1 else None
 
@@ -60,18 +60,21 @@ class Estimate:
 
     @property
     def too_small(self) -> str:
-        """Reason why the interval does not hold for other trainings and scenes; "" if it does."""
+        """Reason why the interval does not hold for new trainings and scenes; "" if it holds."""
         reasons = {"one training per side": len(self.seeds), "one scene": self.scenes}
         return " and ".join(reason for reason, count in reasons.items() if count < 2)
 
     def clear(self, sign: int) -> bool:
-        """Return True if the interval covers trainings and scenes and lies on the side `sign`."""
+        """Return True if the whole interval has the sign `sign`, 1 or -1.
+
+        False for an interval from one training or one scene.
+        """
         # An interval over scenes alone does not hold for other trainings.
         ends = () if self.too_small else self.interval or ()
         return min((sign * end for end in ends), default=0.0) > 0
 
     def record(self) -> dict[str, Any]:
-        """Return plain values for JSON; `by_seed` has means over scenes."""
+        """Return the estimate as plain values for JSON; `by_seed` has the means over scenes."""
         return {
             "mean": self.mean,
             "sd": self.deviation,
@@ -82,29 +85,29 @@ class Estimate:
 
 
 def sign_of(column: Column) -> int:
-    """Return 1 if more of a metric is better, otherwise -1."""
+    """Return 1 if higher values of a metric are better, otherwise -1."""
     return 1 if column.better == "higher" else -1
 
 
 def shown(column: Column, value: float | None, sign: str = "") -> str:
-    """Return a value with one digit more than evaluations show. sign: "+" for differences."""
+    """Format a value with one digit more than `qgs eval` shows. sign: "+" for differences."""
     # Differences are small compared with the means that an evaluation prints.
     return "–" if value is None else f"{value:{sign}.{column.digits + 1}f}"
 
 
 def interval_shown(column: Column, estimate: Estimate | None) -> str:
-    """Return "[low, high]", or a dash without an interval."""
+    """Format an interval as "[low, high]", or as a dash if there is none."""
     if estimate is None or estimate.interval is None:
         return "–"
     return f"[{', '.join(shown(column, end, '+') for end in estimate.interval)}]"
 
 
 def interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float] | None:
-    """Return the interval of the mean of differences (S, C) of S trainings on the same C scenes.
+    """Return a confidence interval of the mean of `values` (S, C): S trainings, C scenes.
 
-    Both are random, so the interval holds for other trainings and other scenes; see
-    `crossed_error`. For one training it covers scenes alone, at 95 %, by the percentile bootstrap.
-    Resamples are seeded, so that equal numbers give equal intervals. None for one scene.
+    Trainings and scenes count as random samples, so the interval holds for new trainings and
+    scenes; see `crossed_error`. For one training it is a 95 % percentile bootstrap over scenes
+    only, with a fixed random seed. None for one scene.
     """
     trainings, scenes = values.shape
     if scenes < 2:
@@ -130,10 +133,11 @@ def interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float,
 def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the standard error of the means of `values` (..., S, C), and its degrees of freedom.
 
-    Both have the shape (...). The variance is a sum of mean squares, as in two-way analysis of
-    variance. Its degrees of freedom follow Satterthwaite 1946 (doi.org/10.2307/3002019), but are at
-    least those of the smaller side. Without the scenes' own variance (Hillis 2007,
-    doi.org/10.1002/sim.2532) the interval is too narrow for few trainings.
+    Both results have the shape (...). S is the number of trainings, C of scenes. The variance is a
+    sum of mean squares, as in two-way analysis of variance. Its degrees of freedom follow
+    Satterthwaite 1946 (doi.org/10.2307/3002019), but are at least min(S, C) - 1. Without the
+    scenes' own variance (Hillis 2007, doi.org/10.1002/sim.2532) the interval is too narrow for few
+    trainings.
     """
     *_, trainings, scenes = values.shape
     of_training = values.mean(-1, keepdims=True)

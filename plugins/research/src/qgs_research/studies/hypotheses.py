@@ -8,19 +8,20 @@ from qgs.contracts import OptionError
 from qgs.wording import did_you_mean
 
 NAME = r"[A-Za-z0-9_][A-Za-z0-9_.]*"
-"""Pattern of names of variants and evaluations, valid as folders and in hypotheses."""
+"""Pattern of allowed names of variants and evaluations, which are used as folder names."""
 
 MAIN = ""
-"""Name of the evaluation in the recipes themselves."""
+"""Name of the default evaluation, which the variants' own recipes describe."""
 
 _FORM = "write `A < B` or `A > B`, each side a variant or a sum such as `A@noisy - A`"
 _TERM = re.compile(rf"\s*([+-]?)\s*({NAME})(?:@({NAME}))?\s*")
 
 
 class Contrast(NamedTuple):
-    """Left side minus right side of a hypothesis. terms: (variant, evaluation) -> coefficient.
+    """Hypothesis as a weighted sum of mean scores: left side minus right side.
 
-    sign: claimed sign, -1 for `<`.
+    terms: coefficient of each mean, by (variant, evaluation). sign: sign of the sum that the
+    hypothesis claims, 1 for `>` and -1 for `<`.
     """
 
     text: str
@@ -29,9 +30,9 @@ class Contrast(NamedTuple):
 
 
 def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -> Contrast:
-    """Return the contrast that `text` describes.
+    """Parse a hypothesis such as `A < B`.
 
-    Raises OptionError for another form or unknown names.
+    Raises OptionError for a text of another form, and for unknown variants or evaluations.
     """
     sides = re.split(r"\s*([<>])\s*", text.strip())
     if len(sides) != 3:
@@ -53,7 +54,7 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     # A sum that does not cancel would depend on the data set, not on the variants.
     if sum(terms.values()):
         raise OptionError(
-            f"the two sides of `{text}` have different weights, so they cannot be compared",
+            f"the two sides of `{text}` have different numbers of terms and cannot be compared",
             "write differences on both sides, such as `A@noisy - A < B@noisy - B`",
         )
     terms = {term: coefficient for term, coefficient in terms.items() if coefficient}

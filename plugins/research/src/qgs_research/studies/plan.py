@@ -1,4 +1,4 @@
-"""Plan of a study: all variants are composed and checked before training."""
+"""Checks of a study before training: all variants are resolved, built and compared."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -24,10 +24,10 @@ from qgs_research.studies.study import Study
 
 
 def planned(study: Study, folder: Path) -> Plan:
-    """Compose all variants and check the whole study, without writing or training.
+    """Resolve all variants and check the whole study. Nothing is written or trained.
 
-    Raises the errors of `composed` and of data sources. Raises ValueError if a variant or an
-    evaluation with runs or results in `folder` has changed.
+    Raises the errors of `composed` and of data sources. Raises ValueError if `folder` has results
+    of a variant or an evaluation that has changed since.
     """
     plan = Plan(study, folder, composed(study))
     check_data(plan)
@@ -36,10 +36,10 @@ def planned(study: Study, folder: Path) -> Plan:
 
 
 def composed(study: Study) -> dict[str, Recipe]:
-    """Return the recipes of all variants, with the study's budget.
+    """Return the resolved recipes of all variants, with the budget of the study.
 
-    Raises RecipeError with all their faults and forbidden differences, and the errors of building
-    them.
+    Raises RecipeError with all faults of the recipes and all forbidden differences between them.
+    Raises the errors of building the models.
     """
     problems = Problems("study")
     recipes: dict[str, Recipe] = {}
@@ -89,7 +89,7 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
 
 
 def _build(recipe: Recipe) -> None:
-    """Build every part of a variant, the model without memory, to check that they fit."""
+    """Build the model (without memory for weights), losses and optimiser, to find errors."""
     recipe.build_optimizer()
     # Use the meta device, because published models would not fit into a laptop's memory.
     recipe.rate_factors(recipe.build_model("meta"))
@@ -103,17 +103,17 @@ EQUAL = (
     *("data", "views", "training", "evaluation", "metrics"),
     *("losses", "objective", "init_from"),
 )
-"""Sections of recipes that must be equal in all variants unless `differs` names them.
+"""Sections of recipes that must be equal in all variants, except for options in `differs`.
 
-The model and its optimiser may always differ.
+Model and optimiser may always differ.
 """
 
 INDEX = "evaluation.index"
-"""Option that is compared by the content of its file, because the file may have moved."""
+"""Option whose file content is compared instead of its path, because files may be moved."""
 
 
 def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Report differences between variants that `differs` does not allow."""
+    """Add a problem for each difference between variants that `differs` does not allow."""
     settings = study.settings
     first = recipes[settings.reference]
     used = set[str]()
@@ -147,7 +147,7 @@ def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems)
 
 
 def check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Report variants that are the same model."""
+    """Add a problem for each variant that equals an earlier variant."""
     names: dict[str, str] = {}
     for name, recipe in recipes.items():
         tree = {key: part for key, part in recipe.tree.items() if key not in BESIDE}
@@ -160,7 +160,10 @@ def check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Proble
 
 
 def check_data(plan: Plan) -> None:
-    """Open every data source and index once; raises their errors, and OptionError for metrics."""
+    """Open every data source and evaluation index once.
+
+    Raises their errors, and OptionError for a metric that cannot be measured.
+    """
     settings = plan.study.settings
     metrics = [settings.metric, *(h.metric for h in settings.hypotheses if h.metric)]
     opened = set[str]()
@@ -187,7 +190,7 @@ def check_data(plan: Plan) -> None:
 
 
 def refuse_changed(plan: Plan) -> None:
-    """Raise ValueError if runs or results in the folder come from other recipes."""
+    """Raise ValueError if existing runs or results were made by recipes that have changed since."""
     for variant, name in product(plan.recipes, plan.evaluations):
         recipe = plan.evaluation_recipe(variant, name)
         file = recipe_file(plan.folder, variant, name)

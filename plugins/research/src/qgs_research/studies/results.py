@@ -32,12 +32,16 @@ UNDECIDED = "undecided"
 _RANKED = 5
 """Least number of variants for a rank correlation.
 
-A random order of three variants is the published one in 1 of 6 cases, of five in 1 of 120.
+A random order of three variants equals the published order in 1 of 6 cases; of five variants, in
+1 of 120 cases.
 """
 
 
 class Judgement(NamedTuple):
-    """Verdict on a hypothesis. estimate: left minus right; None without runs."""
+    """Verdict on a hypothesis: seen, contradicted or undecided, with a reason.
+
+    estimate: left side minus right side; None if their runs have no scores in common.
+    """
 
     hypothesis: Hypothesis
     metric: str
@@ -47,9 +51,9 @@ class Judgement(NamedTuple):
 
 
 class Results(Scores):
-    """All results in the folder of `plan`.
+    """All finished results of a study.
 
-    missing: runs that lack some results. failed: the missing runs that failed.
+    missing: runs without all results. failed: those of the missing runs that stopped with an error.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -68,12 +72,12 @@ class Results(Scores):
 
     @property
     def shared(self) -> str | None:
-        """First evaluation that used one protocol for all its runs, or None."""
+        """Name of the first evaluation with the same protocol for all runs, or None."""
         # The order is that of the study, so the recipes' own evaluation comes first.
         return next((n for n in self.plan.evaluations if len(self.protocols(n)) == 1), None)
 
     def judgements(self) -> list[Judgement]:
-        """Return the verdicts on all hypotheses, in their order."""
+        """Return the verdicts on all hypotheses, in the order of the study file."""
         pairs = zip(self.settings.hypotheses, self.plan.study.contrasts, strict=True)
         return [self._judgement(hypothesis, contrast) for hypothesis, contrast in pairs]
 
@@ -81,7 +85,7 @@ class Results(Scores):
         metric = hypothesis.metric or self.metric
         found = self.estimate(contrast.terms, metric)
         verdict = UNDECIDED
-        reasons = [f"no seed and scene with `{metric}` in all its runs"]
+        reasons = [f"its runs share no seed and scene with a score `{metric}`"]
         if found:
             reasons = [found.too_small or "the interval contains 0"]
             for sign, word in ((contrast.sign, SEEN), (-contrast.sign, CONTRADICTED)):
@@ -99,10 +103,10 @@ class Results(Scores):
         )
 
     def rank_correlation(self) -> float | None:
-        """Return Spearman's rank correlation of our means with the published values.
+        """Return Spearman's rank correlation of measured means and published values.
 
-        Our means are from the recipes' own evaluation. None for fewer than five variants or for
-        different protocols.
+        The means are from the default evaluation. None for fewer than five variants, and if their
+        protocols differ.
         """
         published = self.settings.published
         scores = {variant: self.score(variant, self.metric) for variant in published}
@@ -114,7 +118,10 @@ class Results(Scores):
 
 
 def write_files(results: Results) -> Path:
-    """Write results.json and table.md; return the path of the latter. Only `times` can vary."""
+    """Write results.json and table.md, and return the path of table.md.
+
+    When the same runs are trained again, only `times` in results.json may differ.
+    """
     study = results.plan.study
     head = "\n\n".join(filter(None, [f"# {study.title}", study.settings.question]))
     table = results.plan.folder / "table.md"
@@ -124,7 +131,7 @@ def write_files(results: Results) -> Path:
 
 
 def answer(results: Results) -> str:
-    """Return one line that says if a variant is better than the reference, with its interval."""
+    """Return one line that says whether a variant is better than the reference."""
     text = _verdict(results)
     if results.failed:
         text += f" Failed: {listed(results.failed)}."
@@ -134,17 +141,17 @@ def answer(results: Results) -> str:
 
 
 def _verdict(results: Results) -> str:
-    """Return the verdict from scores alone, of the first evaluation by one protocol.
+    """Return whether the best variant is better than the reference, without missing runs.
 
-    The best of n variants is better if its interval at 1 - 0.05 / n says so (Bonferroni), because
-    chance has n tries. The claim that all are worse needs no correction: it requires each to be
-    worse (an intersection-union test).
+    The evaluation is `Results.shared`. The best of n variants counts as better if its interval at
+    confidence 1 - 0.05 / n does not contain 0 (Bonferroni correction). The claim that all variants
+    are worse needs no correction, because each of them must be worse (intersection-union test).
     """
     if results.metric not in results.columns:
         return "Not known yet: no run is finished."
     evaluation = results.shared
     if evaluation is None:
-        return "Not known: no evaluation has one protocol for all; add one to `evaluations`."
+        return "Not known: variants have different protocols; add an evaluation to `evaluations`."
     found = results.differences(evaluation)
     if not found:
         return f"Not known yet: {results.reference} and another variant share no finished seed."
@@ -172,30 +179,30 @@ def _verdict(results: Results) -> str:
 
 
 def notes(results: Results) -> list[str]:
-    """Return the notes below the tables."""
+    """Return the notes to show below the tables of a study."""
     # Readers see the table of the recipes' own evaluation first.
     found = [*interval_notes([*results.differences().values()]), *training_notes(results)]
     if (count := len(results.settings.hypotheses)) > 1:
-        found.append(f"each of {count} verdicts alone has 95 % confidence")
+        found.append(f"each of the {count} verdicts has 95 % confidence, not all together")
     if results.missing:
         found.append(f"missing runs: {listed(results.missing)}")
     found += [f"{run} failed: {run.failed}" for run in results.failed]
     # Our order of variants can match the published one even if the values cannot.
     if (rank := results.rank_correlation()) is not None:
-        found.append(f"rank correlation with the published order: {rank:+.2f}")
+        found.append(f"rank correlation with the published values: {rank:+.2f}")
     for evaluation in results.plan.evaluations:
-        where = evaluation or "the recipes' own evaluation"
+        where = evaluation or "default evaluation"
         if len(results.protocols(evaluation)) > 1:
             found.append(f"{where}: protocols differ, so differences between them are not shown")
         unscored = {s for result in results.results_of(evaluation) for s in result.missing}
         if unscored:
-            found.append(f"{where}: no score in some run of {listed(sorted(unscored))}")
+            found.append(f"{where}: some runs have no score for {listed(sorted(unscored))}")
     return found
 
 
 def study_summary(results: Results) -> Summary:
-    """Return the answer, the verdicts, a table for each evaluation with results, and notes."""
-    head = ["hypothesis", "metric", "left - right", "95 % interval", "verdict", "of", "note"]
+    """Return the answer, a table of verdicts, a table for each evaluation, and notes."""
+    head = ["hypothesis", "metric", "left - right", "95 % interval", "verdict", "sample", "note"]
     judged = [_hypothesis_row(results, judgement) for judgement in results.judgements()]
     tables: list[tuple[str, Rows]] = [("", [head, *judged])] if judged else []
     others = [name for name in results.columns if name != results.metric]
@@ -223,7 +230,7 @@ def _hypothesis_row(results: Results, judgement: Judgement) -> list[str]:
 
 
 def record(results: Results) -> dict[str, Any]:
-    """Return the content of all tables as plain values, and the times of every run."""
+    """Return the content of results.json: all tables, verdicts, notes and training times."""
     table = [row for name in results.plan.evaluations for row in table_records(results, name)]
     return {
         "answer": answer(results),
@@ -246,7 +253,7 @@ def record(results: Results) -> dict[str, Any]:
 
 
 def _times(results: Results) -> Iterator[dict[str, Any]]:
-    """Yield the training time of every run, which differs between machines and days."""
+    """Yield the number of steps and the training time in seconds of every run."""
     for run in results.plan.runs:
         # The clock of training stands still between sessions.
         for last in read_records(run.folder / "history.jsonl")[-1:]:

@@ -1,6 +1,6 @@
-"""Execution of a study: one process per run, and one run at a time per worker.
+"""Execution of a study. Each run has its own process, and `workers` runs are trained at a time.
 
-A killed process loses only the steps of its run since the last save.
+A killed process loses only the training steps since its last save.
 """
 
 import os
@@ -31,16 +31,16 @@ from qgs_research.studies.runs import Plan, Run, recipe_file, run_of, write_plan
 from qgs_research.studies.study import read_study
 
 WORK = (sys.executable, "-m", "qgs_research.studies.running")
-"""Command of the process of a run, before the arguments of `main`."""
+"""Command that starts the process of a run; the arguments of `main` are appended."""
 
 _SECONDS = 0.3
-"""Seconds between two checks of the processes."""
+"""Seconds between two checks for finished processes."""
 
 
 def run_study(
     file: str, out: Path, workers: int, threads: int | None, only: int | None, device: str
 ) -> int:
-    """Run `qgs study` and return its exit code."""
+    """Do the work of `qgs study`, and return the exit code."""
     console = Console()
     with console.status("composing and checking all variants"):
         plan = planned(read_study(file), out)
@@ -76,10 +76,11 @@ def train_missing(
     device: str,
     console: Console,
 ) -> tuple[list[Run], signal.Signals | None]:
-    """Train the missing `runs`; return those that failed, and the signal that stopped training.
+    """Train and evaluate those of `runs` that are not done.
 
-    It waits for runs of another call on this machine, and continues them if that call dies.
-    threads: CPU threads per run; None for an equal share. The workers share the GPUs.
+    Returns the failed runs, and the signal that stopped training or None. If another call on this
+    machine trains one of the runs, this call waits for it, and continues the run if that call dies.
+    threads: CPU threads per run; None divides the threads among the workers. Runs share the GPUs.
     """
     threads = threads or max(torch.get_num_threads() // workers, 1)
     # Slurm, for example, sets this variable: the other GPUs belong to other jobs.
@@ -89,7 +90,7 @@ def train_missing(
     failed = [run for run in runs if run.failed]
     for run in failed:
         again = f"to retry, delete {run.failure}; to start from step 0, delete {run.folder} too"
-        print_lines(console, [f"{run} failed before: {run.failed}; {again}"])
+        print_lines(console, [f"{run} failed in an earlier call: {run.failed}; {again}"])
     processes: dict[Run, Popen[bytes]] = {}
     gpu_of: dict[Run, str] = {}
     left = list(runs)
@@ -120,7 +121,10 @@ def train_missing(
 
 
 def started(plan: Plan, run: Run, threads: int, device: str, gpu: str) -> Popen[bytes]:
-    """Start a process that trains `run` and prints into its log. gpu: "" for any."""
+    """Start a process that trains `run` and prints to its log file.
+
+    gpu: value of CUDA_VISIBLE_DEVICES; "" leaves the variable unchanged.
+    """
     # Libraries read these variables at import. A log has no width of its own.
     names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
     environment = {**os.environ, **dict.fromkeys(names, str(threads)), "COLUMNS": "100"}
@@ -133,23 +137,24 @@ def started(plan: Plan, run: Run, threads: int, device: str, gpu: str) -> Popen[
 
 def _ended(plan: Plan, run: Run, code: int) -> str:
     if plan.done(run):
-        return f"{run} is done, {sum(map(plan.done, plan.runs))} of {len(plan.runs)} runs"
+        return f"{run} is done; {sum(map(plan.done, plan.runs))} of {len(plan.runs)} runs are done"
     if run.failed:
         return f"{run} failed: {run.failed} (see {run.log})"
     return (
-        f"{run}: its process ended with {code} (see {run.log}); repeat the command to continue it"
+        f"{run}: its process ended with exit code {code} (see {run.log}); "
+        "repeat the command to continue it"
     )
 
 
 def lock_of(run: Run) -> FileLock:
-    """Return the lock of a run; entering it raises Timeout if another process has the run."""
+    """Return the lock of a run. Entering it raises Timeout if another process trains the run."""
     run.folder.parent.mkdir(parents=True, exist_ok=True)
     # The kernel releases the lock when a process dies, so a killed run is free at once.
     return FileLock(run.beside("lock"), blocking=False)
 
 
 def is_free(run: Run) -> bool:
-    """Return True if no process has `run`."""
+    """Return True if no process trains or evaluates `run`."""
     try:
         with lock_of(run):
             return True
@@ -158,9 +163,10 @@ def is_free(run: Run) -> bool:
 
 
 def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -> None:
-    """Train and evaluate a run of the study in `folder`; existing results are kept.
+    """Train and evaluate a run of the study in `folder`. Existing results are kept.
 
-    It does nothing if another process has the run. An error is written beside the run.
+    If another process trains the run, this one does nothing. An error is written to a file beside
+    the run folder.
     """
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     run = run_of(Path(folder), variant, int(seed))
@@ -175,14 +181,14 @@ def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -
 
 
 def _end_with(parent: int) -> None:
-    """Stop as after SIGTERM when the parent process has ended."""
+    """Send SIGTERM to this process when its parent process has ended."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _train_and_evaluate(folder: Path, run: Run, device: str, evaluations: Sequence[str]) -> None:
-    """Do the missing work of `run`; raises the errors of training and evaluation."""
+    """Train `run` to the end and do its missing evaluations. Raises the errors of both."""
 
     def recipe_of(evaluation: str) -> Recipe:
         return resolve(recipe_file(folder, run.variant, evaluation), [f"seed={run.seed}"])

@@ -16,12 +16,12 @@ from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.study import Study
 
 BESIDE = ("seed", "plugins")
-"""Parts of a recipe that do not change the model."""
+"""Keys of a recipe that do not change the model."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """Training of a variant with one seed. folder: run folder of `qgs train`."""
+    """Training of one variant with one seed. folder: run folder, as of `qgs train`."""
 
     variant: str
     seed: int
@@ -31,22 +31,22 @@ class Run:
         return f"{self.variant} seed {self.seed}"
 
     def beside(self, suffix: str) -> Path:
-        """Return a file beside the folder, such as the lock."""
+        """Return the path of a file beside the run folder, such as `seed-0.lock`."""
         return self.folder.with_name(f"{self.folder.name}.{suffix}")
 
     @property
     def log(self) -> Path:
-        """File with the output of its processes."""
+        """Path of the file with the printed output of the run."""
         return self.beside("log")
 
     @property
     def failure(self) -> Path:
-        """File with the reason of a failure."""
+        """Path of the file with the error of a failed run."""
         return self.beside("failed")
 
     @property
     def failed(self) -> str:
-        """First sentence of the reason of a failure; "" without that file."""
+        """First sentence of the error of a failed run; "" if the run has not failed."""
         if not self.failure.is_file():
             return ""
         # The rest of the file is advice, which has no room in tables.
@@ -54,18 +54,21 @@ class Run:
         return first_line.partition(". ")[0]
 
     def evaluation(self, name: str) -> Path:
-        """Return the folder of its results of one evaluation."""
+        """Return the folder with the run's results of the evaluation `name`."""
         return self.folder / (f"evaluation-{name}" if name else "evaluation")
 
     def evaluated(self, name: str) -> bool:
-        """Return True if that evaluation is complete."""
+        """Return True if the run's results of the evaluation `name` are complete."""
         # An evaluation writes this file last.
         return (self.evaluation(name) / "protocol.json").is_file()
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Runs and evaluations of a study in `folder`. recipes: by variant, with the first seed."""
+    """Runs and evaluations of a study in `folder`.
+
+    recipes: resolved recipes by variant, with the first seed of the study.
+    """
 
     study: Study
     folder: Path
@@ -73,12 +76,12 @@ class Plan:
 
     @property
     def evaluations(self) -> list[str]:
-        """Names of all evaluations; the recipes' own comes first."""
+        """Names of all evaluations. The first is "", the default evaluation."""
         return [MAIN, *self.study.evaluations]
 
     @property
     def runs(self) -> list[Run]:
-        """All runs, ordered by seed, then by variant."""
+        """All runs of the study, ordered by seed, then by variant."""
         seeds = self.study.settings.seeds
         # Seeds come first, so that an unfinished study has complete comparisons.
         return [run_of(self.folder, name, seed) for seed in seeds for name in self.recipes]
@@ -90,37 +93,37 @@ class Plan:
         return f"{variants} x {counted(len(self.study.settings.seeds), 'seed')}"
 
     def evaluation_recipe(self, variant: str, evaluation: str) -> Recipe:
-        """Return the recipe of a variant as changed by an evaluation."""
+        """Return the recipe by which models of a variant are evaluated."""
         recipe = self.recipes[variant]
         changes = self.study.evaluations.get(evaluation)
         return changed_recipe(recipe, changes) if changes else recipe
 
     def done(self, run: Run) -> bool:
-        """Return True if no result of `run` is missing."""
+        """Return True if all evaluations of `run` are complete."""
         return all(map(run.evaluated, self.evaluations))
 
 
 def run_of(folder: Path, variant: str, seed: int) -> Run:
-    """Return the run of a variant with a seed, of the study in `folder`."""
+    """Return the run of a variant with a seed. folder: folder of the study."""
     return Run(variant, seed, folder / "runs" / variant / f"seed-{seed}")
 
 
 def recipe_file(folder: Path, variant: str, evaluation: str = MAIN) -> Path:
-    """Return the file of a variant's resolved recipe, for training or for an evaluation."""
+    """Return the path of a variant's resolved recipe for training, or for an evaluation."""
     # Names have no @, which separates variant and evaluation in hypotheses too.
     name = f"{variant}@{evaluation}" if evaluation else variant
     return folder / "variants" / f"{name}.yaml"
 
 
 def changed_recipe(recipe: Recipe, changes: MapNode) -> Recipe:
-    """Return `recipe` with the changes of an evaluation; raises RecipeError."""
+    """Apply the changes of an evaluation to `recipe`. Raises RecipeError for invalid options."""
     tree = from_plain(recipe.tree, Origin("the variant"))
     assert isinstance(tree, MapNode)
     return resolve(merge(tree, changes))
 
 
 def write_plan(plan: Plan) -> None:
-    """Write the recipes that the processes of the runs read."""
+    """Write the resolved recipes of all variants, which the training processes read."""
     for variant, evaluation in product(plan.recipes, plan.evaluations):
         # Include the file and line that set each value, for readers of the folder.
         text = annotated(plan.evaluation_recipe(variant, evaluation))
@@ -128,6 +131,9 @@ def write_plan(plan: Plan) -> None:
 
 
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[str | None, str | None]]:
-    """Return the options in which two recipes differ, except seeds and names of plugins."""
+    """Return the options in which two recipes differ, with both values.
+
+    Seeds and plugin names are ignored.
+    """
     found = differing_options(ours.tree, theirs.tree)
     return {path: values for path, values in found.items() if path not in BESIDE}

@@ -1,4 +1,4 @@
-"""Scores of models: means, differences to a reference, and baselines."""
+"""Mean scores of models, their differences to a reference model, and baselines."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -16,14 +16,16 @@ from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.stored import StoredResults, scenes_with
 
 Terms: TypeAlias = Mapping[tuple[str, str], int]
-"""Weights of means, by model and evaluation."""
+"""Weighted sum of mean scores: the weight of each mean, by (model, evaluation)."""
 
 
 @dataclass
 class Scores:
-    """Results by model and evaluation, then by seed. reference: the model to compare others with.
+    """Stored results of several models, with their means and differences.
 
-    metric: the metric that decides. across_protocols: True to compare results of two protocols.
+    stored: results by (model, evaluation), then by seed. reference: model with which the others are
+    compared. metric: metric that decides which model is better. across_protocols: True allows
+    differences between results of different protocols.
     """
 
     stored: Mapping[tuple[str, str], Runs]
@@ -33,7 +35,7 @@ class Scores:
 
     @cached_property
     def columns(self) -> dict[str, Column]:
-        """Format of the values of all metrics, also of those that only some models have."""
+        """Table formats of all metrics that at least one model has, by name."""
         columns: dict[str, Column] = {}
         for runs in self.stored.values():
             for result in runs.values():
@@ -42,15 +44,15 @@ class Scores:
 
     @property
     def column(self) -> Column:
-        """Format of the metric that decides; raises KeyError without results."""
+        """Table format of `metric`. Raises KeyError if there are no results."""
         return self.columns[self.metric]
 
     def models(self, evaluation: str = MAIN) -> list[str]:
-        """Return the models that have results of `evaluation`."""
+        """Return the names of all models with results of `evaluation`."""
         return [name for (name, of), runs in self.stored.items() if of == evaluation and runs]
 
     def score(self, model: str, metric: str, evaluation: str = MAIN) -> Estimate | None:
-        """Return the mean of a model; None if it has no values of the metric."""
+        """Return the mean score of a model; None if the model has no values of the metric."""
         return self.estimate({(model, evaluation): 1}, metric)
 
     def difference(
@@ -60,9 +62,9 @@ class Scores:
         evaluation: str = MAIN,
         confidence: float = CONFIDENCE,
     ) -> Estimate | None:
-        """Return the difference of a model minus the reference.
+        """Return the mean score of a model minus that of the reference.
 
-        None for the reference itself, and if the two were evaluated by different protocols.
+        None for the reference itself, and if both models were evaluated by different protocols.
         """
         terms = {(model, evaluation): 1, (self.reference, evaluation): -1}
         # Values of two protocols do not measure the same.
@@ -73,7 +75,7 @@ class Scores:
     def differences(
         self, evaluation: str = MAIN, confidence: float = CONFIDENCE
     ) -> dict[str, Estimate]:
-        """Return the differences in the metric that decides, for models that have one."""
+        """Return the differences to the reference in `self.metric`, by model, where they exist."""
         found: dict[str, Estimate] = {}
         for model in self.models(evaluation):
             if apart := self.difference(model, self.metric, evaluation, confidence):
@@ -83,7 +85,10 @@ class Scores:
     def estimate(
         self, terms: Terms, metric: str, confidence: float = CONFIDENCE
     ) -> Estimate | None:
-        """Return the sum of means with weights `terms`; None without a common seed and scene."""
+        """Return a weighted sum of mean scores over the seeds and scenes that all its terms share.
+
+        None if no seed or no scene is common.
+        """
         parts = [(self.stored.get(term, {}), weight) for term, weight in terms.items()]
         seeds = [seed for seed in parts[0][0] if all(seed in runs for runs, _ in parts)]
         scenes = scenes_with(metric, [runs[seed] for runs, _ in parts for seed in seeds])
@@ -96,9 +101,10 @@ class Scores:
         return Estimate(seeds=seeds, values=values, interval=interval(values, confidence))
 
     def baselines(self, evaluation: str) -> dict[str, dict[str, float]]:
-        """Return means over scenes of the baselines, by name and metric.
+        """Return the mean scores of the baselines, by name of the baseline and metric.
 
-        The result is empty if an evaluation has several protocols, each with its own baselines.
+        The result is empty if runs were evaluated by different protocols, because each protocol has
+        its own baselines.
         """
         if len(self.protocols(evaluation)) != 1:
             return {}
@@ -112,16 +118,16 @@ class Scores:
         return found
 
     def protocols(self, evaluation: str) -> set[str]:
-        """Return the hashes of all protocols that `evaluation` used."""
+        """Return the SHA-256 hashes of all protocols in the results of `evaluation`."""
         return {result.protocol.sha256 for result in self.results_of(evaluation)}
 
     def results_of(self, evaluation: str) -> list[StoredResults]:
-        """Return the results of `evaluation` for all runs."""
+        """Return the results of `evaluation` for all models and seeds."""
         parts = (runs for (_, of), runs in self.stored.items() if of == evaluation)
         return [result for runs in parts for result in runs.values()]
 
     def unlike(self, terms: Terms) -> bool:
-        """Return True if the terms combine values of different protocols in one evaluation."""
+        """Return True if a sum compares scores of one evaluation that have different protocols."""
         # Each evaluation may have its own protocol: `A@two - B@two < C - D` is a valid comparison.
         sums: dict[tuple[str, str], int] = defaultdict(int)
         for (model, evaluation), weight in terms.items():

@@ -1,4 +1,4 @@
-"""The command `qgs slurm`: jobs that save before their time ends and continue later."""
+"""Command `qgs slurm`, which writes jobs that save before their time limit and continue later."""
 
 import shlex
 import sys
@@ -11,7 +11,7 @@ import typer
 
 from qgs.cli.options import Device
 
-app = typer.Typer(help="Write Slurm jobs that save before their time ends and continue later.")
+app = typer.Typer(help="Write Slurm jobs that save before their time limit and continue later.")
 
 
 # Unknown options are passed on to `qgs train`.
@@ -23,9 +23,9 @@ def train(
             metavar="RECIPE --out RUN ...", help="Arguments and options of `qgs train`."
         ),
     ],
-    gpus: Annotated[int, typer.Option(min=1, help="GPUs on one node, one process each.")] = 1,
+    gpus: Annotated[int, typer.Option(min=1, help="Number of GPUs, all on one node.")] = 1,
 ) -> None:
-    """Write RUN.slurm.sh, which runs `qgs train` with these arguments on the GPUs of a node."""
+    """Write RUN.slurm.sh, a Slurm job for `qgs train` with the given arguments."""
     from qgs.cli import app as qgs
     from qgs.evaluate.plan import read_index
     from qgs.recipe import resolve
@@ -53,13 +53,13 @@ def train(
 @app.command()
 def study(
     file: Annotated[
-        str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
+        str, typer.Argument(metavar="STUDY", help="Study file, or name of a study in qgs.")
     ],
     out: Annotated[Path, typer.Option(help="Folder of the study.")],
     threads: Annotated[int, typer.Option(min=1, help="CPU threads per run.")] = 1,
     device: Device = "auto",
 ) -> None:
-    """Write OUT/slurm.sh, a job array with a task for each missing run of a study."""
+    """Write OUT/slurm.sh, a Slurm job array with one task for each missing run of a study."""
     from qgs_research.studies.plan import planned
     from qgs_research.studies.study import read_study
 
@@ -69,7 +69,7 @@ def study(
     ]
     if not missing:
         raise ValueError(
-            f"no run is missing in {out}; write its tables by `qgs study` with --workers 0"
+            f"no run is missing in {out}; to write the tables, call `qgs study` with --workers 0"
         )
     words = ["study", file, "--out", str(plan.folder), "--threads", str(threads)]
     workers = max(recipe.training.workers for recipe in plan.recipes.values())
@@ -88,7 +88,10 @@ def study(
 def _write_job(
     script: Path, words: Sequence[str], *, template: str, name: str, log: Path, **values: Any
 ) -> None:
-    """Write the sbatch file `script`, which runs Python with `words` in this folder."""
+    """Fill a job template and write it to `script`.
+
+    words: arguments of Python. The job runs in the current folder.
+    """
     from qgs.files import write_text
 
     text = files("qgs_research.studies").joinpath("template", template).read_text(encoding="utf-8")

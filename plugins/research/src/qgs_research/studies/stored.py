@@ -1,4 +1,4 @@
-"""Reader of the results that `qgs eval` writes."""
+"""Reader of result folders that `qgs eval` writes."""
 
 import csv
 import json
@@ -16,12 +16,13 @@ from qgs.recipe.yaml_text import load_mapping
 
 @dataclass(frozen=True)
 class StoredResults:
-    """Results of one evaluation. name: path of the folder as given.
+    """Results of one evaluation, read from a folder.
 
-    scenes: `SceneScore.values` of the evaluated scenes. frames: their input and target frames as in
-    scenes.csv. columns, missing, step: as in `Evaluation`. recipe, seed: those of the run folder,
-    the resolved recipe as JSON without seed and evaluation. trained: data, duration and other
-    facts about the training, by name.
+    name: path of the folder as given. scenes: values of `SceneScore.values`, by scene. frames:
+    input and target frames of each scene, as in scenes.csv. columns, missing, step: see
+    `Evaluation`.
+    recipe: resolved recipe of the training as JSON, without seed and evaluation; "" if unknown.
+    seed: seed of the training. trained: facts about the training, such as data and duration.
     """
 
     name: str
@@ -36,12 +37,12 @@ class StoredResults:
     trained: Mapping[str, str] = field(default_factory=dict)
 
     def scores(self, metric: str, scenes: Iterable[str]) -> list[float]:
-        """Return the values of the model in these scenes; raises KeyError if one is missing."""
+        """Return the model's values of `metric` in `scenes`. Raises KeyError if one is missing."""
         return [self.scenes[scene][f"model_{metric}"] for scene in scenes]
 
 
 def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes with the metric in all `results`, in the order of the first."""
+    """Return the scenes that have a value of `metric` in all results."""
     # scenes.csv has the baselines' values too.
     value = f"model_{metric}"
     scenes = common_scenes(results)
@@ -49,30 +50,30 @@ def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
 
 
 def common_scenes(results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes in all `results`, in the order of the first."""
+    """Return the scenes that all results share, in the order of the first result."""
     first = results[0].scenes if results else {}
     return [scene for scene in first if all(scene in one.scenes for one in results)]
 
 
 def moved_scenes(results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes in all `results` that were not evaluated on the same frames."""
+    """Return the scenes that all results share, but that were evaluated on different frames."""
     # A protocol that draws views names no frames; they depend on the data.
     scenes = common_scenes(results)
     return [scene for scene in scenes if len({one.frames[scene] for one in results}) > 1]
 
 
 def read_results(path: str | Path) -> StoredResults:
-    """Return the results in `path`: a folder that `qgs eval` wrote, or a run folder with one.
+    """Read results from a folder that `qgs eval` wrote, or from a run folder with `evaluation/`.
 
-    Raises FileNotFoundError if there are none, ValueError if they cannot be read.
+    Raises FileNotFoundError if there are no results, ValueError if they cannot be read.
     """
     # `path` is a folder of `qgs eval`, or the run folder of a training.
     folders = (Path(path), Path(path) / "evaluation")
     folder = next((folder for folder in folders if (folder / "summary.json").is_file()), None)
     if folder is None:
         raise FileNotFoundError(
-            f"no results in {path}; give a folder that `qgs eval` wrote, or a run folder that "
-            "has evaluation/"
+            f"no results in {path}; give a folder that `qgs eval` wrote, or a run folder with a "
+            "folder evaluation/"
         )
     try:
         return _read(folder, str(path))
@@ -109,7 +110,10 @@ def _read(folder: Path, name: str) -> StoredResults:
 
 
 def _training(recipe: Path) -> dict[str, Any]:
-    """Return recipe, seed and `trained` of the run with this resolved recipe; {} without it."""
+    """Return the fields recipe, seed and trained of `StoredResults`, from a resolved recipe file.
+
+    The result is empty if the file does not exist.
+    """
     if not recipe.is_file():
         return {}
     tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())

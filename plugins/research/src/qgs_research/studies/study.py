@@ -20,13 +20,13 @@ from qgs.wording import did_you_mean
 from qgs_research.studies.hypotheses import NAME, Contrast, parsed
 
 _BY_NAME = ("variants", "evaluations", "published")
-"""Keys whose entries are replaced one by one by a study that extends another."""
+"""Keys of which a study that extends another study replaces single entries, not the whole."""
 
 
 def _folder_name(name: str) -> str:
     if not re.fullmatch(NAME, name):
         fix = "use letters, digits, `_` and `.`, but no `.` at the start"
-        raise OptionError(f"{name!r} cannot name a folder or a term of a hypothesis", fix)
+        raise OptionError(f"{name!r} is no valid name of a variant or an evaluation", fix)
     return name
 
 
@@ -52,32 +52,32 @@ Section: TypeAlias = Annotated[str, AfterValidator(_evaluation_section)]
 
 
 class Budget(ComponentConfig):
-    """Budget of each run, either steps or seconds."""
+    """Length of each training, either in steps or in seconds."""
 
     steps: int | None = Field(default=None, ge=1)
-    """Number of optimiser steps, which does not depend on the machine. Default: use seconds."""
+    """Number of optimiser steps. Null means that `seconds` limits the training."""
     seconds: float | None = Field(default=None, gt=0)
-    """Seconds of training time. Default: use steps. Tables show the number of steps."""
+    """Training time in seconds. Null means that `steps` limits the training."""
 
     @model_validator(mode="after")
     def _is_one(self) -> "Budget":
         if (self.steps is None) == (self.seconds is None):
             raise OptionError(
-                "a budget is either steps or seconds", "write `budget: {steps: 2000}`"
+                "a budget needs either steps or seconds, not both", "write `budget: {steps: 2000}`"
             )
         return self
 
 
 class Hypothesis(ComponentConfig):
-    """Claim about means, checked when the runs are done."""
+    """Claim about mean scores of variants, checked when their runs are done."""
 
     claim: str
-    """Claim `A < B` or `A > B` about variants. Each side may be a sum such as `A@noisy - A`, with
-    the name of an evaluation after the @."""
+    """Claim `A < B` or `A > B`, where A and B are variants. Each side may be a sum such as
+    `A@noisy - A`, where `noisy` is the name of an evaluation."""
     metric: str | None = None
-    """Metric to compare. Null: the study's metric."""
+    """Metric to compare. Null means the metric of the study."""
     note: str = ""
-    """Remark to show beside the verdict, for example the value in a paper."""
+    """Remark that the table shows beside the verdict, for example the value in a paper."""
 
     @model_validator(mode="before")
     @classmethod
@@ -92,46 +92,50 @@ def _known_terms(hypothesis: Hypothesis, info: ValidationInfo) -> Hypothesis:
 
 
 class StudySettings(ComponentConfig):
-    """Content of a study file and the files that it extends.
+    """Content of a study file, merged with the study files that it extends.
 
-    Each field is checked against earlier fields, so variants and evaluations come first.
+    Each field is checked against the fields before it, so variants and evaluations come first.
     """
 
     study: int = Field(ge=1, le=1)
-    """Version of the format."""
+    """Version of the study format, always 1."""
     title: str = ""
-    """Heading of the page. Empty: the file's name."""
+    """Heading of the results page. An empty text means the name of the study file."""
     question: str = ""
     """Question that the study answers, in one or more sentences."""
     base: Any = None
-    """Recipe that variants change, or a list of recipes, where later ones change earlier ones."""
+    """Recipe file that the variants change. In a list of recipes, each changes those before it."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Part of a recipe that changes every variant. Default: no change."""
+    """Recipe options that are set in all variants, in the form of a recipe."""
     variants: dict[Name, dict[str, Any] | None] = Field(min_length=1, max_length=200)
-    """Recipe file or part of a recipe, by name. Null: the base. Each takes 0.1 s to check."""
+    """Models to compare, by name. Each is a recipe file or a set of changes to `base`; null means
+    `base` without changes."""
     evaluations: dict[Name, dict[Section, Any]] = Field(default_factory=dict)
-    """Further evaluations by name: changes of the recipe before every model is evaluated again."""
+    """Additional evaluations of every model, by name. Each sets options of the evaluated recipe,
+    such as other data or views."""
     seeds: tuple[int, ...] = Field(default=(0, 1, 2), min_length=1)
-    """Seeds of the runs of each variant. A seed sets initial weights, data and its order."""
+    """Random seeds; each variant is trained once with each of them. A seed determines the initial
+    weights and the order of the data."""
     reference: VariantName
-    """Variant to compare the others with."""
+    """Variant with which all other variants are compared."""
     budget: Budget
-    """Budget of each run, the same for all variants."""
+    """Length of each training, the same for all variants."""
     metric: str = "psnr"
-    """Metric that decides, by its name in evaluations."""
+    """Name of the metric that decides which variant is better."""
     differs: tuple[str, ...] = ()
-    """Options outside model and optimiser in which variants may differ."""
+    """Options, outside model and optimiser, in which variants may differ."""
     hypotheses: tuple[Annotated[Hypothesis, AfterValidator(_known_terms)], ...] = ()
-    """Claims to check. A plain text is read as the claim."""
+    """Claims to check, such as `A > B`. A text is short for an entry with only a claim."""
     published: dict[VariantName, float] = Field(default_factory=dict)
-    """Published values of the metric by variant, to show beside ours with the rank correlation."""
+    """Published values of the metric, by variant. The table shows them beside the measured values,
+    with the rank correlation of both."""
 
     @field_validator("seeds")
     @classmethod
     def _seeds_differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(seeds)) < len(seeds) or min(seeds) < 0:
             raise OptionError(
-                f"must be different numbers from 0 on, got {list(seeds)}", "write `seeds: [0, 1]`"
+                f"must be different integers from 0 on, got {list(seeds)}", "write `seeds: [0, 1]`"
             )
         return seeds
 
@@ -140,8 +144,8 @@ class StudySettings(ComponentConfig):
 class Study:
     """Study that was read from `file`.
 
-    variants: recipes by name, as input of `qgs.recipe.resolve`. evaluations: changes of the trained
-    recipe by name of the evaluation. Both keep the file and line of each value.
+    variants: recipes by name, as input of `qgs.recipe.resolve`. evaluations: changes to the trained
+    recipe, by name of the evaluation. Both mappings keep the file and line of each value.
     """
 
     file: Path
@@ -151,20 +155,21 @@ class Study:
 
     @property
     def title(self) -> str:
-        """Heading of the study."""
+        """Heading of the study: its title, or the name of its file."""
         return self.settings.title or self.file.stem.replace("_", " ")
 
     @cached_property
     def contrasts(self) -> Sequence[Contrast]:
-        """Hypotheses as sums of means."""
+        """Hypotheses as weighted sums of mean scores."""
         claims = [hypothesis.claim for hypothesis in self.settings.hypotheses]
         return [parsed(claim, self.variants, self.evaluations) for claim in claims]
 
 
 def read_study(file: str | Path) -> Study:
-    """Return the study in `file`, or the study of that name that comes with qgs.
+    """Read the study in `file`, or the study of that name that comes with qgs.
 
-    Variants are not composed yet. Raises RecipeError with all faults by file and line.
+    The recipes of the variants are not resolved yet. Raises RecipeError that lists all faults with
+    file and line.
     """
     problems = Problems("study")
     found = found_recipe(Path(file), str(file))
@@ -185,7 +190,7 @@ def read_study(file: str | Path) -> Study:
 
 
 def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
-    """Return the tree of `file`, merged over that of the study that it extends."""
+    """Read the study file `file` and merge it over the study that it extends."""
     try:
         with open_file(file) as opened:
             text = opened.read().decode("utf-8")
@@ -217,7 +222,7 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
 
 
 def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
-    """Return the recipe of a variant: its base, changed by the variant, then by the overlay."""
+    """Return the recipe of a variant: `base`, changed by the variant, then by `overlay`."""
     variants = tree.child("variants")
     origin = variants.origins[name]
     node = variants.child(name)
@@ -245,7 +250,7 @@ def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
 
 
 def _locate_index(node: MapNode) -> None:
-    """Make the path of an index absolute if it is relative to the study file."""
+    """Make `evaluation.index` an absolute path if it is relative to the study file."""
     section = node.child("evaluation")
     index = section.get("index")
     if isinstance(index, str):

@@ -1,4 +1,4 @@
-"""Tables of scores with text above and below, for the terminal, Markdown and JSON."""
+"""Tables of scores, with an answer above and notes below, as text, Markdown and JSON."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,19 +15,22 @@ from qgs_research.studies.scores import Scores
 from qgs_research.studies.stored import StoredResults
 
 Rows: TypeAlias = Sequence[Sequence[str]]
-"""Cells of a table, headers first."""
+"""Rows of a table, as lists of cells. The first row has the headers."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Results as text and tables. answer: one line, or "". tables: titles and rows."""
+    """Results of a comparison for readers: an answer, tables and notes.
+
+    answer: one line, or "". tables: pairs of title and rows. notes: lines below the tables.
+    """
 
     answer: str
     tables: Sequence[tuple[str, Rows]]
     notes: Sequence[str]
 
     def show(self, console: Console) -> None:
-        """Print everything."""
+        """Print answer, tables and notes."""
         print_lines(console, filter(None, [self.answer]))
         for title, rows in self.tables:
             compact = {"collapse_padding": True, "pad_edge": False}
@@ -36,7 +39,7 @@ class Summary:
 
     @property
     def markdown(self) -> str:
-        """Content of a Markdown file."""
+        """Answer, tables and notes as Markdown."""
         parts = [self.answer]
         for title, rows in self.tables:
             parts += [f"**{title}**" if title else "", markdown_table(rows)]
@@ -45,7 +48,7 @@ class Summary:
 
 
 def markdown_table(rows: Rows) -> str:
-    """Return rows of equal length as a Markdown table with numbers aligned to the right."""
+    """Return a Markdown table; all columns but the first are aligned to the right."""
     rule = [":---", *["---:"] * (len(rows[0]) - 1)]
     lines = [[cell.replace("|", "\\|") for cell in row] for row in (rows[0], rule, *rows[1:])]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -58,7 +61,11 @@ def table_rows(
     others: Sequence[str] = (),
     published: Mapping[str, float] | None = None,
 ) -> Rows:
-    """Return a row per model and baseline: all values of a metric, and means of `others`."""
+    """Return a table with one row for each model and baseline.
+
+    metric: metric with mean, standard deviation, difference and interval. others: metrics with
+    means only. published: published values of `metric`, by model.
+    """
     column = scores.columns[metric]
     head = [column.title, "sd", "difference", "95 % interval"]
     head += ["published"] if published else []
@@ -91,14 +98,14 @@ def table_rows(
 
 
 def steps_shown(runs: Iterable[StoredResults]) -> str:
-    """Return the number of steps of runs, for example 2,100, or a range if they differ."""
+    """Return the number of training steps, for example "2,100", or a range if runs differ."""
     # Budgets in seconds end at different steps.
     steps = sorted({stored.step for stored in runs if stored.step is not None})
     return " to ".join(f"{step:,}" for step in (*steps[:1], *steps[1:][-1:])) or "–"
 
 
 def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, Any]]:
-    """Yield mean and difference to the reference for each model and metric as plain values."""
+    """Yield a JSON record for each model and metric: mean and difference to the reference."""
     for model in scores.models(evaluation):
         for metric in scores.columns:
             if score := scores.score(model, metric, evaluation):
@@ -114,7 +121,10 @@ def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, 
 
 
 def training_notes(scores: Scores) -> Iterator[str]:
-    """Yield a note for each model that was trained on other data than the reference, or longer."""
+    """Yield a note for each model whose training differs from that of the reference.
+
+    Differences in data and length of training are noted.
+    """
 
     def facts(model: str) -> set[tuple[str, str]]:
         return {fact for run in scores.stored[model, MAIN].values() for fact in run.trained.items()}
@@ -125,13 +135,13 @@ def training_notes(scores: Scores) -> Iterator[str]:
         # Results without a run folder do not include how the model was trained.
         known = dict(ours).keys() & dict(theirs).keys()
         if unequal := sorted(known & dict(ours ^ theirs).keys()):
-            yield f"{model} was trained otherwise than {scores.reference}: {listed(unequal)} differ"
+            yield f"{model} was trained unlike {scores.reference}: {listed(unequal)} differ"
 
 
 def interval_notes(differences: Iterable[Estimate]) -> Iterator[str]:
-    """Yield notes about the scope of the intervals."""
+    """Yield notes that explain what the intervals cover."""
     seeds = {len(estimate.seeds) for estimate in differences}
     if max(seeds, default=0) > 1:
-        yield "intervals: 95 %, over trainings and scenes; sd: over seeds"
+        yield "95 % intervals cover trainings and scenes; sd is the standard deviation over seeds"
     if 1 in seeds:
-        yield "an interval from one training per side covers scenes alone"
+        yield "with one training per model, an interval covers scenes only, not other trainings"
