@@ -1,4 +1,4 @@
-"""Give qgs what users and strangers give, damaged at random, and see how each case ends.
+"""Fuzz tests: give qgs randomly damaged recipes, checkpoints and data, and check the outcome.
 
     python tools/fuzz.py recipes --count 2000
     python tools/fuzz.py checkpoints --count 500
@@ -6,8 +6,9 @@
     python tools/fuzz.py kill-training --count 12
     python tools/fuzz.py kill-study --count 12
 
-A case must end in success or in one of our errors, within limits of time and memory. A training
-and a study are killed `count` times, and nothing may be lost. Exit status 1 if something is wrong.
+A case must succeed, or be refused with an error of qgs, within limits of time and memory. For
+kill-training and kill-study, processes are killed COUNT times, and no results may be lost. The exit
+code is 1 if something is wrong.
 """
 
 import argparse
@@ -27,9 +28,9 @@ def main() -> int:
     )
     kinds = ("recipes", "checkpoints", "data", "kill-training", "kill-study")
     parser.add_argument("kind", choices=kinds)
-    parser.add_argument("--count", type=int, default=100, help="how many cases or kills")
-    parser.add_argument("--seed", type=int, default=0, help="a case depends on it and its number")
-    parser.add_argument("--only", type=int, help="number of the one case to show and use")
+    parser.add_argument("--count", type=int, default=100, help="number of cases or kills")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of all cases")
+    parser.add_argument("--only", type=int, help="number of a single case to use and show")
     options = parser.parse_args()
     torch.set_num_threads(1)
     module, _, killed = options.kind.partition("-")

@@ -1,11 +1,11 @@
-"""Every check that needs a GPU, in one report: see gpu_check.sh.
+"""All checks that need a GPU, in one report; see gpu_check.sh.
 
     python tools/gpu_check.py OUT [WORD ...]
 
-Each step is a command of its own with a time limit; a step that fails does not stop the others.
-Those that measure no time run side by side, the others alone; with WORDs, only steps that have one
-of them in their name, after gsplat's build, which others would repeat. OUT/report.md has commands,
-results and times, OUT/logs all output.
+Each step is a command with a time limit. A failed step does not stop the other steps. Steps that
+measure time run alone; all other steps run in parallel. With WORDs, only steps with one of the
+words in their name run, after the build of gsplat, which all need. OUT/report.md lists commands,
+results and times; OUT/logs has the output of all steps.
 """
 
 import json
@@ -33,11 +33,11 @@ PHASES = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text("utf-8"))
 BUILD = "gsplat compiles"
 
 Step = dict[str, Any]
-"""name, command, limit: as in gpu_check.yaml, for one combination of its words."""
+"""Step of the report: name, command and time limit, as in gpu_check.yaml."""
 
 
 def steps_of(phase: dict[str, Any], out: Path, words: Sequence[str]) -> Iterator[Step]:
-    """Yield the steps of a phase, or those that have one of `words` in their name."""
+    """Yield the steps of a phase; if `words` are given, steps with one of them in their name."""
     places = {
         "out": shlex.quote(str(out)),
         "root": ROOT,
@@ -54,7 +54,10 @@ def steps_of(phase: dict[str, Any], out: Path, words: Sequence[str]) -> Iterator
 
 
 def run_step(step: Step, out: Path) -> tuple[bool, str, str]:
-    """Run a step in OUT; return whether it passed, its row of the table, its output's end."""
+    """Run a step; return whether it passed, its row in the report, and the end of its output.
+
+    out: folder OUT.
+    """
     log = out / "logs" / f"{step['name'].replace(' ', '-').replace(',', '')}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     env = {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
@@ -73,7 +76,7 @@ def run_step(step: Step, out: Path) -> tuple[bool, str, str]:
 
 
 def report(out: Path, words: Sequence[str]) -> bool:
-    """Run the steps, and write OUT/report.md anew after each; return whether all passed."""
+    """Run all steps and rewrite OUT/report.md after each; return True if all passed."""
     names = [torch.cuda.get_device_name(n) for n in range(torch.cuda.device_count())]
     head = f"# Checks on {', '.join(names)}, torch {torch.__version__}, CUDA {torch.version.cuda}"
     results: list[tuple[bool, str, str]] = []
@@ -90,7 +93,7 @@ def report(out: Path, words: Sequence[str]) -> bool:
 
 
 def time_attention() -> None:
-    """Print time and memory of each kernel of attention at published size."""
+    """Print time and memory of each attention kernel, at the size of the published models."""
     # Of the tests, which are on the path of a step.
     case: Any = import_module("attending").case
     given = {name: x.cuda() for name, x in case((1, 16, 4096, 7168, 64)).items()}

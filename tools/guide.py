@@ -1,14 +1,14 @@
-"""The parts of the guide that are written from the code, and the hook of mkdocs that adds them.
+"""Generator of the parts of the guide that come from the code, and hook for mkdocs.
 
-Pages are readable in the repository too. A module or name is documented where its entry stands, a
-link to its file with the first sentence of its docstring; the site has all its documentation there,
-by mkdocstrings. A link from a name in code to its file leads to this documentation on the site.
-Between `<!-- from the code: NAME -->` and `<!-- end -->` stands what is read in
-the repository in place of the part NAME.
+The pages can be read in the repository and on the site. In the repository, the entry of a module or
+name is a link to its file with the first sentence of its docstring. On the site, mkdocstrings puts
+the whole documentation in place of the entry, and links from names to files lead there. The text
+between `<!-- from the code: NAME -->` and `<!-- end -->` is shown in the repository only; on the
+site, the generated part NAME replaces it.
 
-`python tools/guide.py` writes entries and tables of the pages anew; for a new entry write
+`python tools/guide.py` updates all entries and tables in the pages. For a new entry write
 `::: NAME`, for a new link ``[`LABEL`][NAME]``. `python tools/guide.py reference` prints the recipe
-reference, of the Configs of what is installed; building the guide puts it on the site.
+reference: all options of the installed components. A build of the site includes it.
 """
 
 import inspect
@@ -43,18 +43,21 @@ TO_FILE = re.compile(
 )
 REGISTRY = load_usable_plugins()[0]
 SECTIONS = {".".join(path) or "Top level": config for path, config in SETTINGS.items()}
-"""Settings that are no components, by their place in a recipe."""
+"""Sections of settings that are not components, by their path in a recipe."""
 
 
 def filled(page: str) -> str:
-    """`page` as the site needs it, with all parts that are written from the code."""
+    """Return a page for the site, with all generated parts filled in."""
     page = PART.sub(lambda found: PARTS[found[1]](), page)
     page = ENTRY.sub(lambda found: _block(found[1], found[2]), page)
     return TO_FILE.sub(_cross_reference, page)
 
 
 def written(page: str, folder: Path) -> str:
-    """`page` as it should be in the repository, in `folder`: links to files, the list of checks."""
+    """Return a page for the repository, with links to files and generated lists.
+
+    folder: folder of the page.
+    """
     up = "../" * len(folder.relative_to(ROOT).parts)
     page = CROSS.sub(lambda found: _link(found[1], up), page)
     page = DOCUMENTED.sub(lambda found: _entry(found[1], found[2]), page)
@@ -72,7 +75,10 @@ def _cross_reference(found: re.Match[str]) -> str:
 
 
 def _link(name: str, up: str) -> str:
-    """Return a link to the module that has `name`, labelled with the rest of the name."""
+    """Return a Markdown link to the file that defines `name`.
+
+    up: path from the page to the repository.
+    """
     module = name
     while not inspect.ismodule(found := resolve_name(module)):
         module = module.rpartition(".")[0]
@@ -99,12 +105,12 @@ def _part(name: str, text: str) -> str:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill a page; mkdocs calls this for each one."""
+    """Fill in the generated parts of a page. mkdocs calls this hook for each page."""
     return filled(markdown)
 
 
 def check_list() -> str:
-    """Return tables of all checks by subject, Markdown."""
+    """Return Markdown tables of all checks of the contract suite, by subject."""
     return filled_template(
         "guide_checks.md.jinja",
         modules=groupby(CHECKS.values(), key=lambda check: check.function.__module__),
@@ -123,13 +129,13 @@ def _slots_in_words(of: Collection[str]) -> str:
 
 
 def filled_template(name: str, **values: Any) -> str:
-    """Return what a template beside this file gives."""
+    """Return the text of the template `name` in this folder, filled with `values`."""
     text = Path(__file__).with_name(name).read_text("utf-8")
     return Template(text, trim_blocks=True).render(values)
 
 
 def reference() -> str:
-    """Return tables of all sections and of all components by slot, Markdown."""
+    """Return Markdown tables of the options of all sections and components."""
     return filled_template(
         "guide_reference.md.jinja",
         sections=SECTIONS,
@@ -143,7 +149,7 @@ def reference() -> str:
 
 
 def option_table(config: type[ComponentConfig]) -> str:
-    """Return a table of all options of `config`: values, default, meaning."""
+    """Return a Markdown table of the options of `config`: type, default and meaning."""
     rows = [("option", "values", "default", "meaning"), ("---",) * 4]
     for name, values, default, meaning in option_rows(settings_schema(config)["properties"]):
         values = values.replace("or schedule", "or a [schedule](#schedules)")
@@ -153,7 +159,10 @@ def option_table(config: type[ComponentConfig]) -> str:
 
 
 def fields_of(component: type[Component]) -> Mapping[str, Mapping[str, Any]]:
-    """Return the fields that a component reads and writes by default; none if it has no default."""
+    """Return the fields that a component reads and writes with its default options.
+
+    The result is empty for a component without valid default options.
+    """
     config = default_config(component)
     if config is None:
         return {}
@@ -161,18 +170,18 @@ def fields_of(component: type[Component]) -> Mapping[str, Mapping[str, Any]]:
 
 
 def contract_list() -> str:
-    """Return the signatures of all contracts, and the containers that they exchange, Markdown."""
+    """Return Markdown with the signatures of all contracts and the types that they exchange."""
     return filled_template(
         "guide_contracts.md.jinja", slots=slots, inspect=inspect, resolve=resolve_name
     )
 
 
 PARTS = {"recipe reference": reference, "checks": check_list, "contracts": contract_list}
-"""What writes each part of a page, by its name."""
+"""Functions that generate the parts of pages, by name of the part."""
 
 
 def main() -> None:
-    """Write all pages of the guide anew, or print the reference."""
+    """Update all pages of the guide, or print the recipe reference."""
     if sys.argv[1:] == ["reference"]:
         print(reference())
         return

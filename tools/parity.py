@@ -1,11 +1,12 @@
-"""Compare this framework with files of numbers computed by the published code.
+"""Compare qgs with golden files, whose tensors were computed by the published code.
 
     python tools/parity.py FILE…
 
-A file of a model: the model is composed from the options in the file's metadata, given the file's
-weights and run on its photos. A file of losses: the loss components are run on its tensors. All
-tensors of the file but inputs, weights and crops of a data loader are compared. Exit status 1 if
-one is beyond rtol 1e-4 + atol 5e-5, has no counterpart here, or cannot be computed.
+For a file of a model, the model is built from the options in the file's metadata, loaded with the
+file's weights, and called with its photos. For a file of losses, the loss components are called
+with its tensors. All tensors of the file except inputs, weights and crops of a data loader are
+compared. The exit code is 1 if a tensor differs by more than rtol 1e-4 + atol 5e-5, or cannot be
+computed.
 """
 
 import argparse
@@ -25,9 +26,9 @@ ATOL = 5e-5
 
 @dataclass(frozen=True)
 class Row:
-    """A tensor: its largest error over what is tolerated, and what is wrong with it, if anything.
+    """Comparison of a tensor: largest error relative to the tolerance, and what is wrong or "".
 
-    Errors are infinite where one has NaN or infinity and the other has not.
+    An error is infinite where only one of the tensors has NaN or infinity.
     """
 
     name: str
@@ -37,7 +38,7 @@ class Row:
 
 
 def compared(golden: GoldenFile) -> list[Row]:
-    """Return a row for every tensor to compare, and for those that the file lacks."""
+    """Return a row for every tensor in the golden file, and for every promised tensor it lacks."""
     found = loss_tensors(golden) if golden.is_of_losses else golden_tensors(golden)
     expected = golden.expected()
     rows = [_row(name, found.get(name), tensor) for name, tensor in expected.items()]
@@ -63,7 +64,7 @@ def _row(name: str, found: Tensor | None, expected: Tensor) -> Row:
 
 
 def report(path: Path) -> bool:
-    """Print the table of one file; whether all of it passed."""
+    """Print the comparison of one golden file; return True if all tensors agree."""
     print(path)
     try:
         rows = compared(read_golden(path))

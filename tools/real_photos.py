@@ -1,13 +1,14 @@
-"""Scores of models on real photos, over many windows, at the scale that the search finds.
+"""Scores of models on real photos, over many windows, at the best scale that a search finds.
 
     python tools/real_photos.py PHOTOS ... [--model rooms/locus-64 ...]
         [--distances .5 1 2] [--refine 10] [--windows 12] [--out JSON]
 
-For each window: PSNR and SSIM of novel views with the found scale, with `views.scale: auto`, of the
-nearest photo, of that photo as a plane at the depth of the scene, and after a refinement on the
-inputs. Prints Markdown of means. Windows are those
-that `qgs demo` chooses for the first model. Every eighth photo is held
-out. --distances: how far inputs are apart, in distances of its training.
+A window is a set of neighbouring photos, some as inputs and some as targets. Windows are those that
+`qgs demo` chooses for the first model; every eighth photo is a target. PSNR and SSIM of each window
+are computed for: the model at the best scale; the model with `views.scale: auto`; the nearest input
+photo; this photo as a plane at the depth of the scene; and, with --refine, the model after a
+refinement on the inputs. The means are printed as Markdown. --distances: distance between inputs,
+relative to the distance in the model's training.
 """
 
 import argparse
@@ -55,15 +56,15 @@ def main() -> None:
 
 
 def parsed() -> argparse.Namespace:
-    """Return the options."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("photos", nargs="+", type=Path, help="folders of photos with cameras")
+    parser.add_argument("photos", nargs="+", type=Path, help="folders of photos with camera poses")
     parser.add_argument("--model", nargs="+", default=MODELS, help=f"default: {', '.join(MODELS)}")
     parser.add_argument("--distances", type=float, nargs="+", default=[1.0], metavar="FACTOR")
     parser.add_argument("--refine", type=float, default=0.0, metavar="SECONDS", help="on inputs")
-    parser.add_argument("--windows", type=int, default=12, help="of a scene, at most")
+    parser.add_argument("--windows", type=int, default=12, help="largest number per scene")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="JSON file of all windows")
+    parser.add_argument("--out", type=Path, help="JSON file for the scores of all windows")
     return parser.parse_args()
 
 
@@ -102,9 +103,9 @@ def scene_rows(
 def rendered(
     model: QueryGaussianModel, sample: Sample, factor: float, seconds: float = 0.0
 ) -> Tensor:
-    """Return the targets of `sample` (1, T, 3, H, W), whose factor is 1, at another factor.
+    """Render the target views of `sample`, (1, T, 3, H, W).
 
-    seconds: of a refinement on the inputs.
+    factor: scale of camera positions. seconds: time for a refinement on the inputs, 0 for none.
     """
     inputs = at_factor(sample.inputs, factor)
     cameras = at_factor(sample.targets, factor).cameras
@@ -117,7 +118,7 @@ def rendered(
 
 
 def on_a_plane(inputs: Views, targets: Cameras, depth: float) -> Tensor:
-    """Return nearest inputs (1, T, 3, H, W) as seen by targets, were all they show at `depth`."""
+    """Return for each target the nearest input, warped as a plane at `depth`, (1, T, 3, H, W)."""
     numbers = torch.arange(inputs.images.shape[1]).view(1, -1, 1, 1, 1)
     by_number = Views(numbers.float().expand_as(inputs.images), inputs.cameras)
     nearest = inputs.select(nearest_input(by_number, targets)[0, :, 0, 0, 0].int().tolist())
@@ -135,14 +136,14 @@ def on_a_plane(inputs: Views, targets: Cameras, depth: float) -> Tensor:
 
 
 def lenses(cameras: Cameras) -> Tensor:
-    """Return matrices (V, 3, 3) to pixels, whose middles are whole numbers, of cameras (1, V)."""
+    """Return intrinsic matrices (V, 3, 3) of cameras (1, V). Pixel centres are integers."""
     k_V33 = torch.diag_embed(F.pad(cameras.intrinsics[0, :, :2], (0, 1), value=1.0))
     k_V33[:, :2, 2] = cameras.intrinsics[0, :, 2:] - 0.5
     return k_V33
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Return Markdown of means: a line for each model, scene and distance, and for each model."""
+    """Return a Markdown table of means: a row for each model, scene and distance, and model."""
     scores = [name for name in rows[0] if name.endswith(("PSNR", "SSIM"))]
     groups: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
     for row in rows:

@@ -1,9 +1,10 @@
-"""The picture of the rooms that docs/design.md begins with, drawn from the imports.
+"""Picture of the modules of qgs and their imports, for the start of docs/design.md.
 
     python tools/rooms.py
 
-A room is a package or module of `qgs/`, or a distribution of `plugins/`. Rooms stand above what
-they import. An arrow leads to a room that is imported and that no other arrow leads to already.
+A room is a package or module in `qgs/`, or a distribution in `plugins/`. Each room is drawn above
+the rooms that it imports. An arrow leads to an imported room, unless a path of other arrows leads
+to it.
 """
 
 import ast
@@ -20,12 +21,12 @@ TEMPLATE = Path(__file__).with_name("rooms.svg.jinja")
 GAP = 14
 ROW = 104
 ACROSS = 182
-"""Distance from the left edge of a room to that of the next."""
+"""Distance between the left edges of neighbouring rooms, in pixels."""
 COLUMNS = 7
 
 
 def rooms() -> dict[str, list[Path]]:
-    """Return the name of every room, and its files."""
+    """Return the Python files of every room, by name of the room."""
     folders = sorted((ROOT / "qgs").iterdir()) + sorted((ROOT / "plugins").glob("*/src/*"))
     found = {x.stem: sorted(x.rglob("*.py")) if x.is_dir() else [x] for x in folders}
     # Neither `__main__`, nor what tells type checkers that there are types, nor old folders.
@@ -34,7 +35,7 @@ def rooms() -> dict[str, list[Path]]:
 
 
 def imports(files: list[Path]) -> set[str]:
-    """Return the rooms that `files` import, by statements anywhere in them."""
+    """Return the rooms that `files` import, also inside functions."""
     names = set[str]()
     for file in files:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -48,13 +49,13 @@ def imports(files: list[Path]) -> set[str]:
 
 
 def title(file: Path) -> str:
-    """Return the first words of a docstring."""
+    """Return the first words of the docstring of `file`, as a short title."""
     text = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
     return shorten(re.split("[:,.]", text.replace("`", ""))[0], 30, placeholder=" ...")
 
 
 def drawn() -> str:
-    """Return the picture as SVG."""
+    """Return the picture of all rooms as SVG."""
     files = rooms()
     arrows = nx.DiGraph()
     arrows.add_nodes_from(files)

@@ -1,10 +1,10 @@
-"""Size and density of the Python in this repository, by group; tests/test_quality.py has limits.
+"""Size of the Python code in this repository, by group; tests/test_quality.py sets limits.
 
     python tools/size.py
 
-tokens: of code, without comments, docstrings, line ends and indentation, so that folding lines
-saves nothing. parallel: assignments `a, b = x, y` per 1,000 lines of files without kernels of numba
-or Triton. why: lines that hold a comment of their own, as a share of lines, in percent.
+tokens: number of tokens of code. Comments, docstrings, line ends and indentation do not count, so
+the layout of lines does not matter. parallel: assignments such as `a, b = x, y` per 1,000 lines,
+in files without kernels of numba or Triton. why: percentage of lines that hold only a comment.
 """
 
 import ast
@@ -28,7 +28,10 @@ KERNELS = ("@jit", "@kernel", "numba", "triton.jit")
 
 
 def group_of(path: str) -> str:
-    """Return qgs, plugins, tests, tools, docs or other; `path` is relative to the repository."""
+    """Return the group of a file: qgs, plugins, tests, tools, docs or other.
+
+    path: path of the file, relative to the repository.
+    """
     parts = path.split("/")
     if "tests" in parts or path == "conftest.py":
         return "tests"
@@ -36,20 +39,20 @@ def group_of(path: str) -> str:
 
 
 def is_docstring(node: ast.AST) -> bool:
-    """Tell whether a statement is a text alone, of a module, class, function or name."""
+    """Return True if a statement is a docstring, of a module, class, function or name."""
     value = node.value if isinstance(node, ast.Expr) else None
     return isinstance(value, ast.Constant) and isinstance(value.value, str)
 
 
 def is_parallel(node: ast.AST) -> bool:
-    """Tell whether a statement assigns several values at once."""
+    """Return True if a statement assigns several values at once, such as `a, b = x, y`."""
     if not isinstance(node, ast.Assign):
         return False
     return isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
 
 
 def measure(text: str) -> Counter[str]:
-    """Return the counts of a file, by name."""
+    """Count tokens, lines and other quantities of a file with content `text`, by name."""
     documented: set[int] = set()
     parallel = 0
     for node in ast.walk(ast.parse(text)):
@@ -73,14 +76,14 @@ def measure(text: str) -> Counter[str]:
 
 
 def sources() -> dict[str, str]:
-    """Return path to text of the Python files that git knows."""
+    """Return the contents of all Python files that git tracks, by path."""
     listed = subprocess.check_output(["git", "-C", ROOT, "ls-files", "*.py"], text=True)
     names = [name for name in listed.split() if (ROOT / name).is_file()]
     return {name: (ROOT / name).read_text(encoding="utf-8") for name in names}
 
 
 def sizes() -> dict[str, dict[str, float]]:
-    """Return tokens, lines, files, parallel and why of each group, and of `all`."""
+    """Return tokens, lines, files, parallel and why of each group, and of the group `all`."""
     groups: dict[str, Counter[str]] = defaultdict(Counter)
     for name, text in sources().items():
         counts = measure(text)
@@ -99,7 +102,7 @@ def sizes() -> dict[str, dict[str, float]]:
 
 
 def main() -> None:
-    """Print a table of the groups, the largest first."""
+    """Print a table of the groups, in descending order of size."""
     print(f"{'group':10}{'tokens':>9}{'lines':>8}{'files':>7}{'parallel':>10}{'why %':>7}")
     for group, of in sorted(sizes().items(), key=lambda item: -item[1]["tokens"]):
         counted = f"{of['tokens']:9,}{of['lines']:8,}{of['files']:7}"

@@ -1,1 +1,1 @@
-"""Random cases of what users and strangers give, each used in a process of its own."""
+"""Fuzz tests with random invalid files and options. Each case runs in a separate process."""

@@ -1,4 +1,4 @@
-"""A case and its limits: a process of its own, seconds, bytes, one of our errors or success."""
+"""Runner of fuzz cases. Each has its own process and limits of time and memory."""
 
 import os
 import random
@@ -22,31 +22,34 @@ BYTES = 2 * 10**9
 LONGEST_MESSAGE = 100_000
 TABLES = yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text("utf-8"))
 JUNK = [*TABLES["junk"], "x" * 100_000, [0] * 10_000]
-"""Values where others belong."""
+"""Values of wrong types and extreme sizes, to write in place of valid values."""
 
 Use = Callable[[], str]
-"""Function that uses a case and returns how that ended. It raises what a user must never see."""
+"""Function that uses a case and returns the outcome. It raises errors that no user should see."""
 
 
 class FaultError(Exception):
-    """A case that ended as it must not."""
+    """Error for a case with a forbidden outcome."""
 
 
 def refused(error: BaseException, file: str = "") -> str:
-    """Return "refused" and the kind of `error`. Raises FaultError for a bad message.
+    """Return "refused" and the type of `error`.
 
-    file: must be named in it.
+    Raises FaultError if the message is too long, or does not contain the name `file`.
     """
     text = str(error)
     if file not in text:
-        raise FaultError("no file is named") from error
+        raise FaultError("the message names no file") from error
     if len(text) > LONGEST_MESSAGE:
-        raise FaultError(f"a message of {len(text):,} characters")
+        raise FaultError(f"the message is too long: {len(text):,} characters")
     return f"refused {type(error).__name__}"
 
 
 def other_leaf(tree: Any, junk: Sequence[Any] = JUNK) -> str:
-    """Replace a leaf or a branch of JSON by junk, or remove it; return its key and the junk."""
+    """Replace a random value in a JSON tree by a junk value, or remove it.
+
+    Returns a description of the change.
+    """
     while True:
         key = choice(list(tree) if isinstance(tree, dict) else range(len(tree)))
         inside = tree[key]
@@ -63,7 +66,7 @@ def other_leaf(tree: Any, junk: Sequence[Any] = JUNK) -> str:
 
 
 def other_bytes(file: Path) -> str:
-    """Damage a file, or put another one or none in its place; return what was done."""
+    """Damage, replace or delete a file; return a description of the change."""
     data = file.read_bytes()
     at = randrange(len(data) + 1)
     flipped = bytes(byte ^ randrange(1, 256) for byte in data[at : at + 8])
@@ -87,10 +90,11 @@ def other_bytes(file: Path) -> str:
 
 
 def fuzz(kind: Any, scratch: Path, seed: int, count: int, only: int | None = None) -> int:
-    """Use `count` cases, or one alone; print how they ended. Return 1 if any went wrong.
+    """Use `count` random cases and print their outcomes. Return 1 if one was wrong, else 0.
 
-    kind: a module with `prepare`, which writes what all cases share into the folder `scratch`, and
-    `case_in`, from this folder and an empty one to the description of a random case, and its use.
+    kind: module with the functions `prepare` and `case_in`. `prepare` writes files that all cases
+    share into the folder `scratch`. `case_in` takes this folder and an empty one, and returns a
+    description and the use of a random case. only: number of a single case to use.
     """
     kind.prepare(scratch)
     ends = Counter[str]()
@@ -109,7 +113,7 @@ def fuzz(kind: Any, scratch: Path, seed: int, count: int, only: int | None = Non
 
 
 def ended(use: Use) -> tuple[str, str]:
-    """Do `use` in a process of its own; return how it ended, and what is wrong with that."""
+    """Call `use` in a separate process; return its outcome, and what is wrong with it or ""."""
     with ProcessPoolExecutor(1, get_context("fork")) as pool:
         try:
             end, most = pool.submit(limited, use).result()
@@ -119,7 +123,7 @@ def ended(use: Use) -> tuple[str, str]:
 
 
 def limited(use: Use) -> tuple[str, int]:
-    """Return how `use` ends, and the most bytes of memory that it had."""
+    """Call `use`; return its outcome and the peak memory of this process in bytes."""
     # The signal ends a process that hangs.
     signal.alarm(SECONDS)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)

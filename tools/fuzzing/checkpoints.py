@@ -1,7 +1,9 @@
-"""Checkpoints and PLY files, damaged in many ways: each is used, or refused by its name.
+"""Fuzz cases of checkpoints and PLY files, damaged in many ways.
 
-Half of the checkpoints are sealed anew, as by somebody who means harm. Metadata that are not, and
-are used, must give the numbers of the undamaged file; nothing seals the tensors.
+Each file must be used without an error, or refused by an error that names the file. In half of the
+checkpoints the checksum of the metadata is updated after the damage, as an attacker would do. If a
+checkpoint with a wrong checksum is used, it must give the numbers of the undamaged file. Tensors
+have no checksum.
 """
 
 import json
@@ -29,7 +31,7 @@ SMALL = TABLES["small"].split()
 
 
 def other_tensor(header: Any, data: bytearray) -> None:
-    """Give a tensor another type, shape, place, name or value."""
+    """Change the type, shape, position, name or values of a random tensor."""
     name = choice([key for key in header if key != "__metadata__"])
     entry = header[name]
     shape = entry["shape"]
@@ -51,7 +53,7 @@ def other_tensor(header: Any, data: bytearray) -> None:
 
 
 def other_metadata(header: Any, _: bytearray) -> None:
-    """Put another text, or a leaf or branch of the JSON, into an entry of the metadata."""
+    """Replace an entry of the metadata, or a value in its JSON, by a random value."""
     metadata = header["__metadata__"]
     key = choice(list(metadata))
     text = metadata.pop(key)
@@ -65,7 +67,7 @@ def other_metadata(header: Any, _: bytearray) -> None:
 
 
 def other_recipe(header: Any, _: bytearray) -> None:
-    """Name files in the recipe, and sizes that no tensor has or no machine holds."""
+    """Write other file names, wrong sizes or huge sizes into the recipe in the metadata."""
     tree = json.loads(header["__metadata__"]["qgs.recipe"])
     new = choice(TABLES["recipes"])
     texts = [new, tree | new]
@@ -74,7 +76,7 @@ def other_recipe(header: Any, _: bytearray) -> None:
 
 
 def damage_checkpoint(file: Path) -> str:
-    """Change the header or the tensors of a checkpoint; return what was done."""
+    """Change the header or the tensors of a checkpoint; return a description of the change."""
     whole = file.read_bytes()
     end = 8 + int.from_bytes(whole[:8], "little")
     header = json.loads(whole[8:end])
@@ -93,7 +95,10 @@ def damage_checkpoint(file: Path) -> str:
 
 
 def damage_ply(file: Path) -> str:
-    """Write another word into the header, and perhaps a value that is no number or extreme."""
+    """Change a word in the header of a PLY file, and perhaps a value to NaN or an extreme number.
+
+    Returns a description of the change.
+    """
     head, end, data = file.read_bytes().partition(b"end_header\n")
     values = np.frombuffer(data, "<f4").copy()
     if random.random() < 0.5:
@@ -105,7 +110,7 @@ def damage_ply(file: Path) -> str:
 
 
 def decode(file: Path) -> bytes:
-    """Load a checkpoint and make Gaussians of its queries; return them as PLY."""
+    """Load a checkpoint and decode its queries into Gaussians; return the Gaussians as PLY."""
     with CheckpointFile(file) as checkpoint:
         model = checkpoint.model()
         _ = checkpoint.extra
@@ -119,7 +124,7 @@ def decode(file: Path) -> bytes:
 
 
 def start_from(file: Path) -> bytes:
-    """Start a training from a checkpoint; return its weights."""
+    """Start a training from the weights of a checkpoint; return these weights as bytes."""
     recipe = resolve(RECIPE, [*SMALL, "model.queries.count=9", f"init_from={file}"])
     model = recipe.build_model()
     initialise(model, recipe)
@@ -127,12 +132,15 @@ def start_from(file: Path) -> bytes:
 
 
 def convert(file: Path) -> None:
-    """Read a PLY and write it again."""
+    """Read a PLY file and write it again."""
     qgs.save_ply(qgs.load_ply(file), file.with_name("again.ply"))
 
 
 def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None) -> str:
-    """Return how `use` ended. whole: what it must return; None for anything."""
+    """Call `use` on the file `path`; return "success", or how the file was refused.
+
+    whole: result of the undamaged file, which must be equal; None allows any result.
+    """
     try:
         made = use(path)
     except (ValueError, OSError) as error:
@@ -140,19 +148,22 @@ def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None)
         named = "" if "not finite" in str(error) else str(path)
         return f"{use.__name__} {refused(error, named)}"
     if whole not in (None, made):
-        raise FaultError("other numbers than those of the undamaged file")
+        raise FaultError("the numbers differ from those of the undamaged file")
     return f"{use.__name__} success"
 
 
 def prepare(scratch: Path) -> None:
-    """Write a checkpoint and a PLY file."""
+    """Write an undamaged checkpoint and an undamaged PLY file to `scratch`."""
     model = qgs.compose(RECIPE, SMALL)
     qgs.save(model, scratch / "a.safetensors", extra={"step": "3"})
     decode(scratch / "a.safetensors")
 
 
 def case_in(scratch: Path, folder: Path) -> tuple[str, Use]:
-    """Damage a copy of one of the files."""
+    """Copy one of the files in `scratch` to `folder` and damage it.
+
+    Returns a description of the case, and the function that uses it.
+    """
     use = choice((decode, start_from, convert))
     original = scratch / ("a.ply" if use is convert else "a.safetensors")
     path = folder / original.name

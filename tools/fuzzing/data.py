@@ -1,7 +1,7 @@
-"""Small data sets of every format with one damaged file: each is read, or refused by its name.
+"""Fuzz cases of data: small data sets of every format, in which one file is damaged.
 
-Each is checked as `qgs data check` does and read as training does. What cannot be read, the check
-must call an error.
+Each data set is checked as by `qgs data check`, and read as by training. Reading must succeed, or
+fail with an error that names the data set. If reading fails, the check must report an error.
 """
 
 import json
@@ -34,12 +34,12 @@ RAN = Path("qgs-fuzz-ran")
 
 
 def opened(folder: Path) -> SceneSource:
-    """Open a data set as training does."""
+    """Open the data set in `folder` as training does."""
     return open_for(str(folder), (16, 16), None, sources())[0]
 
 
 def write_nerfstudio(folder: Path, photos: Any) -> None:
-    """Write nerfstudio's format with masks and depth maps."""
+    """Write photos to `folder` in nerfstudio's format, with masks and depth maps."""
     formats.write_nerfstudio(folder, photos)
     (folder / "mask.png").write_bytes(formats.encoded(np.full(SIZE, 255, np.uint8)))
     np.save(folder / "depth.npy", np.ones(SIZE, np.float32))
@@ -49,7 +49,7 @@ def write_nerfstudio(folder: Path, photos: Any) -> None:
 
 
 def write_cameras(folder: Path, photos: Any) -> None:
-    """Write a project's own listing, which has other names for poses and lenses."""
+    """Write photos to `folder` with a custom list of cameras, whose key names are not standard."""
     formats.write_nerfstudio(folder, photos, K=photos.intrinsics)
     listing = folder / "transforms.json"
     text = listing.read_text().replace("transform_matrix", "c2w")
@@ -82,14 +82,17 @@ WRITERS: dict[str, Callable[[Path, Any], object]] = {
 
 
 class Payload:
-    """Code that a pickle would run."""
+    """Object whose pickle runs code when it is loaded."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Path.touch, (RAN,)
 
 
 def damaged(file: Path) -> str:
-    """Change what a file says, or its bytes if its format is unknown; return what was done."""
+    """Damage a file: its values, or its bytes if the format is unknown.
+
+    Returns a description of the damage.
+    """
     match file.suffix:
         case ".json":
             tree = json.loads(file.read_text())
@@ -114,7 +117,10 @@ def damaged(file: Path) -> str:
 
 
 def case_in(_: Path, folder: Path) -> tuple[str, Use]:
-    """Write a data set and damage one of its files."""
+    """Write a data set to `folder` and damage one of its files.
+
+    Returns a description of the case, and the function that uses it.
+    """
     data = folder / "data"
     data.mkdir()
     kind = choice([*WRITERS])
@@ -129,7 +135,7 @@ def case_in(_: Path, folder: Path) -> tuple[str, Use]:
 
 
 def read(folder: Path) -> None:
-    """Read all frames of all scenes, and draw a sample. Raises what reading raises."""
+    """Read all frames of all scenes, and make a training sample. Raises the errors of reading."""
     source = opened(folder)
     for split in ("train", "test"):
         for scene in source.scenes(split):
@@ -138,14 +144,17 @@ def read(folder: Path) -> None:
             every = [scene.images(frames), scene.masks(frames), scene.depths(frames)]
             for tensor in (cameras.c2w, cameras.intrinsics, *every):
                 if tensor is not None and not torch.isfinite(tensor).all():
-                    raise FaultError(f"{scene.name} is delivered with NaN or infinite numbers")
+                    raise FaultError(f"{scene.name} is read with NaN or infinite numbers")
     scenes = source.scenes("train")
     if scenes and all(len(scene) - len(scene.held_out) > 1 for scene in scenes):
         SampleStream(source, ViewsConfig(inputs=2, targets=1, gap=(1, 3)), 0).batch([0])
 
 
 def judged(folder: Path) -> str:
-    """Return how checking and reading end. Raises what a user must not see."""
+    """Check and read a data set; return the outcome of both, "refused" or success.
+
+    Raises an error that no user should see.
+    """
     try:
         report = check(opened_path(folder), Options(geometry=1, threads=1))
         errors = [str(finding) for finding in report.findings if finding.severity == "error"]
@@ -156,14 +165,14 @@ def judged(folder: Path) -> str:
         read(folder)
     except (ValueError, OSError) as error:
         if not errors:
-            raise FaultError(f"the check finds nothing, reading raises: {error}") from error
+            raise FaultError(f"the check finds no error, but reading raises: {error}") from error
         return f"{refused(error, str(folder))}: {error}"
     if RAN.exists():
-        raise FaultError("code of a pickle ran")
+        raise FaultError("loading ran the code in a pickle")
     return "success" if not errors else f"success, with errors of the check: {errors}"
 
 
 def prepare(_: Path) -> None:
-    """Be quiet about what damaged files cause."""
+    """Turn off warnings that damaged files cause."""
     np.seterr(all="ignore")
     logging.disable(logging.CRITICAL)

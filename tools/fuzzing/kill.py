@@ -1,8 +1,9 @@
-"""Kill trainings, or the processes of a study, at random moments, and see that nothing is lost.
+"""Kill trainings, or the processes of a study, at random moments, and check that nothing is lost.
 
-After each kill -9 of a training its state and checkpoint must be whole and no older than before;
-continued to the end, its state must equal, to the bit, that of the same run without a kill. A study
-loses workers and its queue; its tables must equal those of an undisturbed one.
+After each kill -9 of a training, its state and checkpoint must be readable and no older than before
+the kill. After the training is continued to the end, its state must equal, bit by bit, that of a
+run without kills. In a study, workers and the main process are killed; its tables must equal those
+of a study without kills.
 """
 
 import json
@@ -57,7 +58,10 @@ hypotheses: [free < locus, tokengs@more - tokengs < locus@more - locus]
 
 
 def started(command: str, log: Path, **values: object) -> Popen[bytes]:
-    """Start `qgs COMMAND` in a process of its own; `values` fill in its words."""
+    """Start `qgs COMMAND` as a process that prints to `log`.
+
+    values: replacements for placeholders in the command.
+    """
     words = [word.format(recipes=RECIPES, **values) for word in command.split()]
     with log.open("ab") as file:
         return Popen([QGS, *words], stdout=file, stderr=file)
@@ -68,7 +72,7 @@ def train(run: Path, save_every: int) -> Popen[bytes]:
 
 
 def kill_within(process: Popen[bytes], run: Path) -> bool:
-    """Kill a training in the second after its first new step; False if it ended before."""
+    """Kill a training within a second after its first new step; return False if it ended before."""
     history = run / "history.jsonl"
     before = history.stat() if history.exists() else None
     while process.poll() is None and (not history.exists() or history.stat() == before):
@@ -79,7 +83,10 @@ def kill_within(process: Popen[bytes], run: Path) -> bool:
 
 
 def saved_step(run: Path) -> int:
-    """Return the step of the state, 0 without one; raise if state or checkpoint is not whole."""
+    """Return the step of a run's saved state, or 0 if there is none.
+
+    Raises an error if state or checkpoint cannot be read.
+    """
     folder = RunFolder(run)
     if folder.checkpoint.exists():
         qgs.load(folder.checkpoint)
@@ -87,14 +94,14 @@ def saved_step(run: Path) -> int:
 
 
 def values_of(run: Path) -> dict[str, Any]:
-    """Return all values of the state of a run by name, times aside."""
+    """Return all values of a run's saved state by name, except times."""
     values = map_tensors(Tensor.tolist, read_state(run / "state.safetensors")[1])
     del values["counters"]["seconds"]
     return values
 
 
 def training(folder: Path, count: int) -> int:
-    """Kill a training `count` times; return 0 if nothing was lost."""
+    """Kill a training `count` times and continue it; return 0 if nothing was lost, else 1."""
     run = folder / "run"
     steps = [0]
     inside = 0
@@ -106,28 +113,31 @@ def training(folder: Path, count: int) -> int:
     quiet = values_of(folder / "quiet")
     differing = [name for name in sorted(ours | quiet) if ours.get(name) != quiet.get(name)]
     print(
-        f"{len(steps) - 1} kills, {inside} inside a save; steps of the state after each: {steps}; "
+        f"{len(steps) - 1} kills, {inside} of them during a save; saved steps after each: {steps}; "
         f"ended with {codes}; values unlike those of a run without kills: {differing}"
     )
     return int(len(steps) <= count or steps != sorted(steps) or any(codes) or differing != [])
 
 
 def workers_of(queue: Popen[bytes]) -> list[psutil.Process]:
-    """Return the processes that train for a queue."""
+    """Return the training processes that `queue`, the main process of a study, has started."""
     with suppress(psutil.Error):
         return psutil.Process(queue.pid).children()
     return []
 
 
 def tables_of(out: Path) -> tuple[dict[str, Any], str]:
-    """Return the results of a study without its times."""
+    """Return the contents of results.json, without times, and of table.md."""
     record = json.loads((out / "results.json").read_text())
     del record["times"]
     return record, (out / "table.md").read_text()
 
 
 def study(folder: Path, count: int, steps: int = 60) -> int:
-    """Kill workers and queues of a study; return 0 if its tables are those of a quiet one."""
+    """Kill workers and the main process of a study, `count` times.
+
+    Returns 0 if its tables equal those of a study without kills, else 1.
+    """
     (folder / "study.yaml").write_text(STUDY.format(recipes=RECIPES, steps=steps))
     command = "study {folder}/study.yaml --out {folder}/{name} --workers 2 --threads 1 --device cpu"
 
@@ -155,5 +165,5 @@ def study(folder: Path, count: int, steps: int = 60) -> int:
         process = queue("killed")
     codes = [process.wait(), queue("quiet").wait()]
     equal = not any(codes) and tables_of(folder / "quiet") == tables_of(folder / "killed")
-    print(f"kills: {kills}; ended with {codes}; equal to a quiet study: {equal}")
+    print(f"kills: {kills}; ended with {codes}; equal to a study without kills: {equal}")
     return int(not equal or len(kills) < count)

@@ -1,7 +1,7 @@
-"""Shipped recipes in which values, types, structure or text were changed.
+"""Fuzz cases of recipes: shipped recipes with random changes of values, structure or text.
 
-A case passes when it resolves, builds on "meta" and resolves to itself again, or when it is refused
-by one RecipeError of which no problem comes from a component that fails inside.
+A case passes if the recipe resolves, builds on the device "meta", and resolves to itself again. It
+also passes if it is refused with a RecipeError that was not caused by a failure inside a component.
 """
 
 import json
@@ -21,7 +21,7 @@ from qgs.recipe.slots import SLOTS
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 PARTS = ("finetune/dl3dv", "rooms/budget", "studies/")
-"""Beginnings of names of files that are no whole recipes."""
+"""Prefixes of recipe files that are not complete recipes."""
 FOUND = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
 OPTIONS = {name: flat(resolve(RECIPES / name).tree) for name in FOUND if not name.startswith(PARTS)}
 REGISTRY = load_usable_plugins()[0]
@@ -31,19 +31,19 @@ YAML += ["9" * 30, "9" * 5000, "x" * 1000, "[" * 80 + "]" * 80, "[" * 3000 + "]"
 
 
 Options = dict[str, Any]
-"""Values by path of a resolved recipe."""
+"""Values of a resolved recipe, by dotted path."""
 Change = tuple[list[str], str]
-"""A path, and the YAML that is written there."""
+"""Change of a recipe: the path of an option, and the YAML text to write there."""
 
 
 def any_value(options: Options) -> Change:
-    """Write any text in place of an option or a section."""
+    """Replace a random option or section by a random YAML text."""
     path = choice([*options]).split(".")
     return path[: choice([None, None, None, None, -1, 1])] or path, choice(YAML)
 
 
 def scaled(options: Options) -> Change:
-    """Make a number larger, smaller, negative or a fraction."""
+    """Multiply a random number: make it larger, smaller, negative or a fraction."""
     path = choice([path for path, value in options.items() if type(value) in (int, float)])
     number = options[path] * choice(TABLES["factors"])
     whole = isinstance(options[path], int) and random.random() < 0.9
@@ -51,7 +51,7 @@ def scaled(options: Options) -> Change:
 
 
 def other_component(options: Options) -> Change:
-    """Put any component in place of another, of layers and by swaps too."""
+    """Replace a random component by any component: in the model, in one layer, or by `swap`."""
     path = choice([path for path in options if path.endswith(".type")]).split(".")[:-1]
     layer = ["model", "decoder", "layers", choice(TABLES["layers"]), path[-1]]
     swap = ["swap", choice([".".join(path), f"decoder.layers.*.{path[-1]}", "*", "*.x"])]
@@ -60,7 +60,7 @@ def other_component(options: Options) -> Change:
 
 
 def elsewhere(options: Options) -> Change:
-    """Misspell an option, move it elsewhere, or name another base."""
+    """Misspell an option, move it to another section, or change the base recipe."""
     path = choice([*options])
     *section, name = path.split(".")
     others = choice([*options]).split(".")
@@ -71,7 +71,7 @@ def elsewhere(options: Options) -> Change:
 
 
 def broken(text: str) -> str:
-    """Return the text cut, with a piece left out or repeated, or with characters put into it."""
+    """Damage a text: cut it off, remove or repeat a piece, or insert odd characters."""
     lines = text.splitlines(keepends=True)
     pieces = choice((lines, list(text)))
     first, last = sorted(randrange(len(pieces) + 1) for _ in range(2))
@@ -82,7 +82,10 @@ def broken(text: str) -> str:
 
 
 def judged(text: str, overrides: list[str], file: Path) -> str:
-    """Return how a case ends. Raises what nobody should see."""
+    """Resolve and build a recipe; return "success", or how it was refused.
+
+    Raises an error that no user should see.
+    """
     file.write_text(text, encoding="utf-8")
     try:
         recipe = resolve(file, overrides)
@@ -95,12 +98,15 @@ def judged(text: str, overrides: list[str], file: Path) -> str:
     file.write_text(annotated(recipe), encoding="utf-8")
     for again in (file, json.loads(json.dumps(recipe.tree))):
         if resolve(again).tree != recipe.tree:
-            raise FaultError(f"resolves to another recipe when it is written as {type(again)}")
+            raise FaultError(f"the recipe changes when it is written and read as {type(again)}")
     return "success"
 
 
 def case_in(scratch: Path, _: Path) -> tuple[str, Use]:
-    """Write a recipe with one change beside the shipped one; others are overrides."""
+    """Make a random recipe with one change in its file, and further changes as overrides.
+
+    Returns a description of the case, and the function that uses it.
+    """
     name = choice([*OPTIONS])
     shipped = scratch / "recipes" / name
     changes: list[Change] = []
@@ -120,5 +126,5 @@ def case_in(scratch: Path, _: Path) -> tuple[str, Use]:
 
 
 def prepare(scratch: Path) -> None:
-    """Copy the shipped recipes."""
+    """Copy the shipped recipes to `scratch`."""
     shutil.copytree(RECIPES, scratch / "recipes")

@@ -1,5 +1,5 @@
-"""Computing here what files of numbers of the published code hold.
+"""Computation of the tensors in golden files, which were recorded with the published code.
 
-files: reading them. models, splats, losses: their tensors by our components. recording: what
-modules compute on the way.
+files: reads golden files. models, splats, losses: compute their tensors by components of qgs.
+recording: records outputs of modules inside a model.
 """

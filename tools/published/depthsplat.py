@@ -1,4 +1,4 @@
-"""Every tensor of a golden file of DepthSplat, computed by the components."""
+"""Tensors of a golden file of DepthSplat, computed by the components of qgs."""
 
 import json
 from typing import Any
@@ -35,7 +35,7 @@ from qgs.contracts import LayerParts, ModelDims
 from qgs.types import ImageMemory, Views
 
 DIMS = {1: ModelDims(38, 1, 0), 2: ModelDims(39, 1, 2)}
-"""Sizes by number of scales; a model of two scales outputs both depths."""
+"""Model sizes by number of scales. A model with two scales outputs the depths of both."""
 
 OUTPUTS = """
 features_cnn.0                        depth_predictor.backbone.conv2
@@ -57,7 +57,7 @@ feature_upsampler.refinenet2          feature_upsampler.scratch.refinenet2
 feature_upsampler.refinenet3          feature_upsampler.scratch.refinenet3
 feature_upsampler.refinenet4          feature_upsampler.scratch.refinenet4
 """
-"""Names in the file, and modules of the network."""
+"""Lines with a name in the golden file and the module whose output has this name."""
 FINER_OUTPUTS = """
 features_mv.1     mv_pyramid.stages.1
 features_mono.1   mono_pyramid.stages.1
@@ -65,7 +65,7 @@ features_mono.1   mono_pyramid.stages.1
 
 
 def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
-    """Return the encoder with the options and the weights of a file."""
+    """Return DepthSplat's encoder with the options and the weights of a golden file."""
     shapes = {f"encoder.{name}": shape for name, shape in golden.config["state_dict"]}
     options = depthsplat_encoder(shapes)
     del options["type"]
@@ -78,7 +78,7 @@ def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
 
 
 def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """Every output of a golden file."""
+    """Compute every output that a golden file has, by name."""
     encoder = encoder_of(golden)
     views = views_of(golden)
     near = golden.input("near")
@@ -110,7 +110,7 @@ def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> None:
-    """Hooks on all modules whose output a file has."""
+    """Record all modules whose output is in the golden file. size: image size (H, W)."""
     network = encoder.network
     predictor = encoder.network.depth_predictor
     low = (size[0] // encoder.config.stride, size[1] // encoder.config.stride)
@@ -142,7 +142,7 @@ def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> 
 
 
 def swept(found: dict[str, Tensor], predictor: DepthPredictor, views: Views, sweep: Sweep) -> None:
-    """Add to `found` what the sweeps compute between modules."""
+    """Add to `found` the tensors of plane sweeps that no module outputs."""
     shape = sweep.near.shape
     poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
     counts = [predictor.candidates(scale) for scale in range(predictor.sizes.scales)]
@@ -164,7 +164,7 @@ def swept(found: dict[str, Tensor], predictor: DepthPredictor, views: Views, swe
 
 
 def training_gaussians(views: Views, numbers: Tensor, dims: ModelDims) -> dict[str, Tensor]:
-    """Return depths and means of both scales, one behind the other, as training decodes them."""
+    """Return depths and means of Gaussians of both scales, concatenated as in training."""
     memory = ImageMemory(numbers.flatten(1, 3), grid=(views.cameras.shape[1], *views.cameras.size))
     layer = Exchange(Exchange.Config(), LayerParts(dims, {}, 1.0))
     head, centers = outputs_of(dims)
@@ -178,5 +178,5 @@ def training_gaussians(views: Views, numbers: Tensor, dims: ModelDims) -> dict[s
 
 
 def outputs_of(dims: ModelDims) -> tuple[WorldHead, OnRays]:
-    """Return the head and the centers that decode a pixel's numbers."""
+    """Return the head and the centers component that decode the network's output per pixel."""
     return WorldHead(WorldHead.Config(), dims), OnRays(OnRays.Config(measure="depth"), dims)

@@ -1,6 +1,6 @@
-"""Every tensor that a file of losses can hold, computed by our loss components.
+"""Tensors of a golden file of losses, computed by the loss components of qgs.
 
-`refssim` means SSIM with zero padding ("same"), as in training here.
+`refssim` in a name means SSIM with zero padding ("same"), as qgs uses in training.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,14 +22,14 @@ from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering
 RGB_TERM = {"tokengs": "loss_rgb", "locusgs": "loss_mse"}
 SSIM_WEIGHTS = {"nossim": 0.0, "refssim": 0.2}
 CLAMPS = {"noclamp": None, "clamp1": 1.0, "clamp0p25": 0.25}
-"""Thresholds of visibility."""
+"""Thresholds of the visibility loss, by their names in the golden file."""
 
 Given = tuple[LayerPrediction, Rendering, Views]
-"""Input of a loss: prediction, rendering and views of B scenes."""
+"""Inputs of a loss: prediction, rendering and true views of B scenes."""
 
 
 def read_inputs(golden: GoldenFile) -> Given:
-    """Read the inputs of a loss file; outside its mask the truth is white, as in both releases."""
+    """Return the inputs of the losses. True images are white outside their mask, as published."""
     points = golden.input("points")
     images = golden.input("images_gt")
     size = (images.shape[-2], images.shape[-1])
@@ -47,13 +47,13 @@ def read_inputs(golden: GoldenFile) -> Given:
 
 
 def value(loss: Loss, given: Given) -> Tensor:
-    """Return the only term of `loss`."""
+    """Return the value of `loss`, which must have exactly one term."""
     (term,) = loss(*given, given[2]).values()
     return term
 
 
 def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """All tensors that the file may hold, by name."""
+    """Compute all tensors that a golden file of losses may hold, by name."""
     given = read_inputs(golden)
     prediction, _, target = given
     points = prediction.gaussians.means
@@ -77,7 +77,10 @@ def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def visibility(points: Tensor, cameras: Cameras, clamp: float | None) -> dict[str, Tensor]:
-    """Per point, per scene and in all; in all views and in the first alone."""
+    """Return visibility losses by name: for each point, for each scene and in total.
+
+    Each is computed for all views, and for the first view only.
+    """
     guard = AnchorVisibility.Config().z_guard
     found = {}
     for suffix, views in (("", slice(None)), ("_view0", slice(1))):
@@ -95,9 +98,10 @@ def visibility(points: Tensor, cameras: Cameras, clamp: float | None) -> dict[st
 def whole_loss(
     given: Given, has_mask: Tensor, release: str, options: Mapping[str, Any], ssim: float
 ) -> dict[str, Tensor]:
-    """Every term of a release's loss, unweighted, and their weighted sum; per scene and in all.
+    """Return the unweighted terms and the weighted sum of a published loss, by name.
 
-    has_mask: (B,), whether a scene's mask is supervised. ssim: its weight.
+    Both are given for each scene and in total. has_mask: (B,), True for scenes whose mask is
+    supervised. ssim: weight of the SSIM term.
     """
     scenes = [
         [map_tensors(lambda x, one=slice(n, n + 1): x[one], part) for part in given]
@@ -122,7 +126,7 @@ def whole_loss(
 def terms_of(
     release: str, options: Mapping[str, Any], ssim: float
 ) -> Iterator[tuple[str, float, Loss]]:
-    """Name, published weight and unweighted component of each term that is a sum over scenes."""
+    """Yield name, published weight and unweighted loss component of each term."""
     yield RGB_TERM[release], 1.0, Photometric(Photometric.Config(ssim_weight=0.0))
     yield "loss_mask", options["lambda_mask"], Mask(Mask.Config(weight=1.0))
     # 0 stands for none.

@@ -1,6 +1,7 @@
-"""The model of a golden file: composed from the published options, filled with its weights.
+"""Model of a golden file: built from the published options, with the weights in the file.
 
-tokens.l, anchor_*.l: the state after l layers. *.i: inside the 0-based layer i.
+Names of tensors: tokens.l and anchor_*.l are the state after l layers; other names that end in .i
+are inside layer i, counted from 0.
 """
 
 from collections.abc import Callable, Mapping
@@ -40,7 +41,7 @@ COMPUTED: Mapping[str, Callable[[GoldenFile], dict[str, Tensor]]] = {
     "depthsplat": depthsplat_tensors,
     "depthsplat_cases": cases_tensors,
 }
-"""Kinds of files whose weights and inputs are stored in another way."""
+"""Functions for kinds of golden files whose weights and inputs are stored in another way."""
 
 TIMES = ("times", "target_time")
 TUNED = "tuned_latents"
@@ -51,7 +52,7 @@ DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
 
 @torch.no_grad()
 def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """All tensors that the file may hold, computed by its model on its photos and cameras.
+    """Compute all tensors that a golden file may hold, by its model on its photos and cameras.
 
     Raises ValueError for options that no recipe can express.
     """
@@ -93,7 +94,7 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def recipe_of(golden: GoldenFile) -> dict[str, Any]:
-    """Return the recipe of a file's model; raise what `golden_tensors` raises."""
+    """Return the recipe of a golden file's model. Raises the errors of `golden_tensors`."""
     constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
     recipe = RECIPES[golden.config["kind"]](golden.config["options"] | constants)
     weights = golden.weights()
@@ -106,7 +107,7 @@ def recipe_of(golden: GoldenFile) -> dict[str, Any]:
 
 
 def watch(kept: Recorder, model: QueryGaussianModel) -> None:
-    """Record what happens inside the encoder and the layers."""
+    """Record the outputs of modules inside the encoder and the decoder layers."""
     encoder = model.encoder
     assert isinstance(encoder, PatchViT)
     first = encoder.blocks[0] if len(encoder.blocks) else encoder.get_submodule("norm")
@@ -128,7 +129,7 @@ def watch(kept: Recorder, model: QueryGaussianModel) -> None:
 
 
 def of_views(views: Views, model: QueryGaussianModel) -> dict[str, Tensor]:
-    """Return the input of the encoder's network: photos, rays and times."""
+    """Return the inputs of the encoder's network by name: photos, rays and times."""
     origins, directions = camera_rays(views.cameras)
     found = {
         "images": imagenet_normalised(views.images),
@@ -146,7 +147,7 @@ def of_views(views: Views, model: QueryGaussianModel) -> dict[str, Tensor]:
 def of_state(
     model: QueryGaussianModel, memory: ImageMemory, state: QueryState, number: int
 ) -> dict[str, Tensor]:
-    """Return the state after `number` layers, and the bias of the next layer."""
+    """Return the state after `number` layers, and the attention bias of the next layer."""
     found = {f"tokens.{number}": state.features}
     queries = model.queries
     if isinstance(queries, AnchoredQueries):
@@ -164,5 +165,5 @@ def of_state(
 
 
 def packed(g: Gaussians) -> Tensor:
-    """Attributes side by side, as the releases have them."""
+    """Return all attributes of Gaussians in one tensor, as in the published code."""
     return torch.cat([g.means, g.opacities[..., None], g.scales, g.quats, g.colors], -1)

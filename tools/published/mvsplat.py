@@ -1,4 +1,4 @@
-"""Every tensor of a golden file of MVSplat, computed by the components."""
+"""Tensors of a golden file of MVSplat, computed by the components of qgs."""
 
 from qgs_zoo.mvsplat.head import RayHead
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, Sweep
@@ -34,11 +34,11 @@ fullres_features                    depth_predictor.upsampler
 projected_features                  depth_predictor.proj_feature
 delta_disparity_and_density_logit   depth_predictor.to_disparity
 """
-"""Names in the file, and modules of the encoder."""
+"""Lines with a name in the golden file and the encoder module whose output has this name."""
 
 
 def encoder_of(golden: GoldenFile) -> MVSplatEncoder:
-    """Return the encoder with the options and the weights of a file."""
+    """Return MVSplat's encoder with the options and the weights of a golden file."""
     options = golden.config["options"]
     config = MVSplatEncoder.Config(
         candidates=options["num_depth_candidates"],
@@ -57,7 +57,7 @@ def encoder_of(golden: GoldenFile) -> MVSplatEncoder:
 
 
 def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """Every output of a golden file."""
+    """Compute every output that a golden file has, by name."""
     encoder = encoder_of(golden)
     views = views_of(golden)
     near = golden.input("near")
@@ -89,7 +89,10 @@ def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def watch(kept: Recorder, encoder: MVSplatEncoder, low: tuple[int, ...]) -> None:
-    """Hooks on all modules whose output or input a file has."""
+    """Record all modules whose input or output is in the golden file.
+
+    low: size of the feature maps.
+    """
     predictor = encoder.depth_predictor
     refined = predictor.corr_refine_net
     kept.outputs(encoder, OUTPUTS)

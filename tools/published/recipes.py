@@ -1,6 +1,6 @@
-"""The recipes for the options of TokenGS and LocusGS runs, by the names of both releases.
+"""Translation of published options of TokenGS and LocusGS into recipes.
 
-An option that is missing is a KeyError, as is a value that no recipe can express.
+A missing option, or a value that no recipe can express, raises KeyError.
 """
 
 from collections.abc import Mapping
@@ -8,14 +8,17 @@ from typing import Any
 
 OF_2026_6 = {"use_multiscale_encoder": False, "use_latent_bottleneck": False}
 OF_MOTION = {"num_dynamic_gs_tokens": 0, "time_embedding": False}
-"""Parts of TokenGS that LocusGS does not have."""
+"""Options of TokenGS that LocusGS does not have, with the values that turn them off."""
 UNSUPPORTED_BUT = {
     "geo_sparse_sampling_k": 0,
     "use_dense_sparse_attn_mask": False,
     "cross_attn_handcraft": False,
     "unposed_input": False,
 }
-"""Parts of LocusGS that its published models and ablations do not use."""
+"""Options of LocusGS that qgs does not support, with the values that turn them off.
+
+The published models and ablations of LocusGS do not use them.
+"""
 
 BOTH = """
 enc_embed_dim       width
@@ -41,7 +44,7 @@ anchor_radius_refinement    decoder.refinement.radius
 anchor_supervision_layers   supervision.layers
 use_anchor_radius           queries.radius
 """
-"""Released options, and what they are in the model's part of a recipe."""
+"""Lines with a published option and its path in the section `model` of a recipe."""
 SELF_ATTENTION = {"content_only": "qgs/content", "learned_positional": "locus/anchor_aware"}
 CROSS_ATTENTION = {"content_only": "qgs/content", "geometric_positional": "locus/ray_biased"}
 CENTERS = {
@@ -54,14 +57,17 @@ Options = Mapping[str, Any]
 
 
 def only(options: Options, expected: Options) -> None:
-    """Raise ValueError for an option that is there with another value."""
+    """Raise ValueError if one of `options` has another value than in `expected`."""
     for name, value in expected.items():
         if options.get(name, value) != value:
             raise ValueError(f"the option {name} is {options[name]!r}; only {value!r} is supported")
 
 
 def model_of(options: Options, *tables: str) -> dict[str, Any]:
-    """Return the model's part of a recipe, as far as `tables` tell it."""
+    """Translate published options into the section `model` of a recipe, by `tables`.
+
+    tables: texts whose lines are a published option and its path in `model`.
+    """
     model: dict[str, Any] = {}
     for line in "".join(tables).split("\n"):
         if line:
@@ -114,7 +120,7 @@ def tokengs_recipe(options: Options) -> dict[str, Any]:
 def locusgs_recipe(options: Options) -> dict[str, Any]:
     """Return the recipe of the model that LocusGS builds from `options`.
 
-    `geo_sigma`, a constant of the release, may stand among the options.
+    `geo_sigma`, a constant in the published code, may be given as an option.
     """
     only(options, {**UNSUPPORTED_BUT, **OF_2026_6, **OF_MOTION})
     model = model_of(options, BOTH, LOCUS)

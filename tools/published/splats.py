@@ -1,4 +1,4 @@
-"""Parts that golden files of MVSplat and DepthSplat share, and their files of cases."""
+"""Shared parts of the golden files of MVSplat and DepthSplat, and files of single cases."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -28,7 +28,10 @@ from qgs.types import Cameras, GaussianAttributes, ImageMemory, QueryState, View
 
 
 def views_of(golden: GoldenFile) -> Views:
-    """Photos and cameras; lenses of the files are divided by the image's size."""
+    """Return the photos and cameras of a golden file.
+
+    The intrinsics in the file are divided by the image size.
+    """
     images = golden.input("images")
     size = (images.shape[-2], images.shape[-1])
     lens = lens_of(golden.input("intrinsics"), size)
@@ -36,13 +39,16 @@ def views_of(golden: GoldenFile) -> Views:
 
 
 def lens_of(k: Tensor, size: tuple[int, int] = (1, 1)) -> Tensor:
-    """fx, fy, cx, cy (..., 4) in pixels of matrices that are divided by `size`, (H, W)."""
+    """Return fx, fy, cx, cy (..., 4) in pixels of intrinsic matrices (..., 3, 3).
+
+    size: image size (H, W) by which the matrices were divided; (1, 1) for matrices in pixels.
+    """
     lens = torch.stack([k[..., 0, 0], k[..., 1, 1], k[..., 0, 2], k[..., 1, 2]], -1)
     return lens * lens.new_tensor([size[1], size[0], size[1], size[0]])
 
 
 def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
-    """Return the state dict under its published names, without the prefix of checkpoints."""
+    """Return the weights of a golden file by their published names."""
     rule = golden.config["weights"]
     # Sums of the weights, with which whoever recorded the file checked the rule.
     golden.read.add("weights_check")
@@ -55,12 +61,15 @@ def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def of_views(views: int) -> Recorder:
-    """Return a recorder for modules with scenes and views in one axis, which become two."""
+    """Return a recorder that splits the first axis of outputs into scenes and `views` views."""
     return Recorder(lambda x: x.detach().unflatten(0, (-1, views)))
 
 
 def watch_transformer(kept: Recorder, transformer: Any, size: Sequence[int], last: str) -> None:
-    """Record the stream before and behind each attention in windows; `last` names the result."""
+    """Record the features before and after each window attention.
+
+    last: name of the final features.
+    """
     transformer.register_forward_pre_hook(
         lambda _, given: kept.found.update({"transformer.0": given[0]})
     )
@@ -76,7 +85,7 @@ def watch_transformer(kept: Recorder, transformer: Any, size: Sequence[int], las
 
 
 def watch_unet(kept: Recorder, name: str, unet: Any) -> None:
-    """All modules, and what attentions have before their projection."""
+    """Record all modules of a U-Net, and the inputs of the output projections of attention."""
     for path, module in unet.named_modules():
         kept.output(f"{name}.{path}", module)
         if hasattr(module, "qkv"):
@@ -84,7 +93,10 @@ def watch_unet(kept: Recorder, name: str, unet: Any) -> None:
 
 
 def warps(views: Views, poses_BVJ44: Tensor, low: Sequence[int], inverse_BVD: Tensor) -> Tensor:
-    """Return the places of pixels of maps of size `low` in neighbours, (B, V, J, D, h, w, 2)."""
+    """Return the positions of pixels in J neighbour views at D depths, (B, V, J, D, h, w, 2).
+
+    low: size (h, w) of the feature maps. inverse_BVD: inverse depths.
+    """
     pairs = poses_BVJ44.shape[:3]
     lens = feature_lenses(views.cameras, low)[:, :, None].expand(*pairs, 4)
     depth = (1 / inverse_BVD)[:, :, None, :, None, None].expand(*pairs, -1, *low)
@@ -93,9 +105,9 @@ def warps(views: Views, poses_BVJ44: Tensor, low: Sequence[int], inverse_BVD: Te
 
 
 def gaussians(views: Views, numbers: Tensor, head: Any, centers: Any) -> dict[str, Tensor]:
-    """Return outputs behind the networks, by queries, head and centers.
+    """Decode the networks' output into Gaussians, with the queries, head and centers of qgs.
 
-    numbers: (B, V, H, W, C), what the networks give for each pixel.
+    numbers: output of the networks for each pixel, (B, V, H, W, C).
     """
     cameras = views.cameras
     state = pixel_state(views, numbers)
@@ -116,26 +128,29 @@ def gaussians(views: Views, numbers: Tensor, head: Any, centers: Any) -> dict[st
 
 
 def pixel_state(views: Views, numbers: Tensor) -> QueryState:
-    """Return a query for each pixel, with its numbers (B, V, H, W, C)."""
+    """Return a state with one query for each pixel. numbers: features (B, V, H, W, C)."""
     memory = ImageMemory(numbers.flatten(1, 3), grid=(views.cameras.shape[1], *views.cameras.size))
     dims = ModelDims(numbers.shape[-1], 1, 0)
     return PixelQueries(PixelQueries.Config(), dims)(memory, views)
 
 
 def covariances(given: GaussianAttributes) -> Tensor:
-    """(..., 3, 3)."""
+    """Return the covariance matrices (..., 3, 3) of Gaussians."""
     factors = quat_to_matrix(given.quats) * given.scales[..., None, :]
     return factors @ factors.mT
 
 
 def turn_of(c2w: Tensor, sh: Tensor) -> Tensor:
-    """Matrices (..., K, K) that turn raw coefficients (..., K) into the world, in e3nn's basis."""
+    """Return matrices (..., K, K) that rotate harmonic coefficients from camera to world frame.
+
+    The basis of the harmonics is that of e3nn. sh: raw coefficients (..., K).
+    """
     degree = round(sh.shape[-1] ** 0.5) - 1
     return turn_of_harmonics(c2w[..., :3, :3], degree) * band_mask(degree, c2w)
 
 
 def cases_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """Every output of a file of cases: a warp, opacities, single Gaussians."""
+    """Compute every output of a file of single cases: a warp, opacities, single Gaussians."""
     lens = lens_of(golden.input("warp.intrinsics"))
     grid = warp_grid(golden.input("warp.depth"), lens, golden.input("warp.pose"))
     found = {"warp.grid": grid, "warp.warped": warped(golden.input("warp.features"), grid)}
@@ -150,7 +165,7 @@ def cases_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def single_gaussians(golden: GoldenFile) -> dict[str, Tensor]:
-    """Gaussians each with a camera of its own; some have rotations and numbers that trouble."""
+    """Decode Gaussians that have one camera each; some have extreme rotations and values."""
     of_rays = golden.config["kind"] == "mvsplat_cases"
     names = ("depths", "opacities", "raw", "extrinsics")
     depth, opacity, raw, c2w = (golden.input(f"adapter.{name}") for name in names)
@@ -178,7 +193,7 @@ def single_gaussians(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def rays(golden: GoldenFile) -> dict[str, Tensor]:
-    """Fields of pixels in whose middles the Gaussians stand, outside of the image too."""
+    """Return ray fields of pixels at whose centres Gaussians are, also outside the image."""
     height, width = golden.config["image_shape"]
     c2w = golden.input("adapter.extrinsics")[:, None]
     lens = lens_of(golden.input("adapter.intrinsics"), (height, width))[:, None]

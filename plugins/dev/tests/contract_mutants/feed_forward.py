@@ -22,7 +22,12 @@ def register(
     mutant(check, seen)(type(name, (MlpFeedForward,), {"forward": forward_of}))
 
 
-register("ForgetsToReturn", "runs", "it returns NoneType, not Tensor", lambda self, mlp, x: None)
+register(
+    "ForgetsToReturn",
+    "runs",
+    "the component returns NoneType, not Tensor",
+    lambda self, mlp, x: None,
+)
 register(
     "DetachesASummand", "gradients_match_differences", "in evaluation: Jacobian",
     lambda self, mlp, x: mlp(x) + x.square().detach()

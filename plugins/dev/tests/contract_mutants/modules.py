@@ -83,7 +83,7 @@ class IgnoresUnknownInnerOptions(MlpFeedForward):
         outer: Outer | None = None
 
 
-@mutant("construction", "building it changes its options from")
+@mutant("construction", "building changes the options from")
 class AppendsToAnOption(ExtendedMlp):
     class Config(MlpFeedForward.Config):
         sizes: list[int] = Field(default=[1])
@@ -130,7 +130,7 @@ class KeepsLayersInAList(ExtendedMlp):
         self.layers = [nn.Linear(dims.width, dims.width)]
 
 
-@mutant("construction", "building it sets the seed of torch's generator")
+@mutant("construction", "building sets the seed of torch's generator")
 class SeedsWhenBuilt(MlpFeedForward):
     def __init__(self, config, dims):
         torch.manual_seed(0)

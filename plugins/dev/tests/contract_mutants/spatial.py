@@ -216,7 +216,7 @@ class NumbersTokens(ContentCrossAttention):
         return self.core(state.features, memory.keys + number[:, None], memory.values)
 
 
-@mutant("view_permutation", "it declares `ordered_views`")
+@mutant("view_permutation", "the component declares `ordered_views`")
 class DeclaresAnOrder(ContentCrossAttention):
     ordered_views = True
 

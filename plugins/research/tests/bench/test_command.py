@@ -44,7 +44,7 @@ def test_recipes_are_compared_with_the_first(tmp_path, monkeypatch):
             assert times["ratio"]["median"] == sorted(own / base for own, base in pairs)[1]
     ratios = [[kind["ratio"] for kind in recipe["memory"].values()] for recipe in recipes]
     assert ratios == [[1, 1], [0.5, 0.25], [2, 1.5]]
-    assert re.search(r"(?s)tokengs +│ 3 x 16 x 24 +│ +512.*gslrm +│ 3 x 16 x 24 +│ per view", told)
+    assert re.search(r"(?s)tokengs +│ 3 x 16 x 24 +│ +512.*gslrm +│ 3 x 16 x 24 +│ +per view", told)
 
 
 def test_a_report_replaces_nothing(tmp_path):

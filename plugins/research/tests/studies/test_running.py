@@ -87,7 +87,7 @@ def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted
     assert {*failed} == {*plan.runs}
     assert stopped is None
     assert str(first.failure) in told
-    assert told.count("ended with -9") == 3
+    assert told.count("ended with exit code -9") == 3
     assert not first.log.exists()
     assert second.log.read_text() == "threads 1 ['cpu', '', 'more']\n"
     assert Results(plan).failed == [first]

@@ -220,9 +220,9 @@ def check_project_makes_the_memory_again(case: Case) -> None:
         again = module.project(memory.features, memory)
         other = module.project(memory.features.roll(1, 1), memory)
     except NotImplementedError:
-        expect(not module.tunable, "it declares `tunable`, but does not implement `project`")
+        expect(not module.tunable, "the encoder declares `tunable`, but does not have `project`")
         return
-    expect(module.tunable, "it implements `project`, but does not declare `tunable`")
+    expect(module.tunable, "the encoder has `project`, but does not declare `tunable`")
     expect_same(memory, again, "`project` of the memory's own features gives another memory")
     expect(difference(memory, other), "`project` of other features gives the same memory")
 
@@ -294,7 +294,7 @@ def check_unread_cameras_make_no_difference(case: Case) -> None:
     """Require the same results without cameras from a component with `reads_cameras` False."""
     component = case.component
     if not issubclass(component, Encoder | Queries) or component.reads_cameras:
-        raise CannotCheck("it reads cameras")
+        raise CannotCheck("the component reads cameras")
     trial = Trial(case)
     views = trial.inputs["views"]
     bare = Photos(views.images, views.times, views.target_time)

@@ -76,10 +76,12 @@ def check_runs(case: Case) -> None:
     """Require that a forward pass on random inputs returns the type that the slot prescribes."""
     output = Trial(case)()
     kind = OUTPUTS.get(case.slot, Tensor)
-    expect(isinstance(output, kind), f"it returns {type(output).__name__}, not {kind.__name__}")
+    seen = f"the component returns {type(output).__name__}, not {kind.__name__}"
+    expect(isinstance(output, kind), seen)
     if case.slot in WITH_MEMORY:
         kinds = [type(part).__name__ for part in output]
-        expect(kinds == ["QueryState", "ImageMemory"], f"it returns {kinds}, not state and memory")
+        seen = f"the component returns {kinds}, not state and memory"
+        expect(kinds == ["QueryState", "ImageMemory"], seen)
     if isinstance(output, Mapping):
         odd = [name for name, term in output.items() if not isinstance(term, Tensor)]
         expect_none(odd, "not a tensor")
@@ -221,7 +223,8 @@ def check_construction(case: Case) -> None:
         own = case.with_config(case.config.model_copy(deep=True))
         own.build()
         same = own.config == case.config
-        expect(same, f"building it changes its options from {case.config!r} to {own.config!r}")
+        seen = f"building changes the options from {case.config!r} to {own.config!r}"
+        expect(same, seen)
     if case.has_parameters:
         with torch.device("meta"), OnMeta():
             tensors = tensors_of(case.construct())
@@ -282,8 +285,8 @@ def _expect_drawn_from_torch(case: Case) -> None:
         with seeded(seed):
             case.construct()
             after.append(torch.get_rng_state())
-    expect(not torch.equal(*after), "building it sets the seed of torch's generator")
-    expect(others == other_generators(), "building it draws from numpy's or random's generator")
+    expect(not torch.equal(*after), "building sets the seed of torch's generator")
+    expect(others == other_generators(), "building draws from numpy's or random's generator")
     first, second = (dict(case.build(seed=3).state_dict()) for _ in range(2))
     expect_same(first, second, "two instances built from one seed differ")
 

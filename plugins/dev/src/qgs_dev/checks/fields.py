@@ -70,7 +70,7 @@ def check_reads_are_declared(case: Case) -> None:
         expect_none(asked - {*case.reads}, f"read in {mode}, but not required")
         if poisoned is not inputs:
             names = ", ".join(sorted(unread))
-            where = f"in {mode} it reads some of {names}, which it does not declare"
+            where = f"in {mode} the component reads some of {names}, which it does not declare"
             with seeded(0):
                 try:
                     other = trial(poisoned)
@@ -126,7 +126,7 @@ def check_declared_reads_are_used(case: Case) -> None:
     for field in case.reads:
         others = _with_others(trial, field)
         read = any(difference(outputs, trial(inputs)) for inputs in others)
-        expect(read, f"it requires {field}, but other values of it change nothing")
+        expect(read, f"the component requires {field}, but other values of it change nothing")
 
 
 def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
@@ -167,7 +167,7 @@ def check_writes_are_declared(case: Case) -> None:
         expect_none(before.keys() - output.fields.keys(), f"lost in {mode}")
         if case.slot == "refinement":
             passed = _same(output.features, state.features)
-            expect(passed, f"in {mode} it changes the features; a refinement must pass them on")
+            expect(passed, f"in {mode} the refinement changes the features; it must pass them on")
         for name, spec in case.writes.items():
             right = output[name].dtype == spec.dtype
             expect(right, f"in {mode} `{name}` is {described(output[name])}, declared as {spec}")
@@ -189,7 +189,7 @@ def check_unmet_reads_fail_at_compose(case: Case) -> None:
         expect(refusal, f"a recipe without the required {missing} is accepted")
         expect(missing in refusal, f"the message does not name the missing {missing}: {refusal}")
     refusal = _refusal(case, needed)
-    expect(not refusal, f"a recipe with all that it requires is refused: {refusal}")
+    expect(not refusal, f"a recipe with all that the component requires is refused: {refusal}")
     if case.slot in FACTS and case.slot != "renderer":
         # A recipe that is accepted must run.
         run_training_step(resolved(case, needed), case)

@@ -75,7 +75,7 @@ def check_renderings_as_declared(case: Case) -> None:
         for view in ([0], [1]):
             seen = map_tensors(lambda x, view=view: x[:, view], rendering)
             alone.append(trial(rendering=seen, target=target.select(view)))
-        where = "it declares `each`, but compared with the mean over views"
+        where = "the component declares `each`, but compared with the mean over views"
         expect_same(_mean(*alone), terms, where, 1e-4, 1e-6)
 
 
@@ -99,7 +99,7 @@ def check_metric_gives_its_columns(case: Case) -> None:
         expect(sorted(values) == keys, f"its values are {sorted(values)}, its columns are {keys}")
         expect_finite(values, "as the value of a column")
         expect_same(values, _values(module, given), "a second call gives other values")
-        expect_same(before, given, "it changes its inputs")
+        expect_same(before, given, "the component changes its inputs")
 
 
 def check_truth_scores_best(case: Case) -> None:
@@ -154,7 +154,10 @@ def check_objective_gives_an_outcome(case: Case) -> None:
     of its own. Terms and signs must be 0-d and detached. The signs must be those in SIGNS.
     """
     module = case.build()
-    expect(not isinstance(module, nn.Module), "it is an nn.Module; objectives have no parameters")
+    expect(
+        not isinstance(module, nn.Module),
+        "the objective is an nn.Module, but must have no parameters",
+    )
     # Objectives may split the views in halves: 2 is the least number, 3 and 5 are odd.
     for views in (2, 3, 5):
         where = f"with {views} input views"

@@ -46,7 +46,7 @@ def _expect_gaussians(trial: Trial, factor: float, where: str) -> None:
     for mode, out in trial.in_each_mode({"state": state}):
         here = f"in {mode}, {where},"
         given = {name for name in ("sh", "features") if getattr(out, name) is not None}
-        expect(given == named, f"in {mode} it returns {given or None}, not {named or None}")
+        expect(given == named, f"in {mode} the head gives {given or None}, not {named or None}")
         expect_inside(out.quats.norm(dim=-1), 1 - 1e-4, 1 + 1e-4, f"{here} lengths of quaternions")
         expect((out.scales > 0).all(), f"{here} a scale is {out.scales.min():.4g}")
         expect_inside(out.opacities, 0, 1, f"{here} opacities")
@@ -83,7 +83,7 @@ def check_queries_resize(case: Case) -> None:
     module = case.build()
     options = case.config.model_dump(mode="json")
     if "count" not in options or module.count is None:
-        raise CannotCheck("it has no option `count` for the number of queries")
+        raise CannotCheck("the component has no option `count` for the number of queries")
     # Fewer queries must be filled up, more queries must be cut.
     for count in (max(module.count // 2, 1), module.count + 3):
         options["count"] = count
@@ -112,7 +112,7 @@ def check_supervision_weights(case: Case) -> None:
         where = f"with {depth} layers and rounds that end at {rounds},"
         chosen = [layer for layer in [*range(1, depth + 1), *rounds] if layer in weights]
         right = weights and [*weights] == chosen and weights.keys() >= {*rounds}
-        expect(right, f"{where} it supervises {[*weights]}")
+        expect(right, f"{where} the component supervises {[*weights]}")
         expect(min(weights.values()) >= 0, f"{where} weights are {weights}")
         total = sum(weights.values())
         expect(abs(total - 1) < 1e-6, f"{where} weights sum to {total:g}")
@@ -137,7 +137,7 @@ def check_feedback_compares_the_photos(case: Case) -> None:
     expect_same(colours, of_seen, "`compared` views have other mean colours", 1e-4, 1e-5)
     # Training draws the number of rounds.
     counts = [module.rounds, *(module.drawn() for _ in range(4))]
-    expect(min(counts) >= 0, f"it makes {min(counts)} rounds")
+    expect(min(counts) >= 0, f"the component makes {min(counts)} rounds")
     layers = range(bool(max(counts)), case.dims.depth + 1)
     expect(module.layers in layers, f"a round repeats {module.layers} of {case.dims.depth} layers")
 

@@ -152,8 +152,8 @@ def check_eval_repeats_bitwise(case: Case) -> None:
     first = trial()
     trial(inputs_of(case, seed=1))
     expect_same(first, trial(inputs_of(case)), "a second pass on the same inputs differs")
-    expect(torch.equal(torchs, torch.get_rng_state()), "it draws from torch's generator")
-    expect(others == other_generators(), "it draws from numpy's or random's generator")
+    expect(torch.equal(torchs, torch.get_rng_state()), "the component draws from torch's generator")
+    expect(others == other_generators(), "the component draws from numpy's or random's generator")
 
 
 def check_training_draws_from_torch(case: Case) -> None:
@@ -161,7 +161,7 @@ def check_training_draws_from_torch(case: Case) -> None:
     module = case.lively().train()
     before = other_generators()
     first, other, again = (_outputs(module, inputs_of(case), seed) for seed in (1, 2, 1))
-    expect(before == other_generators(), "it draws from numpy's or random's generator in training")
+    expect(before == other_generators(), "training draws from numpy's or random's generator")
     reseeded = torch.equal(first[1], other[1])
     expect(not reseeded, "a training pass sets the seed of torch's generator")
     expect_same(first[0], again[0], "two training passes from the same seed differ")
@@ -187,7 +187,7 @@ def check_scheduled_options_are_read_anew(case: Case) -> None:
             continue
         what = f"`{option}: {getattr(other.config, option)}`"
         same = dict(other.reads) == dict(case.reads) and dict(other.writes) == dict(case.writes)
-        expect(same, f"{what} changes what it requires or provides")
+        expect(same, f"{what} changes what the component requires or provides")
         module = _ready(case)
         # A first call may store a value that the second call must read again.
         _called(case, module)

@@ -116,7 +116,7 @@ def check_view_permutation(case: Case) -> None:
         case, VIEW_INPUTS, permuted, case.slot in ("encoder", "renderer"), part=1
     )
     if may_declare and component.ordered_views:
-        expect(found, "it declares `ordered_views`, but ignores the order")
+        expect(found, "the component declares `ordered_views`, but ignores the order")
     else:
         expect(not found, f"with {len(order)} permuted views, {found}{hint}")
 
