@@ -25,7 +25,7 @@ def register(
 register(
     "ForgetsToReturn",
     "runs",
-    "the component returns NoneType, not Tensor",
+    "component returns NoneType, not Tensor",
     lambda self, mlp, x: None,
 )
 register(

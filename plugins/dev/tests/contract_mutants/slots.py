@@ -147,7 +147,7 @@ class ReversesItsDirection(Psnr):
     column = Column("PSNR", "lower")
 
 
-@mutant("optimizer_steps", "its groups lack given parameters")
+@mutant("optimizer_steps", "the groups do not hold exactly the given parameters")
 class OptimizesDecayingGroups(OneCycleAdamW):
     def build(self, groups):
         return super().build([group for group in groups if group["decays"]])

@@ -189,7 +189,7 @@ def check_compiles(case: Case) -> None:
     found = _gradients(module, ours, eager)
     of_compiled = _gradients(module, theirs, outputs)
     odd = found.keys() ^ of_compiled.keys()
-    expect_none(odd, "has a gradient only if compiled, or only if not compiled")
+    expect_none(odd, "has a gradient only with, or only without, torch.compile")
     largest = max((gradient.abs().max().item() for gradient in found.values()), default=0.0)
     for name, gradient in found.items():
         # Gradients of different inputs differ by orders of magnitude; a small one may be the rest

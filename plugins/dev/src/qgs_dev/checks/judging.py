@@ -96,7 +96,10 @@ def check_metric_gives_its_columns(case: Case) -> None:
         before = cloned(given)
         values = _values(module, given)
         keys = sorted(module.columns())
-        expect(sorted(values) == keys, f"its values are {sorted(values)}, its columns are {keys}")
+        expect(
+            sorted(values) == keys,
+            f"its values are {sorted(values)}, its columns are {keys}",
+        )
         expect_finite(values, "as the value of a column")
         expect_same(values, _values(module, given), "a second call gives other values")
         expect_same(before, given, "the component changes its inputs")

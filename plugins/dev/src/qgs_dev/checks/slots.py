@@ -97,7 +97,7 @@ def check_queries_resize(case: Case) -> None:
         for name, values in learned.items():
             first = slice(min(len(values), len(resized[name]))) if values.ndim else ...
             kept = torch.equal(resized[name][first], values[first])
-            expect(kept, f"`resized` of {count} queries changes `{name}` of the first ones")
+            expect(kept, f"`resized` of {count} queries changes `{name}` of the kept queries")
 
 
 def check_supervision_weights(case: Case) -> None:
@@ -128,18 +128,25 @@ def check_feedback_compares_the_photos(case: Case) -> None:
     module = trial.module
     photos = trial.inputs["photos"]
     seen = module.compared(photos)
-    expect_same(photos.cameras.c2w, seen.cameras.c2w, "`compared` views have other poses")
+    expect_same(
+        photos.cameras.c2w, seen.cameras.c2w, "`compared` views have other poses than the photos"
+    )
     corners, of_seen = (_corners(views.cameras) for views in (photos, seen))
     expect_same(
         corners, of_seen, "`compared` views have other rays through their corners", 1e-5, 1e-6
     )
     colours, of_seen = (views.images.mean((-1, -2)) for views in (photos, seen))
-    expect_same(colours, of_seen, "`compared` views have other mean colours", 1e-4, 1e-5)
+    expect_same(
+        colours, of_seen, "`compared` views have other mean colours than the photos", 1e-4, 1e-5
+    )
     # Training draws the number of rounds.
     counts = [module.rounds, *(module.drawn() for _ in range(4))]
     expect(min(counts) >= 0, f"the component makes {min(counts)} rounds")
     layers = range(bool(max(counts)), case.dims.depth + 1)
-    expect(module.layers in layers, f"a round repeats {module.layers} of {case.dims.depth} layers")
+    expect(
+        module.layers in layers,
+        f"a round repeats {module.layers} layers of a decoder with {case.dims.depth}",
+    )
 
 
 def _corners(cameras: Cameras) -> Tensor:
@@ -201,9 +208,9 @@ def check_optimizer_steps(case: Case) -> None:
     run = _Optimization(case)
     groups = run.torch_optimizer.param_groups
     given = {id(parameter) for group in groups for parameter in group["params"]}
-    expect(given == {*map(id, run.weights)}, "its groups lack given parameters or have others")
+    expect(given == {*map(id, run.weights)}, "the groups do not hold exactly the given parameters")
     factors = all("factor" in group for group in groups)
-    expect(factors, "a group has no `factor`; training scales its learning rate by it")
+    expect(factors, "a group has no `factor`, which scales its learning rate")
     before = cloned(run.weights)
     run.step(range(3))
     expect_finite(run.weights, "after three steps")
