@@ -57,7 +57,7 @@ USUAL = Sizes()
 def many(case: Case) -> Sizes:
     """Return sizes with more than 128 queries, Gaussians and tokens.
 
-    Errors of components that work on chunks of up to 128 then show.
+    They reveal errors of components that work in chunks or windows of up to 128.
     """
     image = (64, 96) if case.slot == "cross_attention" else None
     return Sizes(queries=200, views=3, gaussians=1, image=image)

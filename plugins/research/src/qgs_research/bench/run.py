@@ -65,7 +65,7 @@ def measure_recipes(
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
     for operation in operations if memory else ():
         for entry, recipe, workload in zip(entries, recipes, works, strict=True):
-            say(f"{entry['recipe']}: memory of the {operation}")
+            say(f"{entry['recipe']}: measuring memory of the {operation}")
             peak = asdict(peak_memory(recipe, operation, workload, torch.get_num_threads()))
             entry["memory"][operation] = peak
             first = entries[0]["memory"][operation]
@@ -81,7 +81,7 @@ def measure_recipes(
         entry["parameters"]["ratio"] = entry["parameters"]["count"] / first["count"]
     for operation in operations:
         tasks = [make_task(operation, *given) for given in zip(recipes, models, works, strict=True)]
-        say(f"seconds of the {operation}")
+        say(f"measuring seconds of the {operation}")
         columns = in_turn(tasks, rounds, warmup)
         for entry, samples in zip(entries, columns, strict=True):
             # Ratios within a round cancel the load of the machine.

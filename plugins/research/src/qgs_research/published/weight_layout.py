@@ -16,7 +16,7 @@ class LayoutError(ValueError):
 
 
 def renamed(name: str, ours: str, theirs: str) -> str | None:
-    """Translate a parameter name by the rule `ours` -> `theirs`; None if it does not match.
+    """Translate a parameter name by the rule `ours` -> `theirs`; None if the rule does not match.
 
     `{}` in a rule stands for the number of a layer. If `ours` ends with a dot, it names a module,
     and the rest of the name is kept.
