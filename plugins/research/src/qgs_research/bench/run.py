@@ -45,16 +45,13 @@ def measure_recipes(
     Args:
         names: recipes, as for `resolve`.
         work: fields of the workload, as for `workload_of`.
-        step: True also measures training steps.
-        memory: True also measures peak memory.
-        renderer: True also measures rendering.
+        step, memory, renderer: True also measures training steps, peak memory or rendering.
         rounds: number of measured calls of each operation, after `warmup` unmeasured calls.
         overrides: options to set in all recipes.
         say: function that is called with a description of each measurement before it starts.
 
     Returns the report as plain values for JSON: all measured seconds, bytes, and ratios to the
-    first recipe, which are computed in each round. Raises the errors of the models and of
-    `peak_memory`.
+    first recipe in each round. Raises the errors of the models and of `peak_memory`.
     """
     recipes = [resolve(name, overrides) for name in names]
     works = [workload_of(recipe, **work) for recipe in recipes]

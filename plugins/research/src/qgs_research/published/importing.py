@@ -49,12 +49,11 @@ def import_weights(
 ) -> Transfer:
     """Write a checkpoint of `recipe` with published weights.
 
-    weights: file of published weights. recipe: None derives the recipe from the weights, changes it
-    by `overrides`, for example "data.image_size=[64, 64]", and writes it to a .yaml file beside
-    `out`. out: path of a new .safetensors file. Raises FileNotFoundError, FileExistsError,
-    ValueError for a wrong suffix of `out`, RecipeError for wrong `overrides`, CheckpointError for
-    unreadable weights and PublishedError for weights that do not fit. After an error no file is
-    left.
+    recipe: None derives the recipe from the weights, changes it by `overrides`, for example
+        "data.image_size=[64, 64]", and writes it to a .yaml file beside `out`.
+    out: path of a new .safetensors file.
+    Raises FileNotFoundError, FileExistsError, ValueError for a wrong suffix of `out`, RecipeError,
+    CheckpointError and PublishedError. After an error no file is left.
     """
     out = new_checkpoint_path(out)
     # A given recipe needs no second file.
