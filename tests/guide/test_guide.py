@@ -43,7 +43,6 @@ def test_the_code_of_the_five_ideas_computes_its_formula_and_keeps_its_contract(
     means = centers(torch.zeros(1, 8, 4, 3), QueryState(torch.zeros(1, 8, 16)))
     assert means.tolist() == [[[[0.0, 0.0, 2.0]] * 4] * 8]
     assert not contract_failures(Case(near.Config()))
-    exec(code["state.py"], {})
 
 
 def test_recipes_of_the_five_ideas():
