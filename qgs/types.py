@@ -104,8 +104,15 @@ class Views(TensorContainer):
     def __post_init__(self) -> None:
         check_shapes(self.cameras, c2w="B V 4 4")
         sizes = dict(zip("BVHW", (*self.cameras.shape, *self.cameras.size), strict=True))
-        shapes = {"images": "B V 3 H W", "masks": "B V 1 H W", "depths": "B V 1 H W"}
-        check_shapes(self, sizes, **shapes, times="B V", target_time="B 1")
+        check_shapes(
+            self,
+            sizes,
+            images="B V 3 H W",
+            masks="B V 1 H W",
+            depths="B V 1 H W",
+            times="B V",
+            target_time="B 1",
+        )
         _check_unit_images(self)
 
     def select(self, index: Any) -> Self:
@@ -320,8 +327,9 @@ class Rendering(TensorContainer):
     features: Tensor | None = None
 
     def __post_init__(self) -> None:
-        shapes = {"alpha": "B V 1 H W", "depth": "B V 1 H W", "features": "B V F H W"}
-        check_shapes(self, rgb="B V 3 H W", **shapes)
+        check_shapes(
+            self, rgb="B V 3 H W", alpha="B V 1 H W", depth="B V 1 H W", features="B V F H W"
+        )
 
 
 @dataclass(frozen=True)

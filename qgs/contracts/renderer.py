@@ -7,6 +7,7 @@ import torch
 from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor
 
+from qgs.containers import check_shapes
 from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec, OptionError
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import seen_colors
@@ -93,12 +94,8 @@ class Renderer(Component, torch.nn.Module):
 def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
     """Raise ValueError unless Gaussians (B, G) and cameras (B, V) match in shape and device."""
     means = gaussians.means
-    if means.ndim != 3 or len(cameras.shape) != 2:
-        raise ValueError(
-            f"a renderer needs Gaussians with means (B, G, 3) and cameras of shape (B, V), got "
-            f"{tuple(means.shape)} and {tuple(cameras.shape)}; add leading dimensions for a single "
-            "scene or view"
-        )
+    check_shapes(gaussians, means="B G 3")
+    check_shapes(cameras, c2w="B V 4 4")
     if len(means) != cameras.shape[0]:
         raise ValueError(
             f"Gaussians of {len(means)} scenes cannot be rendered from cameras of "

@@ -13,14 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.containers import map_tensors
 from qgs.contracts import Frames, Scene
 from qgs.data.view_samplers import evenly
 from qgs.domain import Domain
 from qgs.geometry.poses import largest_distance, look_at_depth
 from qgs.geometry.rays import pixel_directions
 from qgs.geometry.transforms import to_camera, to_pixels
-from qgs.types import Cameras
 
 NOVEL = 6
 """Default limit on the number of photos that renderings are compared with."""
@@ -99,10 +97,10 @@ class Frusta:
 
     def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:
         self.scene = scene
-        given = scene.cameras
-        c2w = given.c2w.double().clone()
+        given = scene.cameras.to(torch.float64)
+        c2w = given.c2w.clone()
         c2w[:, :3, 3] /= depth or scene_depth(scene)
-        self.cameras = Cameras(c2w, given.intrinsics.double(), given.size)
+        self.cameras = given.replace(c2w=c2w)
         self.centres = c2w[:, :3, 3].numpy()
         axes = c2w[:, :3, 2].numpy()
         self.low, self.high, self.most_turn = trained_ratios(trained_on)
@@ -235,7 +233,7 @@ def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
         return planes[:0]
     photo, *images = scene.images([frame, *others])
     size = scene.cameras.size
-    cameras = map_tensors(Tensor.double, scene.cameras)
+    cameras = scene.cameras.to(torch.float64)
     pose = cameras.c2w[frame]
     rays_HW3 = pixel_directions(cameras.intrinsics[frame], size) @ pose[:3, :3].T
     points_DHW3 = pose[:3, 3] + rays_HW3 * planes[:, None, None, None]

@@ -164,11 +164,18 @@ def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Ca
 
     No image is decoded.
     """
+    return in_world(world, scene.cameras[list(frames)])[None]
+
+
+def in_world(world: tuple[Tensor, Tensor], cameras: Cameras) -> Cameras:
+    """Return a scene's cameras, (V,) or (B, V), in float32 in the coordinates `world`.
+
+    world: the result of `own_world`.
+    """
     reference, scale = world
-    cameras = scene.cameras[list(frames)]
     # float32 only now, because map coordinates have seven digits before the point.
-    c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
-    return Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size)
+    c2w = scaled(relative_to(reference, cameras.c2w), scale)
+    return cameras.replace(c2w=c2w).to(torch.float32)
 
 
 def from_0_to_1(times: Tensor) -> Tensor:
@@ -221,9 +228,9 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
 def mirrored_views(views: Views) -> Views:
     """Mirror views in x: images, masks, depth maps, poses and principal points."""
     cameras = views.cameras
-    fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
-    intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
-    flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[..., 2] = cameras.size[1] - intrinsics[..., 2]
+    flipped = cameras.replace(c2w=mirrored(cameras.c2w), intrinsics=intrinsics)
     images, masks, depths = map_tensors(
         lambda x: torch.from_numpy(np.ascontiguousarray(x.numpy()[..., ::-1])),
         (views.images, views.masks, views.depths),

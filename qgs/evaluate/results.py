@@ -73,7 +73,7 @@ class Evaluation:
         value: METHOD_METRIC, such as "model_psnr", or "gaussians_used".
         """
         found = self._values(value)
-        return sum(found) / len(found) if found else None
+        return fmean(found) if found else None
 
     def means(self, method: str = "model") -> dict[str, float | None]:
         """Return the mean over scenes of each value in `columns`. method: "model" or a baseline."""

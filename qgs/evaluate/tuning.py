@@ -4,14 +4,13 @@ import re
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from qgs.containers import map_tensors, named_tensors
 from qgs.contracts.schedule import END, follow
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.types import Gaussians, Prediction, Views
+from qgs.types import Gaussians, Views
 
 
 def tuning_settings(tune: str | None) -> list[str]:
@@ -73,27 +72,23 @@ def tune(
     optimizer = torch.optim.Adam(leaves, lr=settings.rate)
     losses: list[float] = []
 
-    def predicted() -> tuple[Prediction, Tensor]:
-        # The part that is fixed was computed once, outside.
-        if what == "queries":
-            prediction = model.predict(views, memory, tuned, ())
-        else:
-            prediction = model.predict(views, model.encoder.project(tuned, memory), start, ())
-        rendering = model.render(prediction.gaussians, views.cameras)
-        terms = loss(prediction.layers[model.depth], rendering, views, views)
-        value = torch.stack(list(terms.values())).sum()
-        losses.append(float(value.detach()))
-        return prediction, value
-
-    with torch.enable_grad():
-        for _ in range(settings.tuning_steps):
-            _, value = predicted()
+    for step in range(settings.tuning_steps + 1):
+        with torch.set_grad_enabled(step < settings.tuning_steps):
+            # The part that is fixed was computed once, outside.
+            if what == "queries":
+                prediction = model.predict(views, memory, tuned, ())
+            else:
+                prediction = model.predict(views, model.encoder.project(tuned, memory), start, ())
+            rendering = model.render(prediction.gaussians, views.cameras)
+            terms = loss(prediction.layers[model.depth], rendering, views, views)
+            value = torch.stack(list(terms.values())).sum()
+            losses.append(float(value.detach()))
+            if step == settings.tuning_steps:
+                break
             optimizer.zero_grad()
             # Of these alone: others would be left in the model's weights.
             value.backward(inputs=leaves)
             optimizer.step()
-    with torch.no_grad():
-        prediction, _ = predicted()
     record = {
         "what": what,
         "steps": settings.tuning_steps,

@@ -64,13 +64,10 @@ def _exp2(x):
 def _by_depth(splats, top, bottom, width):
     """Return the indices of splats that touch image rows [top, bottom), by ascending depth.
 
-    width: of the image. This is a stable radix sort on the bits of the depths; positive floats sort
-    like their bits.
+    width: of the image. Splats at the same depth keep their order.
     """
     count = splats.shape[0]
     order = np.empty(count, np.int32)
-    other = np.empty(count, np.int32)
-    depths = np.empty(count, np.float32)
     n = 0
     for g in range(count):
         u = splats[g, 0]
@@ -80,24 +77,8 @@ def _by_depth(splats, top, bottom, width):
         if ex > 0 and v + ey > top and v - ey < bottom and u + ex > 0 and u - ex < width:
             order[n] = g
             n += 1
-        depths[g] = splats[g, 5]
-    keys = depths.view(np.uint32)
-    starts = np.empty(2048, np.int64)
-    for shift in (0, 11, 22):
-        starts[:] = 0
-        for i in range(n):
-            starts[(keys[order[i]] >> shift) & 2047] += 1
-        total = 0
-        for digit in range(2048):
-            size = starts[digit]
-            starts[digit] = total
-            total += size
-        for i in range(n):
-            digit = (keys[order[i]] >> shift) & 2047
-            other[starts[digit]] = order[i]
-            starts[digit] += 1
-        order, other = other, order
-    return order[:n]
+    order = order[:n]
+    return order[np.argsort(splats[order, 5], kind="mergesort")]
 
 
 @kernel
@@ -121,23 +102,16 @@ def _open(state, live, rows, columns):
     live: becomes True for each tile row in the image. rows, columns: part of the tile in the image.
     """
     state[:] = _ZERO
-    for row in range(TILE):
-        live[row] = row < rows
-        base = row * _ROW
-        for lane in range(TILE):
-            state[base + lane] = _ONE
-            state[base + TILE + lane] = _ONE if row < rows and lane < columns else _ZERO
+    state.reshape(TILE, _ROW)[:rows, : TILE + columns] = _ONE
+    live[:] = False
+    live[:rows] = True
 
 
 @kernel
 def _close_rows(state, live):
     """Set live[row] to False for rows in which no pixel takes more splats; return `live.any()`."""
     for row in range(TILE):
-        total = _ZERO
-        base = row * _ROW + TILE
-        for lane in range(TILE):
-            total += state[base + lane]
-        live[row] = total > _ZERO
+        live[row] = state[row * _ROW + TILE :][:TILE].any()
     return live.any()
 
 
@@ -280,11 +254,8 @@ def _rows_within(above, reach):
 
 @kernel
 def _store_sums(state, sums, y0, x0, rows, columns):
-    for row in range(rows):
-        for lane in range(columns):
-            base = row * _ROW + lane
-            for channel in range(SUMS):
-                sums[channel, y0 + row, x0 + lane] = state[base + (2 + channel) * TILE]
+    blocks = state.reshape(TILE, 9, TILE)[:rows, 2 : 2 + SUMS, :columns]
+    sums[:, y0 : y0 + rows, x0 : x0 + columns] = blocks.transpose(1, 0, 2)
 
 
 @kernel

@@ -3,15 +3,15 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
 
 from qgs.containers import concatenated
-from qgs.data.samples import Sample
+from qgs.data.samples import Sample, in_world
 from qgs.domain import REMEDY
 from qgs.files import AnyPath
-from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
@@ -62,8 +62,8 @@ class Reconstruction:
         compared = [score for score in self.scores if score.baselines]
         if not compared:
             return ""
-        model = sum(score.psnr for score in compared) / len(compared)
-        nearest = sum(score.baselines["nearest_input"] for score in compared) / len(compared)
+        model = fmean(score.psnr for score in compared)
+        nearest = fmean(score.baselines["nearest_input"] for score in compared)
         remedy = f"{REMEDY}; or fit the result to its photos, to more photos or longer (qgs refine)"
         return worse_than_nearest(Psnr.column, model, nearest, remedy)
 
@@ -75,10 +75,8 @@ class Reconstruction:
 
     def render(self, cameras: Cameras) -> Rendering:
         """Render from cameras (1, V) in the photos' world; depths are in the unit of that world."""
-        reference, scale = (part.to(cameras.c2w.device) for part in self.sample.world)
-        # In float64: coordinates of maps have seven digits before the point.
-        c2w = scaled(relative_to(reference, cameras.c2w.double()), scale).float()
-        own = Cameras(c2w, cameras.intrinsics.float(), cameras.size).to(self.gaussians.means.device)
+        reference, scale = self.sample.world
+        own = in_world(self.sample.world, cameras.to(reference)).to(self.gaussians.means.device)
         with torch.no_grad():
             seen = self.model.render(self.gaussians, own)
         return replace(seen, depth=seen.depth / float(scale))

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from os import fspath
-from typing import TypeAlias
+from typing import TypeAlias, get_args
 
 import torch
 from torch import Tensor
@@ -138,9 +138,8 @@ def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
     Raises ValueError if no scene has this name, or if `name` is None and there are several scenes.
     path: location of the source, for messages.
     """
-    splits: tuple[Split, ...] = ("train", "test")
     places: dict[str, tuple[Split, int]] = {}
-    for split in splits:
+    for split in get_args(Split):
         places |= {known: (split, place) for place, known in enumerate(source.names(split))}
     if name is None and len(places) == 1:
         (name,) = places
@@ -207,9 +206,8 @@ class GivenScene(Scene):
 
     @property
     def cameras(self) -> Cameras:
-        """Cameras (F,) of the views, with float64 poses."""
-        cameras = self.views.cameras[0]
-        return Cameras(cameras.c2w.double(), cameras.intrinsics, cameras.size)
+        """Cameras (F,) of the views, in float64."""
+        return self.views.cameras[0].to(torch.float64)
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """Return images (len(frames), 3, H, W)."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
 from qgs.contracts.component import MissingExtraError
-from qgs.contracts.renderer import background_of, channels_of, check_inputs
+from qgs.contracts.renderer import background_of, channels_of, check_inputs, raise_precision
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -52,17 +52,15 @@ class GsplatRenderer(Renderer):
         rasterization = import_module("gsplat").rasterization
 
         with torch.autocast("cuda", enabled=False):
-            gaussians = gaussians.to(torch.float32)
-            cameras = cameras.to(torch.float32)
+            gaussians, cameras = raise_precision(gaussians, cameras)
             backdrop = background_of(background, self.config.background, gaussians.means)
             channels = channels_of(gaussians, cameras)
             # Features are over 0.
             backdrop = F.pad(backdrop, (0, channels.shape[-1] - 3))
             height, width = cameras.size
-            fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
-            o = torch.zeros_like(fx)
-            one = torch.ones_like(fx)
-            calibration = torch.stack([fx, o, cx, o, fy, cy, o, o, one], -1)
+            focal, principal = cameras.intrinsics.split(2, -1)
+            calibration = torch.diag_embed(F.pad(focal, (0, 1), value=1.0))
+            calibration[..., :2, 2] = principal
             # The packed path asserts with backgrounds and can mix gradients between scenes.
             rgbd, alpha, _ = rasterization(
                 means=gaussians.means,
@@ -71,7 +69,7 @@ class GsplatRenderer(Renderer):
                 opacities=gaussians.opacities,
                 colors=channels.expand(-1, cameras.shape[1], -1, -1),
                 viewmats=cameras.w2c,
-                Ks=calibration.unflatten(-1, (3, 3)),
+                Ks=calibration,
                 width=width,
                 height=height,
                 near_plane=self.config.near,

@@ -168,8 +168,8 @@ def test_mismatches_are_named(build):
     gaussians, cameras = make_scene(batch=2, views=2)
     render = build()
     must_refuse("2 scenes cannot be rendered from cameras of 1", render, gaussians, cameras[:1])
-    must_refuse(r"means \(B, G, 3\)", render, gaussians[0], cameras)
-    must_refuse(r"cameras of shape \(B, V\)", render, gaussians, cameras[0])
+    must_refuse(r"means must have shape \(B, G, 3\)", render, gaussians[0], cameras)
+    must_refuse(r"c2w must have shape \(B, V, 4, 4\)", render, gaussians, cameras[0])
     must_refuse(r"shape \(3,\)", render, gaussians, cameras, torch.zeros(1, 3))
 
 
