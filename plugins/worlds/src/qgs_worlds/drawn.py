@@ -70,6 +70,7 @@ class DrawnScene(Scene):
     def cameras(self) -> Cameras:
         """See `Scene`."""
         intrinsics = torch.from_numpy(self.lens).float().expand(len(self), 4)
+        # float() copies float64, so the poses of the ray caster keep their units
         c2w = torch.from_numpy(self.c2w).float()
         c2w[:, :3, 3] *= self.scale
         return Cameras(c2w, intrinsics, self._config.image_size)

@@ -34,6 +34,7 @@ _NUDGE = np.float32(1e-3)
 @inner
 def reciprocal(x):
     """Return 1 / x, or a large number where x is 0."""
+    # infinity times the 0 of an origin on a face would be NaN
     return ONE / (x if abs(x) > TINY else TINY)
 
 
@@ -70,6 +71,7 @@ def ball(o, d, radius):
     inside = radius * radius - (x * x + y * y + z * z)
     root = math.sqrt(max(inside, ZERO) * inverse)
     met = inside > ZERO
+    # shapes of furnished rooms have no cut, so nothing asks for the exit
     return (middle - root if met else NONE), NONE, ZERO, ZERO
 
 
@@ -169,6 +171,7 @@ def frustum(o, d, top):
     a = d[0] * d[0] + d[1] * d[1] - change * change
     b = o[0] * d[0] + o[1] * d[1] - change * radius
     c = o[0] * o[0] + o[1] * o[1] - radius * radius
+    # 0 for a ray along the side, which meets the cone only once
     a = a if abs(a) > TINY else TINY
     square = b * b - a * c
     root = math.sqrt(max(square, ZERO))
@@ -277,6 +280,7 @@ def relief(o, d, heights, start):
         return NONE, -NONE, ZERO, ZERO
     cells = np.float32(heights.shape[0] - 1)
     above = _above(heights, o, d, t)
+    # a ray that enters the cube below the map meets a wall of the solid, not its top
     if above < ZERO:
         return t, t, ONE, ONE
     while t < end:

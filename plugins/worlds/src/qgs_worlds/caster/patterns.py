@@ -50,6 +50,7 @@ def _grid(x, y, shift, seed, softness):
     x = x + shift * (row & 1)
     # no two tiles are quite alike
     tone = 0.6 * _hash(math.floor(x), row, seed) + 0.4 * _noise(3 * x, 3 * y, seed)
+    # a brick is twice as long as high, so a joint takes twice the share of its height
     return tone, softness * max(_seam(x, 0.03), _seam(y, 0.03 * (1 + 2 * shift)))
 
 
@@ -59,6 +60,7 @@ def _planks(x, y, seed, fade):
     # boards start at different heights
     along = y * 0.16 + 7.0 * _hash(board, 3, seed)
     tone = 0.6 * _hash(board, math.floor(along), seed)
+    # grain that fades leaves its mean, 0.2
     tone += 0.4 * _noise(x * 9, y * 0.7, seed) * fade + 0.2 * (1 - fade)
     return tone, fade * max(_seam(x, 0.03), _seam(along, 0.005))
 
@@ -132,6 +134,7 @@ def mixture(texture, u, v, p, q, footprint):
     seed = texture.seed
     x = u / texture.period
     y = v / texture.period
+    # all details from five samples in a period on, none below about two
     fade = min(max(1.6 - 3 * footprint / texture.period, 0.0), 1.0)
     if kind == CHECKER:
         odd = (math.floor(x) + math.floor(y)) & 1

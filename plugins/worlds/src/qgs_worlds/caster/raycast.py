@@ -67,6 +67,7 @@ def _clipped(corners, points):
             n += 1
         for axis in range(3):
             other = k | (1 << axis)
+            # each edge once, from its corner with the smaller number
             if other != k and (z > _PLANE) != (corners[other, 2] > _PLANE):
                 w = (_PLANE - z) / (corners[other, 2] - z)
                 for a in range(3):
@@ -168,6 +169,7 @@ def _inside_row(kind, extra, heights, steps, o, base, step, spans):
         for k in range(count):
             p, d, t = _ray(o, base, step, steps[k])
             if kind == s.TORUS:
+                # p is at t, so the camera is at -t: what lies behind it is no hit
                 _store(spans, k, torus(p, d, extra, -t), t)
             else:
                 _store(spans, k, relief(p, d, heights, -t), t)
@@ -275,6 +277,7 @@ def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
         steps[j] = (j + 0.5) / samples
     o = narrow(c2w[:, 3])
     corners = np.empty((8, 3))
+    # a clipped box has at most its 8 corners and a point on each of its 12 edges
     points = np.empty((20, 3))
     # one for all shapes, because allocating takes longer than small shapes do
     scratch = np.empty((2, 4, columns * samples), np.float32)

@@ -49,6 +49,7 @@ class Primitive(NamedTuple):
         a, b, c = (t * half for t, half in zip(self.turn[6:], self.half, strict=True))
         if self.kind == s.ELLIPSOID:
             return math.hypot(a, b, c)
+        # a frustum counts as a cylinder: `lowest` needs only a bound
         return abs(c) + (math.hypot(a, b) if self.kind == s.FRUSTUM else abs(a) + abs(b))
 
 
@@ -108,11 +109,13 @@ def any_turn(rng: Random) -> Turn:
 def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primitive:
     """Return a round or square bar between two points."""
     x, y, z = (b - a for a, b in zip(start, end, strict=True))
+    # two equal points must not divide by 0
     length = math.sqrt(x * x + y * y + z * z) + 1e-9
     x = x / length
     y = y / length
     z = z / length
     flat = math.hypot(x, y)
+    # an upright bar has no level direction of its own
     u, v = (-y / flat, x / flat) if flat > 1e-6 else (1.0, 0.0)
     # columns: level, across both, along the bar
     turn = (u, -v * z, x, v, u * z, y, 0.0, v * x - u * y, z)
@@ -132,6 +135,7 @@ def packed(shapes: Sequence[Shape]) -> np.ndarray:
     if holes:
         table["cut"][[shape.cut is not None for shape in shapes]] = _primitives(holes)
     sizes = body["extent"] * body["unit"]
+    # round kinds have no corners that stick out of a sphere of their largest half size
     is_round = np.isin(body["kind"], ROUND)
     table["radius"] = np.where(is_round, sizes.max(1), np.linalg.norm(sizes, axis=1))
     for field in ("texture", "faces", "cut_texture", "scale"):
@@ -150,6 +154,7 @@ def _primitives(primitives: Sequence[Primitive]) -> np.ndarray:
     table = np.zeros(len(kind), s.PRIMITIVE)
     table["kind"] = kind
     table["extra"] = extra
+    # the transpose of a rotation is its inverse: axes lead from the world to the primitive
     table["axes"] = turn.reshape(-1, 3, 3).transpose(0, 2, 1) / unit[:, :, None]
     table["center"] = center
     table["unit"] = unit

@@ -215,6 +215,7 @@ def _books(make: Furniture, sizes: Sizes) -> Piece:
     rng = make.rng
     w = sizes["w"]
     levels = sizes["n"]
+    # the top board ends at the height of the sides
     heights = [min(i * _LEVEL, levels * _LEVEL - 0.03) for i in range(levels + 1)]
     piece = [box(0, 0, z, w, 0.32, 0.03, sizes["wood"]) for z in heights]
     for i in range(levels):

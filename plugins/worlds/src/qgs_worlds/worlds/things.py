@@ -73,6 +73,7 @@ class Things:
     def texture(self) -> tuple[int, int]:
         """Return a random first texture (index) for a shape, and its number of textures, 1 or 6."""
         faces = 6 if self.rng.random() < 0.3 else 1
+        # five more textures follow the first one if there are six faces
         return self.rng.randrange(self._textures - 5), faces
 
     def skinned(self, body: Primitive, scale: float = 1.0) -> Shape:
@@ -129,6 +130,7 @@ class Things:
 
     def _composite(self) -> Thing:
         rng = self.rng
+        # rounding may reach the upper end, which would be one too many
         count = min(int(spread(rng, 1, self.style.most + 1)), self.style.most)
         cut = rng.random() < self.style.cut
         thing = []
@@ -149,6 +151,7 @@ class Things:
         rng = self.rng
         count = rng.randint(3, 7)
         first = self.skinned(self._primitive((0.0, 0.0, 0.0), 1.2 / count))
+        # values that stand twice are likelier: most rows are level, straight and of one size
         way = rotated(self._turn(), (2.0 / count, 0.0, rng.choice((0.0, 0.0, 1.2 / count))))
         angle = rng.choice((0.0, 0.0, rng.uniform(-0.5, 0.5)))
         grow = rng.choice((1.0, 1.0, rng.uniform(0.8, 1.2)))
@@ -171,6 +174,7 @@ class Things:
         rng = self.rng
         a, b, c = (rng.uniform(0.4, 1) for _ in range(3))
         points = [(x, y, z) for x in (-a, a) for y in (-b, b) for z in (-c, c)]
+        # corners that share an edge differ in one bit
         pairs = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
         return self._rods(points, pairs, spread(rng, 0.012, 0.08))
 
