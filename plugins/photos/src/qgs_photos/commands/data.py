@@ -220,6 +220,7 @@ def _opened(
         kind = recognised(opened_path(path), sources())
         plugin = kind.partition("/")[0]
         recipe = {"recipe": 1, "data": {"type": kind, "path": path}}
+        # components of qgs itself are there without being named
         recipe["plugins"] = [] if plugin == "qgs" else [plugin]
     source = resolve(recipe, [f"data.{option}" for option in options]).build_data()
     if image_size is not None:

@@ -37,6 +37,7 @@ class Encoding:
         """Encode pixels (H, W, 3), uint8, as the bytes of a JPEG or PNG file."""
         if self.jpeg is None:
             return encoded(pixels)
+        # by default Pillow would halve the resolution of colours
         return encoded(pixels, "JPEG", quality=self.jpeg, subsampling=0)
 
 

@@ -39,6 +39,7 @@ def chosen_splits(
     for training. Raises ValueError if no scene has a name in `test`.
     """
     train = _places(source, "train")
+    # train comes first for the order, and last because it wins for a scene in both splits
     places = {**train, **_places(source, "test"), **train}
     if test is not None:
         if absent := [name for name in test if name not in places]:
@@ -75,6 +76,7 @@ def _begin(folder: UPath, settings: Mapping[str, Any]) -> None:
     Raises ValueError if the unfinished packing has other settings, and FileExistsError if the
     folder holds anything else.
     """
+    # tuples become lists, or settings would differ from those read from the file
     settings = json.loads(json.dumps(settings))
     file = folder / SETTINGS
     if file.is_file():
@@ -169,6 +171,7 @@ def pack(
     for split, places in splits.items():
         files = written[split] = _packed_before(folder / split)
         for chunk in _chunks(entries(places, frozenset(files)), chunk_bytes):
+            # numbers go on after the chunks of an interrupted run
             file = f"{len({*files.values()}):06d}{SUFFIX}"
             with opened_replacing(folder / split / file) as opened:
                 torch.save(chunk, opened)
@@ -223,6 +226,7 @@ def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
         with temporary.open("wb") as file:
             yield file
         path.fs.mv(temporary.path, path.path)
+    # Ctrl-C must not leave the temporary file either
     except BaseException:
         if temporary.exists():
             temporary.unlink()
