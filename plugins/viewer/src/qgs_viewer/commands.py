@@ -231,6 +231,7 @@ def _serve(
             panel.pick(query)
         # others reach this machine by its name, not by the address that stands for all
         names = {"127.0.0.1": "localhost", "0.0.0.0": socket.gethostname()}
+        # the wanted port may be taken, and then the server has chosen another
         address = f"http://{names.get(host, host)}:{server.get_port()}"
         print_lines(console, [f"{source.title}: {address} (Ctrl-C ends it)"])
         if show:

@@ -34,6 +34,7 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
         loss_axis.set(title="Training loss", xlabel="steps", yscale="log")
         title = f"{Psnr.column.heading} of the training views, {Psnr.column.unit}"
         psnr_axis.set(title=title, xlabel="steps")
+        # PSNR rises, which leaves this corner free
         psnr_axis.legend(loc="lower right")
         loss_axis.yaxis.set_major_formatter("{x:g}")
         # a loss may stay within one power of ten, where major ticks alone say nothing

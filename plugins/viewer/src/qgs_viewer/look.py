@@ -43,6 +43,7 @@ def running_mean(values: Sequence[float]) -> np.ndarray:
 
     At both ends the window is cut off.
     """
+    # an odd number, so that the window has a middle
     window = np.ones(2 * int(len(values) / 40) + 1)
     sums = np.convolve(values, window, "same")
     return sums / np.convolve(np.ones(len(values)), window, "same")

@@ -28,6 +28,7 @@ def prediction_png(prediction: Prediction) -> bytes | None:
     """
     gaussians = prediction.gaussians[:1]
     means = gaussians.means[0].float()
+    # predictions on the meta device have shapes, but no numbers
     if means.is_meta or not means.isfinite().all():
         return None
     if not (means[:, 2] > 0).any():

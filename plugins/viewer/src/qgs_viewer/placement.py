@@ -147,4 +147,5 @@ def patch_centers(grid: tuple[int, int, int], size: tuple[int, int]) -> Tensor:
     _, rows, columns = grid
     height, width = size
     places = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).double() + 0.5
+    # a grid counts rows first, pixels are (x, y)
     return places.flip(-1) * torch.tensor([width / columns, height / rows])

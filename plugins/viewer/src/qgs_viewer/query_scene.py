@@ -86,6 +86,7 @@ class QueryScene:
 
     def query_of(self, gaussian: int) -> int:
         """Return the index of the query that made the Gaussian with this index."""
+        # Gaussians lie query by query, as many of each
         return gaussian * self.queries // self.gaussians.count
 
     def members(self, query: int) -> slice:

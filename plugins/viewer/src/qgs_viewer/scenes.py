@@ -135,4 +135,5 @@ def ratio(sample: Sample, own: Sample) -> float:
     for one in (sample, own):
         c2w = torch.cat([one.inputs.cameras.c2w, one.targets.cameras.c2w], 1)
         lengths.append(float(largest_distance(c2w)))
+    # cameras at one point have no distance to compare
     return lengths[0] / lengths[1] if lengths[1] else 1.0

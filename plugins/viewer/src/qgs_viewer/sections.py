@@ -135,6 +135,7 @@ def anchors(models: Shown, detail: Detail) -> Section:
         layers = range(model.scene.depth + 1)
         tiles = []
         for layer in evenly(layers, LAYERS + 1):
+            # supports are float64, the camera that projects them is float32
             support = map_tensors(Tensor.float, model.scene.support(layer))
             picture = support_picture(photo, support, camera.to("cpu"), colors)
             start = "learned start" if learned else "start of these photos"
