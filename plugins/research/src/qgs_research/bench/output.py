@@ -37,6 +37,7 @@ def show(report: Mapping[str, Any], console: Console) -> None:
     rows = [(f"{count / 1e9:,.3f}", f"{count / flops[0]:.3f}") for count in flops]
     table("operations, photos to Gaussians", ("GFLOP", "ratio"), rows)
     for operation, first in base["seconds"].items():
+        # the first recipe sets the unit of all rows, so that they compare
         in_seconds = first["median"] >= 10
         unit = "s" if in_seconds else "ms"
         headers = (f"median, {unit}", "quartiles", "ratio, round by round", "quartiles")

@@ -48,6 +48,7 @@ def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
         raise LayoutError(
             f"{READOUT}: {scales} norms, one for each used block, do not fit {depth} blocks"
         )
+    # files do not say which blocks are read: the release reads every second one
     step = 2 if 2 * scales <= depth + 1 else 1
     found: dict[str, Any] = {"blocks": list(range(depth - step * (scales - 1), depth + 1, step))}
     if LATENTS not in shapes:

@@ -120,6 +120,7 @@ def diff(
         # Another component has other options, so name the components first.
         rows = slots if path.endswith(".type") else options
         rows.append([path.removesuffix(".type"), *(escape(value or "-") for value in values)])
+    # sizes need no memory for weights
     before = parameter_counts(ours.build_model("meta"))
     after = parameter_counts(theirs.build_model("meta"))
     before["total"] = sum(before.values())

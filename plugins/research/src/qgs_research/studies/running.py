@@ -63,6 +63,7 @@ def run_study(
         print_lines(console, [f"written to {table}"])
     if stopped:
         print_lines(console, [f"stopped by {stopped.name}; repeat the command to continue"])
+        # as shells report a process that a signal ended
         return 128 + stopped
     return int(bool(failed))
 
@@ -114,6 +115,7 @@ def train_missing(
                     processes[run] = started(plan, run, threads, device, gpu_of[run])
             time.sleep(_SECONDS)
         for process in processes.values():
+            # all are stopped before the first is waited for, so that they save at the same time
             process.terminate()
         for process in processes.values():
             process.wait()
@@ -168,6 +170,7 @@ def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -
     If another process trains the run, this one does nothing. An error is written to a file beside
     the run folder.
     """
+    # a call that is killed cannot end its runs, so each run watches its call
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     run = run_of(Path(folder), variant, int(seed))
     try:

@@ -39,6 +39,7 @@ class Scores:
         columns: dict[str, Column] = {}
         for runs in self.stored.values():
             for result in runs.values():
+                # formats of the first result win, so that one metric has one format
                 columns = {**result.columns, **columns}
         return columns
 
