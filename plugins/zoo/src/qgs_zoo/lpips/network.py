@@ -33,6 +33,7 @@ from qgs_zoo.parts import load_weights
 _VGG_FILE = "vgg16-397923af.pth"
 _BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 """Torchvision's indices of VGG-16's convolutions, in five blocks with 2 x 2 max pooling between."""
+# mean and standard deviation of ImageNet, for images in [-1, 1]
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPS = 1e-10
@@ -103,6 +104,7 @@ class PerceptualDistance(nn.Module):
             self.blocks.append(block)
 
     def _fill_linear(self, factors: Mapping[str, Tensor]) -> None:
+        # number 0 in the files is a dropout, which has no weights
         names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
         self.linear = nn.ParameterList([factors[name].float() for name in names])
 
@@ -191,5 +193,6 @@ class Lpips(Metric):
     @torch.no_grad()
     def distance(self, images: Tensor, truth: Tensor) -> Tensor:
         """Return the LPIPS (...) of pairs of images (..., 3, H, W), which are clipped to [0, 1]."""
+        # pair by pair, so that memory does not grow with the number of views
         pairs = zip(*(x.clamp(0, 1).flatten(0, -4).split(1) for x in (images, truth)), strict=True)
         return torch.cat([self.network(*pair) for pair in pairs]).reshape(images.shape[:-3])

@@ -103,6 +103,7 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
     world = torch.einsum("bvkl,bvpxl->bvpxk", world_harmonics(rotation_BV33, degree), sh_BVPXK)
     world = world.flatten(1, 2).flatten(2)
     changed = torch.cat([numbers_BMC[..., :first], world, numbers_BMC[..., last:]], -1)
+    # without the zeros that `numbers_of` appended
     return changed[..., : features_BMD.shape[-1]]
 
 

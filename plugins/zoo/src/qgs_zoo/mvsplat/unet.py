@@ -154,6 +154,7 @@ class UNet(nn.Module):
             up[-1] += [Upsample(width)] if level else []
         self.input_blocks = nn.ModuleList(OverViews(*modules) for modules in down)
         blocks = (ResidualBlock(width, width, pre_norm) for _ in range(2))
+        # the identity keeps the number of the second block, so that parameter names match
         self.middle_block = nn.Sequential(next(blocks), nn.Identity(), next(blocks))
         self.output_blocks = nn.ModuleList(OverViews(*modules) for modules in up)
         final = conv3(width, width)
