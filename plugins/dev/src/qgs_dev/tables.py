@@ -58,6 +58,7 @@ def details(name: str, registry: Registry) -> Iterator[Table | str]:
     """
     settings = {".".join(path) or "recipe": config for path, config in SETTINGS.items()}
     models = _models(registry)
+    # a slot may be written with its place in a recipe, such as model.decoder.feed_forward
     slot = name.removeprefix("model.").removeprefix("decoder.")
     components = [(s, kind) for s in SLOTS for kind in registry.components(s)]
     shown = [(s, kind) for s, kind in components if name == kind or slot == s]

@@ -88,6 +88,7 @@ def check_queries_resize(case: Case) -> None:
     for count in (max(module.count // 2, 1), module.count + 3):
         options["count"] = count
         config = type(case.config).model_validate_json(json.dumps(options))
+        # another seed than that of `module`, whose own values must not pass for kept ones
         learned = dict(case.with_config(config).build(seed=1).state_dict())
         resized = module.resized(learned, torch.Generator().manual_seed(0))
         try:
@@ -95,6 +96,7 @@ def check_queries_resize(case: Case) -> None:
         except RuntimeError as error:
             expect(False, f"`resized` of {count} queries cannot be loaded: {error}")
         for name, values in learned.items():
+            # a value without axes has no queries to compare
             first = slice(min(len(values), len(resized[name]))) if values.ndim else ...
             kept = torch.equal(resized[name][first], values[first])
             expect(kept, f"`resized` of {count} queries changes `{name}` of the kept queries")
