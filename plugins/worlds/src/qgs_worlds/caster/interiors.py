@@ -62,6 +62,7 @@ def _darken(darkness, body, size, lamp):
             if hit(body, (np.float32(x), np.float32(y), _UNDER), _UP) < 1:
                 dark = below
             ray = (np.float32(x - lamp[0]), np.float32(y - lamp[1]), np.float32(-lamp[2]))
+            # t is 1 on the floor, so an earlier hit is between floor and lamp
             if hit(body, source, ray) < 1:
                 dark = max(dark, _SHADOW)
             darkness[i, j] = max(darkness[i, j], dark)
@@ -152,6 +153,7 @@ def _wall_shadow(place, size, face):
 def _floor_shadow(floor, place, size):
     """Interpolate the light factors of the floor at a point."""
     last = floor.shape[0] - 1
+    # below the last line, so that cell i + 1 exists
     a = min(max((place[0] / size[0] + 0.5) * last, 0.0), last - 1e-6)
     b = min(max((place[1] / size[1] + 0.5) * last, 0.0), last - 1e-6)
     i = int(a)

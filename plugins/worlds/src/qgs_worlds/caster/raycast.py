@@ -54,10 +54,7 @@ def _corners(body, c2w, corners):
 
 @inner
 def _clipped(corners, points):
-    """Clip a box at the camera plane; write the corners of its visible part to `points`.
-
-    Returns their number.
-    """
+    """Write the corners of a box, clipped at the camera plane, to `points`; return their number."""
     n = 0
     for k in range(8):
         z = corners[k, 2]

@@ -90,6 +90,7 @@ def _on_primitive(primitive, heights, face, p):
 def to_world(primitive, n):
     """Turn a normal from a primitive's frame into the world frame; its length is not 1."""
     axes = primitive.axes
+    # `axes` leads into the frame, so its transpose leads normals out of it
     return dot(axes[:, 0], n), dot(axes[:, 1], n), dot(axes[:, 2], n)
 
 
@@ -105,6 +106,7 @@ def surface(shape, heights, part, place):
     p = local_point(primitive, narrow(place))
     n, u, v, side = _on_primitive(primitive, heights, face, p)
     normal = unit(times(-1.0 if cut else 1.0, to_world(primitive, n)))
+    # a shape with one texture has it on all sides
     row = shape.cut_texture if cut else shape.texture + min(side, shape.faces - 1)
     scale = 1.0 / shape.scale
     return row, normal, u * scale, v * scale
@@ -222,6 +224,7 @@ def _gather(t, code, i, j, own, samples):
                 t_sum += distance
                 u_sum += distance * b
                 v_sum += distance * a
+    # with these weights the point at the mean t is the mean of the hits
     return n, t_sum / n, u_sum / t_sum, v_sum / t_sum
 
 

@@ -65,6 +65,7 @@ def _views(
     if light["lamp"]:
         c2w[:, :3, :3] = _FACES
         c2w[:, :3, 3] = place
+        # a focal length of half the side is a right angle of view: six of them see everything
         return [(pose, _LAMP_SIDE, _LAMP_SIDE / 2) for pose in c2w]
     right = np.array([-place[1], place[0], 0.0]) / math.hypot(place[0], place[1])
     c2w[0, :3] = np.stack([right, np.cross(-place, right), -place, middle + _SUN * place], -1)
@@ -84,6 +85,7 @@ def _seen(shadows, k, own, p):
     # written so that NaN counts as outside
     if not (a > -1 and a < side and b > -1 and b < side):
         return 1.0
+    # below the last pixel, so that a second one exists in both directions
     a = min(max(a, 0.0), side - 1.001)
     b = min(max(b, 0.0), side - 1.001)
     i = int(b)

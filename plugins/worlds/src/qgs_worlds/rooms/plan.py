@@ -35,10 +35,7 @@ _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 
 def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
-    """Return a random room of `size` metres. Furniture keeps clear of the cameras.
-
-    eyes: camera centres (F, 3).
-    """
+    """Return a random room of `size` metres, its furniture clear of cameras at `eyes` (F, 3)."""
     material = Materials(rng)
     # in most rooms all four walls are of one kind
     wall = material("wall")
@@ -139,6 +136,7 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
         if furnisher.free(*spot):
             piece = make.piece(rng.choice(AGAINST_WALLS))
             low, high = bounds(piece)
+            # the skirting board sticks out by 2 cm
             at = _from_wall(side, across / 2 - float(high[1]) - 0.02, position - float(low[0]))
             if furnisher.place(piece, *at, turn):
                 position += float(high[0] - low[0])

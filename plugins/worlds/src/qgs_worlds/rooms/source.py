@@ -99,11 +99,13 @@ def camera_path(
     travel = float(rng.uniform(*TRAVEL))
     back = float(rng.uniform(WALL + 0.1, 0.25 * across)) - across / 2
     middle = float(rng.uniform(-1, 1)) * max(along / 2 - WALL - travel / 2 - 0.1, 0.0)
+    # a single camera stands in the middle, not at the start
     s = np.linspace(-0.5, 0.5, count) if count > 1 else np.zeros(1)
     sway, lift = rng.uniform(-0.12, 0.12, 2)
     phase = rng.uniform(0, math.pi)
     eyes = np.stack(
         [
+            # the last term keeps a swaying path from coming nearer to the wall
             back + sway * np.cos(3 * s + phase) + abs(sway),
             middle + travel * s,
             rng.uniform(*EYE) + lift * np.sin(3 * s + phase),

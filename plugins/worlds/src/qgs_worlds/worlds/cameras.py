@@ -152,6 +152,7 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
     c2w = _look_at(eyes, targets, np.radians(roll))
     # walks and orbits go both ways
     order = -1 if rng.random() < 0.5 else 1
+    # a copy, because torch takes no array with a negative stride
     return Rig(np.ascontiguousarray(c2w[::order]), fov, distance, motion)
 
 
