@@ -136,10 +136,7 @@ class DinoV2(nn.Module):
         return found
 
     def positions(self, rows: int, columns: int) -> Tensor:
-        """Return position embeddings of the class token, then of a grid of any size.
-
-        They are (1, 1 + rows * columns, C).
-        """
+        """Return position embeddings (1, 1 + rows * columns, C): class token, then a grid."""
         if rows == columns == GRID:
             return self.pos_embed
         # The class token has its own embedding, which is not a place.

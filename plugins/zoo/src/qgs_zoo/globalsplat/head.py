@@ -183,10 +183,7 @@ def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
 
 
 def growth(candidates: int, count: int) -> float:
-    """Return the number to add to log scales so that merging keeps the total volume.
-
-    `candidates` candidates are merged into `count` Gaussians.
-    """
+    """Return what log scales gain so that `candidates` merged into `count` keep the total volume."""
     return math.log(candidates / count) / 3
 
 

@@ -146,10 +146,7 @@ class LpipsLoss(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """Return the mean LPIPS of the rendered views.
-
-        Raises ValueError if a side of the images is shorter than 16 pixels.
-        """
+        """Return the mean LPIPS of the views. Raises ValueError for sides below 16 pixels."""
         images = rendering.rgb.flatten(0, 1)
         truth = target.images.flatten(0, 1)
         return self.network(images, truth).mean()
@@ -184,10 +181,7 @@ class Lpips(Metric):
         self.network.load(self.config.weights)
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return the LPIPS (1, T) of each of the T target views.
-
-        Raises ValueError if a side is shorter than 16 pixels.
-        """
+        """Return the LPIPS (1, T) of T views. Raises ValueError for sides below 16 pixels."""
         return self.distance(given.images, given.targets.images)
 
     @torch.no_grad()

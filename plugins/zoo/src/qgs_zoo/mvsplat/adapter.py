@@ -63,6 +63,7 @@ def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     """
     generator = torch.Generator().manual_seed(0)
     double = {"dtype": torch.float64, "device": "cpu"}
+    # more directions than the 25 harmonics of degree 4, so that the fit is exact
     around = F.normalize(torch.randn(64, 3, generator=generator, **double), dim=-1)
     # The rasteriser of the family evaluates the functions of 3DGS at (z, x, y) of a direction.
     cycle = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], **double)

@@ -140,10 +140,7 @@ def harmonics_of(features_BND: Tensor) -> Tensor:
 
 
 def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
-    """Return opacities (1 - (1 - p)^e + p^(1 / e)) / 2 with e = 2^exponent.
-
-    An exponent of 0 returns p unchanged.
-    """
+    """Return opacities (1 - (1 - p)^e + p^(1 / e)) / 2 with e = 2^exponent; p for exponent 0."""
     if exponent == 0:
         return p
     # The mean of two curves, which is p for an exponent of 0 (published weights). The released code

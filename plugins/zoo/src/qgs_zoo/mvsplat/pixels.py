@@ -108,10 +108,7 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
 
 
 def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
-    """Return the values of PIXEL_FIELDS for images of rows x columns pixels.
-
-    They are (B, V * rows * columns, ...).
-    """
+    """Return PIXEL_FIELDS, (B, V * rows * columns, ...), of images of rows x columns pixels."""
     turn = quaternions(cameras.c2w[..., :3, :3]).repeat_interleave(rows * columns, 1)
     return {PIXEL: pixel_rays(cameras, rows, columns), TURN: turn}
 

@@ -137,10 +137,7 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlate features with those sampled from another view, some depths at a time.
-
-    Returns (N, D, h, w).
-    """
+    """Correlate features with those sampled from another view, part by part: (N, D, h, w)."""
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))

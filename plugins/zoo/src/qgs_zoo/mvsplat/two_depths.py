@@ -63,10 +63,7 @@ class DepthError(Metric):
     column = Column("AbsRel", "lower")
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return |z - true z| / true z of each pixel with a known true depth.
-
-        It is 1 if nothing is rendered there.
-        """
+        """Return |z - true z| / true z where the true depth is known; 1 if nothing is rendered."""
         assert given.depth is not None
         assert given.true_depth is not None
         # Zero means that there is no measurement.

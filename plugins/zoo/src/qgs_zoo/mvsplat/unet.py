@@ -81,10 +81,7 @@ class ResidualBlock(nn.Module):
 
 
 class ViewAttention(nn.Module):
-    """Attention over the pixels of all views, with heads of 32 channels.
-
-    There is no embedding of positions.
-    """
+    """Attention over the pixels of all views, with heads of 32 channels, without positions."""
 
     def __init__(self, width: int, pre_norm: bool) -> None:
         super().__init__()

@@ -154,10 +154,7 @@ class DynamicObjective(Objective):
 
 
 def _alone(layer: LayerPrediction) -> LayerPrediction:
-    """Return the dynamic queries of a layer and their Gaussians.
-
-    The same queries must be dynamic in all scenes.
-    """
+    """Return a layer's dynamic queries, which must be the same in all scenes, with Gaussians."""
     moves_N = layer.state[MOVES][0]
     each = layer.gaussians.count // len(moves_N)
     of_gaussians = moves_N.repeat_interleave(each)
