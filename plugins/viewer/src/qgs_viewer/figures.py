@@ -68,10 +68,7 @@ def write_figures(
 
 
 def grid(section: Section) -> Figure:
-    """Return a Matplotlib figure with one panel for each tile of `section`.
-
-    Tiles are not interpolated.
-    """
+    """Return a Matplotlib figure with a panel, not interpolated, for each tile of `section`."""
     columns = max(map(len, section.rows.values()))
     tiles = [tile for tile in next(iter(section.rows.values())) if tile]
     # all pictures of a section have the shape of its first

@@ -166,6 +166,7 @@ def measure(tree: dict[str, Any], operation: Operation, workload: Workload, thre
         if on_gpu:
             torch.cuda.reset_peak_memory_stats()
         elif restart.exists():  # on Linux
+            # Linux then forgets the peak, VmHWM, but keeps the memory.
             restart.write_text("5")
     task()
     peak = torch.cuda.max_memory_allocated() if on_gpu else resident_bytes("VmHWM")

@@ -131,9 +131,6 @@ def write_plan(plan: Plan) -> None:
 
 
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[str | None, str | None]]:
-    """Return the options in which two recipes differ, with both values.
-
-    Seeds and plugin names are ignored.
-    """
+    """Return the options in which two recipes differ, with both values, except those in BESIDE."""
     found = differing_options(ours.tree, theirs.tree)
     return {path: values for path, values in found.items() if path not in BESIDE}
