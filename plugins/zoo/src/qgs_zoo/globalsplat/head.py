@@ -183,7 +183,7 @@ def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
 
 
 def growth(candidates: int, count: int) -> float:
-    """Return what log scales gain so that `candidates` merged into `count` keep the total volume."""
+    """Return what log scales gain so that `candidates` merged into `count` keep total volume."""
     return math.log(candidates / count) / 3
 
 
