@@ -129,3 +129,32 @@ def test_images_of_another_size_are_told_when_decoded(folder):
     Image.new("RGB", (40, 40)).save(folder / NAMES[3])
     scene = read(folder)
     must_refuse(r"view_003\.png", scene.images, [3])
+
+
+def test_a_matrix_of_intrinsics_and_numbers_as_text_are_read(folder):
+    expected = read(folder).cameras
+    change(folder, w="40", h="30", fl_x="50.0", fl_y=None, cx=None, cy=None)
+    for frame, key in enumerate(("K", "intrinsic_matrix")):
+        change(folder, frame, **{key: [["50", 0, 19], [0, 52, 16], [0, 0, 1]]})
+    changed = read(folder).cameras
+    assert torch.equal(changed.intrinsics[:2], expected.intrinsics[:2])
+    assert changed.intrinsics[2].tolist() == [50, 50, 20, 15]
+    change(folder, 2, transform_matrix=None)
+    assert len(read(folder)) == 5
+
+
+def test_a_scale_of_rotations_is_divided_out_and_a_stray_camera_left_out(folder, caplog):
+    expected = read(folder).cameras.c2w
+    scaled = json.loads((folder / "transforms.json").read_text())["frames"]
+    for number, frame in enumerate(scaled):
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, :3] *= 2.5
+        pose[0, 3] += 4500 * (number == 3)
+        change(folder, number, transform_matrix=pose.tolist())
+    found = read(folder).cameras.c2w
+    assert torch.allclose(found, expected[[0, 1, 2, 4, 5]])
+    assert "rotations of 6 frames" in caplog.text
+    assert "frame 3 (images/view_003.png): the camera stands" in caplog.text
+    pose[:3, 0] *= 1.1
+    change(folder, 5, transform_matrix=pose.tolist())
+    assert len(read(folder)) == 4

@@ -68,7 +68,7 @@ k1 | {"k1": NaN}
 def test_what_cannot_be_meant_is_refused(tmp_path):
     for line in REFUSED.strip().splitlines():
         word, text = line.split(" | ")
-        must_refuse(word, opened, folder(tmp_path, **json.loads(text)))
+        must_refuse(word, opened, folder(tmp_path, count=2, **json.loads(text)))
 
 
 def test_folders_and_files_that_are_not_there(tmp_path):
@@ -82,12 +82,13 @@ def test_folders_and_files_that_are_not_there(tmp_path):
 def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
     for name in ("mine", "other"):
         (tmp_path / name).mkdir()
-    folder(tmp_path / "other")
+    far = folder(tmp_path / "other") / "images/far.png"
+    Image.new("RGB", (64, 48)).save(far)
     mine = tmp_path / "mine"
     (mine / "linked").symlink_to(tmp_path / "other")  # a link in the folder is the user's own
     for of in ("depth_file_path", "mask_path", "file_path"):
-        assert read(folder(mine, frame={of: "linked/images/1.png"}))
-        for place in ("../other/images/1.png", f"{tmp_path}/other/images/1.png"):
+        assert read(folder(mine, frame={of: "linked/images/far.png"}))
+        for place in ("../other/images/far.png", str(far)):
             folder(mine, frame={of: place})
-            must_refuse(r"other/images/1\.png", opened, mine)
+            must_refuse(r"other/images/far\.png", opened, mine)
             assert of != "file_path" or read(mine, outside=True)

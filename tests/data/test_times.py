@@ -42,7 +42,7 @@ def test_times_of_dnerf(tmp_path):
 
 def test_times_that_cannot_be(tmp_path):
     for time in (..., None, "noon", float("nan"), [1]):
-        must_refuse("'time'", scene, dnerf(tmp_path, 0, time, 0.5))
+        must_refuse("'time'", scene, dnerf(tmp_path, 0, time, time))
 
 
 def test_one_camera_a_time_gives_that_frame_as_all_targets():

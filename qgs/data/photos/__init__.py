@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from upath import UPath
 
+from qgs.data.photos.finding import located
 from qgs.data.photos.nerfstudio import Nerfstudio
 from qgs.data.photos.reader import (
     Listing,
     PhotoFrame,
     PhotoReader,
-    existing,
     installed_readers,
-    refuse_outside,
-    refuse_problems,
+    mended,
+    sound_frames,
 )
 from qgs.paths import is_local, listing
 from qgs.wording import listed, warn_once
@@ -48,11 +48,16 @@ def with_cameras(path: UPath) -> UPath:
     return next(filter(None, made), path)
 
 
-def read_listing(folder: UPath, format: str = "auto", images: str | None = None) -> Listing:
+def read_listing(
+    folder: UPath, format: str = "auto", images: str | None = None, outside: bool = False
+) -> Listing:
     """Read the photos that `folder` lists. format: "auto" reads the first format of `readers`.
 
-    images: folder with scaled copies of the photos to read, such as images_4. Raises
-    FileNotFoundError without a folder or listing, and ValueError for an unreadable listing.
+    Files that are not where they are listed are searched, see `located`.
+
+    images: folder with scaled copies of the photos to read, such as images_4. outside: allow files
+    outside of `folder`. Raises FileNotFoundError without a folder or listing, and ValueError for an
+    unreadable listing and for files outside of `folder` that are not allowed.
     """
     known = readers()
     listings = ", ".join(f"{reader.listing} ({name})" for name, reader in known.items())
@@ -80,6 +85,7 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
             f"{held[0]}; set data.format in a recipe to read another format"
         )
     found = known[held[0] if format == "auto" else format].read(folder, images)
+    found = mended(located(found, found.folder or folder, images, outside))
     still = [frame.name for frame in found.frames if frame.time is None and not frame.problems]
     if still and len({frame.time is None for frame in found.frames}) > 1:
         raise ValueError(
@@ -99,10 +105,7 @@ def present_frames(
     FileNotFoundError if fewer than two images exist or a mask is missing, and ValueError for poses
     and intrinsics that cannot be right.
     """
-    found = read_listing(folder, format, images)
-    # A listing of a stranger must not name other files of this machine.
-    if not outside:
-        refuse_outside(folder, found)
+    found = read_listing(folder, format, images, outside)
     frames = [frame for frame in found.frames if frame.split != "unused"]
     count = len(frames)
     if count < len(found.frames):
@@ -110,23 +113,22 @@ def present_frames(
             f"{len(found.frames) - count} of {len(found.frames)} frames of {found.file} are "
             "in none of its splits and are left out"
         )
-    there = existing(frame.path for frame in frames)
-    present = [frame for frame in frames if frame.path in there]
-    missing = [str(frame.path) for frame in frames if frame.path not in there]
+    present = [frame for frame in frames if frame.path in found.present]
+    missing = [str(frame.path) for frame in frames if frame.path not in found.present]
     # Before the count: a wrong listing explains missing images.
-    refuse_problems(found.file, present if len(present) > 1 else frames)
+    sound = sound_frames(found.file, present if len(present) > 1 else frames)
     if len(present) < 2:
         raise FileNotFoundError(
             f"{found.file} names {count} images, but {len(present)} exist and 2 are needed: add "
-            f"{listed(missing, 3) or 'photos'}"
+            f"{listed(missing, 3) or 'photos'}, or name the folder that they are in as `images`"
         )
     if missing:
         warn_once(f"{len(missing)} of {count} images of {folder} are missing: {listed(missing, 3)}")
-    masks = [frame.mask for frame in present if frame.mask is not None]
-    absent = sorted({*map(str, masks)} - {*map(str, existing(masks))})
+    masks = [frame.mask for frame in sound if frame.mask is not None]
+    absent = sorted({str(mask) for mask in masks if mask not in found.present})
     if absent:
         raise FileNotFoundError(
             f"{found.file} names {len(masks)} masks, but {len(absent)} do not exist: "
             f"{listed(absent, 3)}. Add them, or remove their 'mask_path'"
         )
-    return present, missing
+    return sound, missing

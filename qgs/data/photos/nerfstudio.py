@@ -11,6 +11,7 @@ from PIL import Image
 from upath import UPath
 
 from qgs.data.images import image_size, read_image
+from qgs.data.photos.finding import found_files
 from qgs.data.photos.reader import (
     FrameProblem,
     Intrinsics,
@@ -19,20 +20,21 @@ from qgs.data.photos.reader import (
     PhotoFrame,
     PhotoReader,
     Size,
-    existing,
     installed_readers,
     listed_size,
     numbers,
-    with_images,
 )
 from qgs.paths import read_json
 
-PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+PINHOLE = (
+    "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV",
+)  # fmt: skip
 """Camera models that are a pinhole if all distortion coefficients are 0."""
 _COEFFICIENTS = (
     "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
     "sx1", "sy1", "b1", "b2",
 )  # fmt: skip
+_MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_matrix")
 _NO_POSE = np.full((4, 4), np.nan)
 _NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
 # Of a pose's columns: the camera's y and z axes change sign.
@@ -51,13 +53,7 @@ class Nerfstudio(PhotoReader):
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """Read the frames in the order of the file; see `PhotoReader`."""
         file = folder / cls.listing
-        frames = read_transforms(file)
-        top = {PurePosixPath(frame.name).parts[:1] for frame in frames}
-        # DL3DV ships reduced copies alone, under the listing of the full size.
-        reduced = top == {("images",)} and not (folder / "images").is_dir()
-        if images is not None or reduced:
-            frames = with_images(frames, folder, images)
-        return Listing(file, frames)
+        return Listing(file, read_transforms(file))
 
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
@@ -74,9 +70,9 @@ def read_transforms(file: UPath) -> list[PhotoFrame]:
     try:
         # An angle of view needs the image's size; a header is read only where nothing lists one.
         if any(frame.problems and not frame.size for frame in frames):
-            present = existing(frame.path for frame in frames)
-            first = [frame.path for frame in frames if frame.path in present][:1]
-            size = read_image(first[0], image_size) if first else None
+            present = found_files(folder, [frame.path for frame in frames if frame.name])
+            first = next(iter(present.values()), None)
+            size = read_image(first, image_size) if first else None
             frames = [_frame(folder, data, entry, size) for entry in entries]
         return _with_splits(frames, data)
     except ValueError as error:
@@ -93,7 +89,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
     if not isinstance(path, str) or not PurePosixPath(path).name or "://" in path:
         problem = FrameProblem("its 'file_path' names no file", "correct or remove the frame")
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
-    values = _Values({**data, **entry})
+    values = _Values({**_flat(data), **_flat(entry)})
     height = values.number("h")
     width = values.number("w")
     if height is not None and width is not None:
@@ -118,6 +114,15 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
     )
 
 
+def _flat(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return `values` with the entries of a matrix of intrinsics under their own names."""
+    matrix = numbers(next((values[key] for key in _MATRICES if key in values), None))
+    if matrix.shape != (3, 3):
+        return values
+    names = ("fl_x", "fl_y", "cx", "cy")
+    return {**dict(zip(names, matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)), **values}
+
+
 class _Values(dict[str, Any]):
     """Values of a frame, and problems of values that cannot be read."""
 
@@ -132,8 +137,10 @@ class _Values(dict[str, Any]):
     def number(self, key: str) -> float | None:
         """Return the finite number `key`; None if it is absent, null or invalid, a problem."""
         value = self.get(key)
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-            return float(value)
+        # Some programs write numbers as text.
+        read = numbers([value])
+        if read.shape == (1,) and not isinstance(value, bool) and math.isfinite(read[0]):
+            return float(read[0])
         if value is not None:
             self.problem(f"{key!r} must be a finite number, got {value!r}", "correct the value")
         return None

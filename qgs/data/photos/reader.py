@@ -1,20 +1,19 @@
 """Base class of photo readers, the frames that they return, and checks of frames."""
 
 import math
-import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePosixPath
 from typing import ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
+import torch
 from upath import UPath
 
 from qgs.extensions import ExtensionError, installed, load
 from qgs.paths import listing
-from qgs.wording import listed, name_shown, numbered, warn_once
+from qgs.wording import listed, numbered, warn_once
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 Size: TypeAlias = tuple[int, int]
@@ -31,6 +30,8 @@ LARGEST_SIDE = 10**6
 _FARTHEST = 1e12
 # Tolerance of rotations against orthonormality.
 _RIGID = 1e-3
+# A camera so many times farther from the middle than three quarters of all has a wrong pose.
+_STRAY = 100
 # Relative difference between the file's and the listing's aspect ratio.
 _SAME_ASPECT = 0.01
 # Ratio of fx and fy up to which pixels are about square.
@@ -119,10 +120,15 @@ class PhotoFrame:
 
 @dataclass(frozen=True)
 class Listing:
-    """Photos of a folder. file: the file that lists them. frames: in the order of that file."""
+    """Photos of a folder. file: the file that lists them. frames: in the order of that file.
+
+    folder: folder of the photos; None for the folder that was read. present: files that exist.
+    """
 
     file: UPath
     frames: Sequence[PhotoFrame]
+    folder: UPath | None = None
+    present: Collection[UPath] = ()
 
 
 class PhotoReader(ABC):
@@ -190,67 +196,47 @@ def numbers(value: object) -> np.ndarray:
         return np.zeros(0)
 
 
-def existing(paths: Iterable[UPath]) -> set[UPath]:
-    """Return the paths that exist. Each folder is listed once, since object stores are slow."""
-    names: dict[str, set[str]] = {}
-    held: set[UPath] = set()
-    for path in paths:
-        folder = str(path.parent)
-        if folder not in names:
-            names[folder] = {item.name for item in listing(path.parent)}
-        if path.name in names[folder]:
-            held.add(path)
-    return held
-
-
 def image_folder(folder: UPath, wanted: str | None) -> UPath:
-    """Return the folder of photos: `wanted`, or else images, or else its largest scaled copy.
+    """Return the folder of photos: `wanted`, or else images, its largest copy, or `folder`.
 
-    Raises FileNotFoundError if there is none.
+    Raises FileNotFoundError if `wanted` is given and does not exist.
     """
-    if wanted is not None:
-        chosen = folder / wanted
-        if not chosen.is_dir():
-            raise FileNotFoundError(f"{chosen} does not exist: correct the option `images`")
-        return chosen
-    copies = [item for item in folder.iterdir() if _COPY.fullmatch(item.name) and item.is_dir()]
-    if not copies:
-        raise FileNotFoundError(
-            f"{folder} has neither a folder `images` nor a scaled copy such as images_4: set the "
-            "option `images` to the folder of photos"
+    if wanted is None:
+        copies = [item for item in listing(folder) if _COPY.fullmatch(item.name.lower())]
+        # images comes before images_2, and images_16 last.
+        return min(
+            filter(UPath.is_dir, copies),
+            key=lambda item: (len(item.name), item.name),
+            default=folder,
         )
-    # `images` counts as reduced by 1.
-    return min(copies, key=lambda item: int(item.name.partition("_")[2] or 1))
+    if not (folder / wanted).is_dir():
+        raise FileNotFoundError(f"{folder / wanted} does not exist: correct `images`")
+    return folder / wanted
 
 
-def with_images(
-    frames: Sequence[PhotoFrame], folder: UPath, wanted: str | None
-) -> list[PhotoFrame]:
-    """Return `frames` with photos of the same names in `image_folder(folder, wanted)`.
+def mended(found: Listing) -> Listing:
+    """Divide uniform scales out of rotations, and mark poses far from all others as a problem.
 
-    Raises FileNotFoundError if there is no such folder.
+    Metashape multiplies all rotations by one number.
     """
-    photos = image_folder(folder, wanted)
-    inside = wanted or photos.name
-
-    def moved(frame: PhotoFrame) -> PhotoFrame:
-        parts = PurePosixPath(frame.name).parts
-        name = str(PurePosixPath(inside, *(parts[1:] or parts)))
-        mask = folder / name if frame.mask == frame.path else frame.mask
-        return replace(frame, name=name, path=folder / name, mask=mask)
-
-    return [moved(frame) if frame.name else frame for frame in frames]
-
-
-def refuse_outside(folder: UPath, found: Listing) -> None:
-    """Raise ValueError if a listed file is outside of `folder`. Links in `folder` are allowed."""
-    for frame in found.frames:
-        for file in filter(None, (frame.path, frame.mask, frame.depth)):
-            if os.path.relpath(file.path, folder.path or ".").split(os.sep)[0] == "..":
-                raise ValueError(
-                    f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: "
-                    "move it into the folder, or train with data.outside=true"
-                )
+    poses = torch.from_numpy(np.stack([frame.c2w for frame in found.frames]))
+    scales = torch.linalg.det(poses[:, :3, :3]).abs() ** (1 / 3)
+    # A shear and NaN stay as they are, and are refused.
+    scaled = ((scales - 1).abs() > _RIGID) & (scales > 0)
+    poses[scaled, :, :3] /= scales[scaled, None, None]
+    if scaled.any():
+        warn_once(f"{found.file}: a scale is divided out of the rotations of {scaled.sum()} frames")
+    distances = (poses[:, :3, 3] - poses[:, :3, 3].nanmedian(0).values).norm(dim=-1)
+    far = distances > _STRAY * distances.nanquantile(0.75)
+    stray = FrameProblem(
+        f"the camera stands more than {_STRAY} times as far away as most other cameras",
+        "correct its pose, or remove the frame",
+    )
+    frames = [
+        replace(frame, c2w=pose, problems=frame.problems + (stray,) * is_far)
+        for frame, pose, is_far in zip(found.frames, poses.numpy(), far.tolist(), strict=True)
+    ]
+    return replace(found, frames=frames)
 
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
@@ -329,16 +315,33 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
     return None, (FrameProblem(reason, "correct the width and height"),)
 
 
-def refuse_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:
-    """Raise ValueError for the first problem of a frame; warn of implausible intrinsics."""
+def sound_frames(listing: object, frames: Sequence[PhotoFrame]) -> list[PhotoFrame]:
+    """Return the frames without problems; warn of the others and of implausible intrinsics.
+
+    listing: file that is named in messages. Raises ValueError if fewer than two have no problem.
+    """
+    sound: list[PhotoFrame] = []
+    faulty: list[str] = []
     for index, frame in enumerate(frames):
-        for problem in frame.problems or (
+        problems = frame.problems or (
             *pose_problems(frame.c2w),
             *intrinsics_problems(frame.intrinsics, frame.size),
-        ):
-            raise ValueError(f"{listing}: frame {numbered(index, frame.name)}: {problem}")
-    doubtful = [f.name for f in frames if f.size and not are_plausible(f.intrinsics, f.size)]
+        )
+        if problems:
+            faulty.append(f"frame {numbered(index, frame.name)}: {problems[0]}")
+        else:
+            sound.append(frame)
+    if faulty and len(sound) < 2:
+        raise ValueError(f"{listing}: {faulty[0]}")
+    if faulty:
+        warn_once(
+            f"{listing}: {len(faulty)} of {len(frames)} frames are left out: "
+            f"{listed(faulty, 3, '; ')}"
+        )
+    doubtful = [f.name for f in sound if f.size and not are_plausible(f.intrinsics, f.size)]
     if doubtful:
-        count = f"{len(doubtful)} of {len(frames)}"
-        what = f"{count} frames have intrinsics that are implausible for the size"
-        warn_once(f"{listing}: {what}: {listed(doubtful, 3)}; {UNLESS}")
+        warn_once(
+            f"{listing}: {len(doubtful)} of {len(frames)} frames have intrinsics that are "
+            f"implausible for the size: {listed(doubtful, 3)}; {UNLESS}"
+        )
+    return sound

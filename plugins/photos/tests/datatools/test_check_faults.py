@@ -136,18 +136,16 @@ def test_a_camera_that_stands_still_may_film_what_moves(planted):
     planted.check(geometry=0)
 
 
-def test_photos_have_one_number_in_reading_and_in_checking(planted):
+def test_photos_have_one_number_in_reading_and_in_checking(planted, caplog):
     """Behind a photo that is missing, the number in a message is the one that `--frames` takes."""
     nan = "error: frame 2 (images/3.jpg): the pose has NaN*"
     room = planted("error: images/1.jpg: the image does not exist*", nan)
     del room.files["images/1.jpg"]
     room.poses[3] = np.nan
     planted.check()
-    must_refuse(
-        r"frame 2 \(images/3\.jpg\): the pose has NaN",
-        present_frames,
-        UPath(planted.root / "room 00"),
-    )
+    present, _ = present_frames(UPath(planted.root / "room 00"))
+    assert "frame 2 (images/3.jpg): the pose has NaN" in caplog.text
+    assert len(present) == 4
 
 
 def test_faults_of_a_scene_in_a_chunk(shots, tmp_path):

@@ -12,13 +12,14 @@ import numpy as np
 from upath import UPath
 
 from qgs.data.images import image_size, read_image
+from qgs.data.photos.finding import found_files, inside
 from qgs.data.photos.reader import (
     FrameProblem,
     Listing,
     PhotoFrame,
     PhotoReader,
     Size,
-    existing,
+    image_folder,
     listed_size,
     numbers,
 )
@@ -89,32 +90,22 @@ class CamerasJson(PhotoReader):
             names.append(next(given, ""))
         if not cameras:
             raise ValueError(f"{file} lists no cameras: expected {_FORM}")
-        folders = [folder / images] if images else [folder, folder / "images"]
-        # relative to the first of the folders that holds some of them
         if any(names):
-            names = _with_suffixes(names, folders)
-            held = (place for place in folders if existing(place / name for name in names if name))
-            place = next(held, folders[0])
+            listed = [folder / name for name in names]
+            found = found_files(folder, listed, images=images)
         else:
-            found = {place: image_files(place) for place in folders if place.is_dir()}
-            place, files = max(found.items(), key=lambda item: len(item[1]), default=(folder, []))
-            names = [item.name for item in files]
-            if len(names) != len(cameras):
+            place = image_folder(folder, images)
+            listed = image_files(place)
+            if len(listed) != len(cameras):
                 raise ValueError(
                     f"{file} lists {len(cameras)} cameras without names of images, but {place} has "
-                    f"{len(names)} images: name the images, as in {_FORM}"
+                    f"{len(listed)} images: name the images, as in {_FORM}"
                 )
-        pairs = zip(cameras, names, strict=True)
-        read = [_Camera(camera, place, name) for camera, name in pairs]
+            found = {}
+        read = [_Camera(*pair, found) for pair in zip(cameras, listed, strict=True)]
         if any(camera.in_parts for camera in read):
             warn_once(f"intrinsics in {file} are read as fractions of width and height")
         return Listing(file, [camera.frame(folder) for camera in read])
-
-
-def _with_suffixes(names: list[str], folders: list[UPath]) -> list[str]:
-    """Return `names`; a name without a suffix gets that of the photo with this name."""
-    known = {photo.stem: photo.name for folder in folders for photo in image_files(folder)}
-    return [name if "." in name else known.get(name, name) for name in names]
 
 
 def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
@@ -156,14 +147,15 @@ def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
 class _Camera:
     """A camera of the file.
 
-    values: its entry. place: folder of the photos. name: file name of the photo in that folder;
-    "" if none is named.
+    values: its entry. path: its photo as listed. found: where listed photos are.
     """
 
-    def __init__(self, values: Mapping[str, Any], place: UPath, name: str) -> None:
+    def __init__(
+        self, values: Mapping[str, Any], path: UPath, found: Mapping[UPath, UPath]
+    ) -> None:
         self.values = values
-        self.place = place
-        self.name = name
+        self.path = path
+        self.real = found.get(path, path)
         self.problems = list[FrameProblem]()
         sides = [values.get(s, values.get(long)) for s, long in (("h", "height"), ("w", "width"))]
         self.size: Size | None = None
@@ -171,8 +163,6 @@ class _Camera:
             plain = (s if isinstance(s, int | float) else math.nan for s in sides)
             self.size, wrong = listed_size(*plain)
             self.problems += wrong
-        if not name:
-            self._wrong("no image is named")
         self.in_parts = False
         self.pose = self._pose()
         self.intrinsics = self._intrinsics()
@@ -231,20 +221,20 @@ class _Camera:
 
     def _photo_size(self) -> Size | None:
         """Return (H, W) as listed, or else that of the image file; None if it cannot be read."""
-        if self.size is None and self.name:
+        if self.size is None:
             with suppress(ValueError):
-                self.size = read_image(self.place / self.name, image_size)
+                self.size = read_image(self.real, image_size)
         return self.size
 
     def frame(self, folder: UPath) -> PhotoFrame:
         """Return the photo and its camera. folder: the scene's, to which the name is relative."""
-        inside = self.name
-        if self.place != folder and inside:
-            inside = f"{self.place.name}/{inside}"
+        name = "" if self.path == folder else "/".join(inside(folder, self.path))
+        if not name:
+            self._wrong("no image is named")
         fx, fy, cx, cy = self.intrinsics.tolist()
         return PhotoFrame(
-            name=inside,
-            path=self.place / self.name,
+            name=name,
+            path=self.path,
             c2w=self.pose,
             intrinsics=(fx, fy, cx, cy),
             size=self.size,

@@ -8,7 +8,8 @@ import io
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
+from contextlib import suppress
+from itertools import chain
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
 
@@ -16,8 +17,10 @@ import numpy as np
 import torch
 from upath import UPath
 
+from qgs.data.photos.finding import is_inside
 from qgs.data.photos.nerfstudio import PINHOLE
 from qgs.data.photos.reader import (
+    FrameProblem,
     Lens,
     Listing,
     PhotoFrame,
@@ -26,23 +29,20 @@ from qgs.data.photos.reader import (
     listed_size,
 )
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.paths import open_file
-from qgs.wording import name_shown
-from qgs_photos.datasets.lenses import BendingLens, Fisheye, RadialTangential, bending
+from qgs.paths import listing, open_file
+from qgs.wording import listed, name_shown, warn_once
+from qgs_photos.datasets.lenses import FOCAL, bending, model_name, parameters
+from qgs_photos.image_files import image_files
 
-_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-_MODELS: dict[str, tuple[int, str, type[BendingLens] | None]] = {
-    "SIMPLE_PINHOLE": (0, "f cx cy", None),
-    "PINHOLE": (1, "fx fy cx cy", None),
-    "SIMPLE_RADIAL": (2, "f cx cy k1", RadialTangential),
-    "RADIAL": (3, "f cx cy k1 k2", RadialTangential),
-    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2", RadialTangential),
-    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4", Fisheye),
-    "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1", Fisheye),
-    "RADIAL_FISHEYE": (9, "f cx cy k1 k2", Fisheye),
-}
-"""Camera models by name: number in binary files, parameters in order, and class of the lens."""
-_NAMES = {number: name for name, (number, _, _) in _MODELS.items()}
+_PLACES = (
+    "sparse/*",
+    "sparse",
+    "colmap/sparse/*",
+    "colmap/sparse",
+    ".",
+    "dense/sparse",
+    "dense/*/sparse",
+)
 _LONGER = "a file goes on after the number of records that it announces"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
@@ -63,51 +63,85 @@ class Colmap(PhotoReader):
     @classmethod
     def lens(cls, model: str, coefficients: Mapping[str, float]) -> Lens | None:
         """See `PhotoReader`."""
-        kind = Fisheye if model == "OPENCV_FISHEYE" else RadialTangential
-        known = {field.name: coefficients.get(field.name, 0.0) for field in fields(kind)}
-        # files with several cameras have these at the top, for all models
-        others = coefficients.keys() - known.keys() - {"p1", "p2"}
-        if others or not (kind is Fisheye or model in PINHOLE):
-            return None
-        return bending(kind(**known))
+        # nerfstudio has a k3 in models where COLMAP has none
+        kind = "FULL_OPENCV" if model in PINHOLE else model
+        with suppress(ValueError):
+            # files with several cameras have p1 and p2 at the top, for all models
+            known = {"p1", "p2", *parameters(kind)}
+            known -= {"k4", "k5", "k6"} if kind != model else set()
+            return None if coefficients.keys() - known else bending(kind, coefficients)
+        return None
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """See `PhotoReader`."""
-        model, suffix = next(_models(folder))
-        read_cameras, read_images = _READ[suffix]
-        try:
-            listed = [*read_cameras(model)]
-            cameras = {number: _camera(*camera) for number, camera in listed}
-            posed = [(name, _c2w(*pose), camera) for name, pose, camera in read_images(model)]
-            if len(cameras) + len({PurePosixPath(p[0]) for p in posed}) < len(listed) + len(posed):
-                raise ValueError("a camera or an image is listed twice")
-            if unknown := {camera for *_, camera in posed} - cameras.keys():
-                raise ValueError(f"images name cameras {sorted(unknown)}, which it does not hold")
-        except ValueError as error:
-            raise ValueError(
-                f"the COLMAP model {model} (cameras.{suffix}, images.{suffix}) cannot be read: "
-                f"{name_shown(str(error))}; export it again, or copy it again"
-            ) from error
-        photos = image_folder(folder, images)
-        frames = [
-            PhotoFrame(str(PurePosixPath(photos.name, name)), photos / name, c2w, **cameras[camera])
-            for name, c2w, camera in posed
-        ]
-        return Listing(model, sorted(frames, key=lambda frame: frame.name))
+        found = [_read(*model) for model in _models(folder)]
+        # beside its own photos first: those of dense/0 are undistorted; then the largest
+        best = max(found, key=lambda one: (_has_photos(one.folder or folder), len(one.frames)))
+        if others := [f"{one.file} ({len(one.frames)})" for one in found if one is not best]:
+            warn_once(
+                f"of {len(found)} COLMAP models {best.file} with {len(best.frames)} photos is "
+                f"read, and not {listed(others)}"
+            )
+        if best.folder and not is_inside(folder, best.folder):
+            warn_once(f"{folder} is a COLMAP model of {best.folder}, whose photos are read")
+        return best
+
+
+def _read(model: UPath, suffix: str) -> Listing:
+    """Read the model's photos by name. Raises ValueError."""
+    read_cameras, read_images = _READ[suffix]
+    try:
+        listed = [*read_cameras(model)]
+        cameras = {number: _camera(*camera) for number, camera in listed}
+        posed = [*read_images(model)]
+        if len(cameras) + len({PurePosixPath(p[0]) for p in posed}) < len(listed) + len(posed):
+            raise ValueError("a camera or an image is listed twice")
+    except ValueError as error:
+        raise ValueError(
+            f"the COLMAP model {model} (cameras.{suffix}, images.{suffix}) cannot be read: "
+            f"{name_shown(str(error))}; export it again, or copy it again"
+        ) from error
+    folder = _project(model)
+    photos = image_folder(folder, None)
+    frames = list[PhotoFrame]()
+    for name, pose, number in posed:
+        inside = name if photos == folder else f"{photos.name}/{name}"
+        camera = cameras.get(number) or _faulty(f"there is no camera {number}")
+        frames.append(PhotoFrame(inside, folder / inside, _c2w(*pose), **camera))
+    return Listing(model, sorted(frames, key=lambda frame: frame.name), folder)
+
+
+def _project(model: UPath) -> UPath:
+    """Return the folder whose photos a model is of: that of its `sparse`, or its own."""
+    places = (model, model.parent)
+    sparse = next((place for place in places if place.absolute().name == "sparse"), None)
+    if sparse is None or image_files(model):
+        return model
+    return sparse.parent.parent if sparse.parent.name == "colmap" else sparse.parent
+
+
+def _has_photos(folder: UPath) -> bool:
+    return image_folder(folder, None) != folder or bool(image_files(folder))
 
 
 def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
-    """Yield the models in `folder` and the suffix of their files, in the order of preference."""
-    for place in _PLACES:
-        # binary keeps all digits of a pose
-        for suffix in ("bin", "txt"):
-            files = (folder / place / f"{name}.{suffix}" for name in ("cameras", "images"))
-            if all(file.is_file() for file in files):
-                yield folder / place, suffix
+    """Yield the models in `folder` and the suffix of their files."""
+    for pattern in (*_PLACES, "*") if folder.name == "sparse" else _PLACES:
+        places = [folder]
+        for part in pattern.split("/"):
+            inside = (sorted(listing(p), key=str) if part == "*" else [p / part] for p in places)
+            places = [*chain.from_iterable(inside)]
+        for place in places:
+            held = {item.name for item in listing(place)}
+            # binary keeps all digits of a pose
+            for suffix in ("bin", "txt"):
+                if {f"cameras.{suffix}", f"images.{suffix}"} <= held:
+                    yield place, suffix
+                    break
 
 
-Camera: TypeAlias = tuple[int, tuple[str, int, int, Sequence[float]]]
+Camera: TypeAlias = tuple[int, tuple[str, float, float, Sequence[float]]]
 """Number of the camera; name of its camera model, width and height in pixels, parameters."""
 Image: TypeAlias = tuple[str, list[float], int]
 """Name, world-to-camera as quaternion (w, x, y, z) and translation (x, y, z), camera's number."""
@@ -116,39 +150,51 @@ Image: TypeAlias = tuple[str, list[float], int]
 def _text_cameras(model: UPath) -> Iterator[Camera]:
     for line in _lines(model / "cameras.txt"):
         number, name, width, height, *parameters = line.split()
-        if "_" in "".join([number, width, height, *parameters]):  # Python reads 1_000 as a number
-            raise ValueError(f"cameras.txt has a number with an underscore in {line[:60]!r}")
-        yield int(number), (name, int(width), int(height), [*map(float, parameters)])
+        yield int(number), (name, _number(width), _number(height), [*map(_number, parameters)])
 
 
 def _text_images(model: UPath) -> Iterator[Image]:
-    for line in _lines(model / "images.txt", points=True):
+    lines = [*_lines(model / "images.txt")]
+    posed = [line for line in lines if not _is_points(line)]
+    if 1 < len(posed) == len(lines):
+        warn_once(f"{model / 'images.txt'} has no points: {len(posed)} lines are read as poses")
+    for line in posed:
         number, *fields = line.split(maxsplit=9)
-        if len(fields) != 9 or not number.isdecimal() or "_" in "".join(fields[:8]):
-            raise ValueError(f"images.txt has {line[:60]!r}, expected 9 numbers and a name")
-        yield fields[8], [*map(float, fields[:7])], int(fields[7])
+        if len(fields) != 9 or not number.isdecimal() or not fields[7].isdecimal():
+            raise ValueError(f"images.txt has {line[:60]!r} expected 9 numbers and a name")
+        yield fields[8], [*map(_number, fields[:7])], int(fields[7])
 
 
-def _lines(file: UPath, points: bool = False) -> Iterator[str]:
-    """Yield the lines of a file without comments.
+def _is_points(line: str) -> bool:
+    """Return whether a line of images.txt has x, y and number of each point, and no name."""
+    words = line.split()
+    # the first points and the last: there are thousands
+    return len(words) % 3 == 0 and not np.isnan([*map(_number, words[:12] + words[-1:])]).any()
 
-    points: skip the line after each, which lists points. Raises ValueError if it is missing.
-    """
-    with io.TextIOWrapper(open_file(file), encoding="utf-8") as lines:
+
+def _number(word: str) -> float:
+    """Return a number as text; NaN for what is none, such as -nan(ind) of Windows."""
+    # Python reads 1_000
+    with suppress(ValueError):
+        return float(word.replace("_", "?"))
+    return math.nan
+
+
+def _lines(file: UPath) -> Iterator[str]:
+    """Yield the lines of a file that have content but no comment."""
+    with io.TextIOWrapper(open_file(file), encoding="utf-8-sig") as lines:
         for line in lines:
             if (line := line.strip()) and not line.startswith("#"):
                 yield line
-                if points and len(next(lines, "").split()) % 3:  # x, y, number of each point
-                    raise ValueError(f"{file.name} has no line of points after {line[:60]!r}")
 
 
 def _binary_cameras(model: UPath) -> Iterator[Camera]:
     with open_file(model / "cameras.bin") as file:
         for _ in range(_unpacked("<Q", file)[0]):
             number, kind, width, height = _unpacked("<IiQQ", file)
-            name = _NAMES.get(kind, f"number {kind}")
-            parameters = _unpacked(f"<{len(_parameters(name))}d", file)
-            yield number, (name, width, height, parameters)
+            name = model_name(kind)
+            values = _unpacked(f"<{len(parameters(name))}d", file)
+            yield number, (name, width, height, values)
         if file.read(1):
             raise ValueError(_LONGER)
 
@@ -176,26 +222,27 @@ def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
     return struct.unpack(format, content)
 
 
-def _parameters(model: str) -> list[str]:
-    """Return the names of a camera model's parameters. Raises ValueError for an unknown model."""
-    if model not in _MODELS:
-        known = ", ".join(_MODELS)
-        fix = f"undistort the photos with `colmap image_undistorter`, or use one of {known}"
-        raise ValueError(f"the camera model {model} is not known: {fix}")
-    return _MODELS[model][1].split()
-
-
-def _camera(model: str, width: int, height: int, parameters: Sequence[float]) -> dict[str, Any]:
-    """Return the fields of a `PhotoFrame` that follow from its camera, by name."""
-    values = dict(zip(_parameters(model), parameters, strict=True))
+def _camera(model: str, width: float, height: float, values: Sequence[float]) -> dict[str, Any]:
+    """Return the fields of a `PhotoFrame` that the camera took."""
     size, problems = listed_size(height, width)
-    focal = values.pop("f", math.nan)  # simple models have one for both axes
-    fx = values.pop("fx", focal)
-    fy = values.pop("fy", focal)
-    intrinsics = fx, fy, values.pop("cx"), values.pop("cy")
-    kind = _MODELS[model][2]
-    lens = bending(kind(**values)) if kind else None
+    try:
+        if not np.isfinite(values).all():
+            raise ValueError("it has numbers that are none")
+        named = dict(zip(parameters(model), values, strict=True))
+        # simple models have one focal length for both axes
+        focal = [named.pop(key) for key in FOCAL if key in named]
+        intrinsics = (*(focal[:1] + focal[-1:]), named.pop("cx"), named.pop("cy"))
+        lens = bending(model, named)
+    except (ValueError, KeyError):
+        numbers = f"{len(values)} numbers: {' '.join(map(str, values))[:80]}"
+        return _faulty(f"the camera is not one that COLMAP knows, {model} of {numbers}")
     return {"size": size, "problems": problems, "intrinsics": intrinsics, "lens": lens}
+
+
+def _faulty(reason: str) -> dict[str, Any]:
+    """Return the fields of a photo that no camera is known of."""
+    fix = "export the model again, or undistort the photos with `colmap image_undistorter`"
+    return {"intrinsics": (math.nan,) * 4, "problems": (FrameProblem(reason, fix),)}
 
 
 def _c2w(*cam_from_world: float) -> np.ndarray:
@@ -205,8 +252,9 @@ def _c2w(*cam_from_world: float) -> np.ndarray:
     within 0.1.
     """
     quaternion, translation = torch.tensor(cam_from_world, dtype=torch.float64).split([4, 3])
-    if abs(float(quaternion.norm()) - 1) > 0.1:
-        raise ValueError(f"the quaternion {[*cam_from_world[:4]]} of an image must have length 1")
+    # not a rotation: NaN is told with the frame
+    if not abs(float(quaternion.norm()) - 1) <= 0.1:
+        return np.full((4, 4), math.nan)
     rotation = quat_to_matrix(quaternion / quaternion.norm()).T
     c2w = torch.eye(4, dtype=torch.float64)
     c2w[:3, :3] = rotation

@@ -1,39 +1,58 @@
 """Model the distortion of lenses, and undistort photos."""
 
+import importlib
 import math
-from abc import abstractmethod
+import signal
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Self
+from functools import cache, lru_cache
+from typing import Any, Self
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.data.photos.nerfstudio import PINHOLE
 from qgs.data.photos.reader import Intrinsics, Lens, Size
 
+FOCAL = ("f", "fx", "fy")
+"""Parameters of a camera model that are focal lengths."""
 MOST_ZOOM = 2.0
 # Rows that are undistorted at once: photos of phones would take gigabytes.
 _ROWS = 64
 
 
+@dataclass(frozen=True)
 class BendingLens(Lens):
-    """A lens with distortion: a map of the plane z = 1 in front of the camera.
+    """Any of COLMAP's lenses that bend rays, by pycolmap; OpenCV's are among them.
 
-    It maps the point in which a pinhole camera sees a ray to the point in which this lens sees it.
+    parameters: as COLMAP orders them, with focal lengths of 1 and the principal point at 0. turns:
+    clockwise quarters from its camera to this one.
     """
 
-    @abstractmethod
+    model: str
+    parameters: tuple[float, ...]
+    turns: int = 0
+
     def distorted(self, points: Tensor) -> Tensor:
-        """Map undistorted points (..., 2) in the plane z = 1 to distorted ones."""
+        """Return where the lens puts points (..., 2) of the plane z = 1 on its own."""
+        camera = _pycolmap().Camera(model=self.model, width=1, height=1, params=self.parameters)
+        # a quarter clockwise makes (-y, x) of (x, y)
+        plane = torch.view_as_complex(points.double().contiguous()).numpy() * (-1j) ** self.turns
+        flat = plane.ravel()
+        bent = camera.img_from_cam(np.stack([flat.real, flat.imag, np.ones(len(flat))], -1))
+        turned = (bent @ [1, 1j]).reshape(plane.shape) * 1j**self.turns
+        return torch.view_as_real(torch.from_numpy(turned)).to(points)
 
-    @abstractmethod
     def sees(self, points: Tensor) -> Tensor:
-        """Return whether undistorted points (..., 2) are in the photo's valid range.
+        """Return whether points (..., 2) lie before where the function turns back."""
+        return points.norm(dim=-1) < _reach(self)
 
-        Beyond it, the distorted radius decreases, and the map would show the photo again.
-        """
+    def turned(self) -> Self:
+        """See `Lens`."""
+        return replace(self, turns=self.turns + 1)
 
     def undistorted(
         self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
@@ -65,81 +84,53 @@ class BendingLens(Lens):
         return _whole_zoom(intrinsics, self, size, target)
 
 
-@dataclass(frozen=True)
-class RadialTangential(BendingLens):
-    """OpenCV's radial-tangential distortion (Brown, 1966).
+def bending(model: str, coefficients: Mapping[str, float]) -> BendingLens | None:
+    """Return the lens of a camera model of COLMAP; None where it is a pinhole.
 
-    Covers COLMAP's camera models SIMPLE_RADIAL, RADIAL and OPENCV.
+    coefficients: by COLMAP's names; others are 0. Raises ValueError for an unknown model.
     """
-
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
-
-    def distorted(self, points: Tensor) -> Tensor:
-        """See `BendingLens`."""
-        # kornia's distort_points takes half as long again, and this is most of undistorting.
-        x, y = points.unbind(-1)
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        u = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
-        v = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
-        return torch.stack([u, v], -1)
-
-    def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) lie where the radial polynomial still grows."""
-        return (points * points).sum(-1) < _turn(self.k1, self.k2, self.k3)
-
-    def turned(self) -> Self:
-        """See `Lens`."""
-        # (p2, p1) is a vector in the image.
-        return replace(self, p1=self.p2, p2=-self.p1)
+    names = parameters(model)
+    if model in PINHOLE and not any(coefficients.values()):
+        return None
+    if "cx" not in names:
+        raise ValueError(f"the camera model {model} is no lens, but a panorama")
+    ideal = dict.fromkeys(FOCAL, 1.0) | dict(coefficients)
+    return BendingLens(model, tuple(ideal.get(name, 0.0) for name in names))
 
 
-@dataclass(frozen=True)
-class Fisheye(BendingLens):
-    """OpenCV's fisheye distortion (Kannala and Brandt, 2006); equidistant if all are 0."""
-
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-
-    def distorted(self, points: Tensor) -> Tensor:
-        """See `BendingLens`."""
-        radius = points.norm(dim=-1, keepdim=True)
-        theta = radius.atan()
-        t2 = theta * theta
-        bent = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
-        return points * torch.where(radius > 0, bent / radius, 1.0)
-
-    def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) lie where the polynomial in the angle still grows."""
-        return points.norm(dim=-1).atan().square() < _turn(self.k1, self.k2, self.k3, self.k4)
-
-    def turned(self) -> Self:
-        """See `Lens`. The distortion has rotational symmetry, so the lens does not change."""
-        return self
+def parameters(model: str) -> list[str]:
+    """Return the names of a camera model's parameters. Raises ValueError for an unknown model."""
+    try:
+        return _pycolmap().Camera(model=model).params_info.split(", ")
+    except RuntimeError as error:
+        raise ValueError(f"the camera model {model} is not known") from error
 
 
-def bending(lens: BendingLens) -> BendingLens | None:
-    """Return `lens`, or None if it has no distortion."""
-    return lens if isinstance(lens, Fisheye) or any(vars(lens).values()) else None
+def model_name(number: int) -> str:
+    """Return the name of the camera model that has this number in binary files of COLMAP."""
+    return _pycolmap().CameraModelId(number).name
 
 
-def _turn(*coefficients: float) -> float:
-    """Return r^2 for the least radius r at which r (1 + k1 r^2 + k2 r^4 + ...) stops growing.
+@cache
+def _pycolmap() -> Any:
+    # it takes a while to load, and most photos are of pinholes
+    handler = signal.getsignal(signal.SIGTERM)
+    module = importlib.import_module("pycolmap")
+    # its own prints a trace, and ends a training that would be kept; threads cannot set one
+    with suppress(ValueError):
+        signal.signal(signal.SIGTERM, handler)
+    return module
 
-    coefficients: k1, k2, ... Returns infinity if it always grows. Beyond this radius the polynomial
-    would show the photo again, mirrored.
+
+@lru_cache(maxsize=4096)
+def _reach(lens: BendingLens) -> float:
+    """Return the distance from the middle up to which `lens` shows what is farther out farther out.
+
+    Behind it, it shows the same again, mirrored. inf for none up to 84 degrees.
     """
-    slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(coefficients))]
-    # Numerical roots of a real polynomial have small imaginary parts.
-    roots = np.roots(slope[::-1])
-    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    return float(real.min()) if len(real) else math.inf
+    radii = torch.linspace(0, 10, 20_001).double()
+    rising = lens.distorted(torch.stack([radii, torch.zeros_like(radii)], -1))[:, 0].diff() > 0
+    return math.inf if rising.all() else float(radii[rising.logical_not().nonzero()[0, 0]])
 
 
 def _in_photo(

@@ -99,6 +99,18 @@ def check(
     return CheckReport(scenes=scenes, general=general, notes=notes)
 
 
+def faults_of_poses(path: UPath, scene: str | None, most_photos: int) -> list[Finding]:
+    """Return errors of one scene's cameras, judged by `most_photos` photos, in seconds.
+
+    scene: its name, where `path` holds several. Raises as `check`.
+    """
+    options = Options(headers_only=True)
+    for item in _items(path, options):
+        if isinstance(item, Candidate) and scene in (None, item.name):
+            return errors_of(check_scene(item, options, most_photos).findings)
+    return []
+
+
 def _refuse_unknown(format: str) -> None:
     of_plugins = [kind for kind in sources(format) if kind.partition("/")[0] not in OF_FILES]
     known = ["auto", *readers(), "dl3dv", "chunks", *of_plugins]

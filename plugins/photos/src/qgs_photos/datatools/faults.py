@@ -18,8 +18,6 @@ from qgs_photos.datatools.photos import DecodedScene
 
 # Of a rotation's entries.
 _SAME = 2e-6
-# Of coordinates that were float32 before they were written.
-_FLOAT32 = 5e-7
 # Of the cameras' extent: the largest distance that counts as none.
 _OF_EXTENT = 1e-4
 
@@ -71,14 +69,12 @@ def sharing_findings(scene: DecodedScene, usable: Sequence[int]) -> Iterator[Fin
     poses = np.stack([scene.photos[frame].listed.c2w for frame in usable])
     centres = poses[:, :3, 3]
     extent = np.ptp(centres, axis=0).max()
-    # far from the origin, as on maps, float32 cannot tell centres apart
-    rounding = _FLOAT32 * np.abs(centres).max()
-    if extent <= rounding:
+    if not extent:
         reason = f"all {len(usable)} cameras stand on one point, so that depth is undetermined"
         yield scene.finding(usable, reason, "export the poses with their translations")
         return
     told = set[int]()
-    for pair in sorted(KDTree(centres).query_pairs(min(rounding, _OF_EXTENT * extent))):
+    for pair in sorted(KDTree(centres).query_pairs(_OF_EXTENT * extent)):
         first, frame = (usable[place] for place in pair)
         if frame in told:
             continue

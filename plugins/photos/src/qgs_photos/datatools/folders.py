@@ -8,7 +8,7 @@ from upath import UPath
 
 from qgs.data.images import decode_alpha, decode_depth, decode_mask, read_image
 from qgs.data.photos import formats_of, read_listing
-from qgs.data.photos.reader import PhotoFrame, existing, refuse_outside
+from qgs.data.photos.reader import PhotoFrame
 from qgs.data.photos.source import folder_name, upright
 from qgs.paths import read_file
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
@@ -64,15 +64,13 @@ def _archived_photos(place: UPath, images: str | None) -> list[Photo]:
 
 def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
     listing = read_listing(folder, kind, images)
-    refuse_outside(folder, listing)
     frames = [*map(upright, listing.frames)]
-    there = existing(frame.path for frame in frames if frame.name)
     return [
         Photo(
             listed=frame,
             read=partial(read_file, frame.path),
             maps={"mask": partial(_mask, frame), "depth map": partial(_depth, frame)},
-            exists=frame.path in there,
+            exists=frame.path in listing.present,
         )
         for frame in frames
     ]

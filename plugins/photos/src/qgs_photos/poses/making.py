@@ -31,6 +31,7 @@ from qgs_photos.poses.photos import (
     Show,
     camera_groups,
     left_out_formats,
+    names_of,
     photo_files,
     prepare,
 )
@@ -95,8 +96,9 @@ def fingerprint(source: Path) -> dict[str, Any]:
     Poses belong to a source as long as its fingerprint stays the same.
     """
     files = [source] if source.is_file() else photo_files(source)
-    stats = {file.name: file.stat() for file in files}
-    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
+    stats = [file.stat() for file in files]
+    times = ([stat.st_size, stat.st_mtime_ns] for stat in stats)
+    return dict(zip(names_of(files), times, strict=True))
 
 
 def make_poses(source: Path, out: Path, options: Options, console: Console) -> Poses:

@@ -7,6 +7,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -50,18 +51,29 @@ class Photo:
 
 
 def photo_files(folder: Path) -> list[Path]:
-    """Return the photos in `folder`, or in its subfolder images/, sorted so that 2 precedes 10.
+    """Return the photos in `folder`, else in its images/, else in all of its subfolders.
+
+    They are sorted so that 2 precedes 10.
 
     Raises PosesError for fewer than LEAST photos.
     """
     found = next((f for f in (folder, folder / "images") if image_files(UPath(f))), folder)
-    files = [Path(str(file)) for file in image_files(UPath(found)) if file.is_file()]
+    inside = sorted(item for item in found.iterdir() if item.is_dir() and item.name[0] != ".")
+    own = image_files(UPath(found)) and [found]
+    listings = (image_files(UPath(place)) for place in own or inside)
+    files = [Path(str(file)) for file in chain.from_iterable(listings) if file.is_file()]
     if len(files) >= LEAST:
-        return sorted(files, key=lambda file: _by_number(file.name))
+        return sorted(files, key=lambda file: _by_number(str(file)))
     text = f"{found} holds {counted(len(files), 'photo')}, but poses need at least {LEAST}"
     if foreign := left_out_formats(found):
         raise PosesError(f"{text}; {listed(foreign, 3)} cannot be read: convert them to JPEG")
     raise PosesError(f"{text}: take more photos, from different positions")
+
+
+def names_of(files: Sequence[Path]) -> list[str]:
+    """Return the names of files, with their folders where these differ."""
+    top = os.path.commonpath([file.parent for file in files])
+    return [file.relative_to(top).as_posix() for file in files]
 
 
 def _by_number(name: str) -> tuple[str, str]:
@@ -92,11 +104,11 @@ def prepare(
     """
     ready = list[Photo]()
     faulty = dict[str, str]()
-    names = [file.name for file in files]
+    names = names_of(files)
     # IMG 10 comes before IMG 2 as text
     if names != sorted(names):
         digits = len(str(len(names)))
-        names = [f"{number:0{digits}}_{name}" for number, name in enumerate(names)]
+        names = [f"{n:0{digits}}_{name.replace('/', '_')}" for n, name in enumerate(names)]
     for number, (file, name) in enumerate(zip(files, names, strict=True)):
         try:
             ready.append(_prepared(file, name, kept, working, side))
@@ -104,7 +116,7 @@ def prepare(
             # a number of the system's: it is the disk that is at fault, not the photo
             if isinstance(error, OSError) and error.errno is not None:
                 raise
-            faulty[file.name] = str(error)
+            faulty[name] = str(error)
         progress("photos", number + 1, len(files))
     return ready, faulty
 
@@ -122,6 +134,8 @@ def _prepared(file: Path, name: str, kept: Path, working: Path, side: int) -> Ph
         exif, camera = _exif(image)
     rgb = eight_bits(upright).convert("RGB")
     name = name if stays else f"{name}.png"
+    for folder in (kept, working):
+        (folder / name).parent.mkdir(exist_ok=True)
     if plain and not turned:
         _link(file, kept / name)
     else:
