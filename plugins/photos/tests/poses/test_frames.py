@@ -82,6 +82,21 @@ def test_a_turned_phone_gives_upright_frames(tmp_path):
         assert np.abs(np.array(found, float) - np.array(expected, float)).mean() < 4
 
 
+@pytest.mark.parametrize("name", ["hlg.mov", pytest.param("pq.mov", marks=pytest.mark.slow)])
+def test_hdr_videos_look_as_others(tmp_path, name):
+    shown = []
+    for video in ("bt709.mp4", name):
+        extract(Path(__file__).parent / "videos" / video, tmp_path, 3)
+        shown.append(np.array(Image.open(tmp_path / "00000.jpg"), float))
+    assert np.abs(shown[1] - shown[0]).mean() < 4
+
+
+def test_pixels_of_a_video_become_square(tmp_path):
+    images = numbered_images(6)
+    extract(write_video(tmp_path / "a.mp4", images, **{"x264-params": "sar=3/2"}), tmp_path, 3)
+    assert Image.open(tmp_path / "00000.jpg").size == (192, 96)
+
+
 def test_a_broken_tail_costs_its_frames(tmp_path):
     video = cut(write_video(tmp_path / "a.mkv", numbered_images(55), g="5"), 0.6)
     remarks = extract(video, tmp_path, 12)

@@ -1,6 +1,5 @@
 """Render videos of Gaussians along a camera path, as mp4 or WebP."""
 
-import json
 import math
 from collections.abc import Iterator
 from fractions import Fraction
@@ -183,7 +182,8 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
         )
     if photos is None:
         raise ValueError(f"{file} holds no cameras: name the photos, `qgs video {source} PHOTOS`")
-    renderer = AutoRenderer(_scene_options(file.parent))
+    # as viewers show files of Gaussians
+    renderer = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0)))
     cameras = photo_scene(photos, None, name).cameras
     return _in_own_world(load_ply(file), cameras, renderer)
 
@@ -208,15 +208,3 @@ def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
     depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
     ahead = depths[depths > 0]
     return ahead.median() if ahead.numel() else torch.ones((), dtype=torch.float64)
-
-
-def _scene_options(folder: Path) -> AutoRenderer.Config:
-    """Return renderer options with the background in `folder`/metrics.json of `qgs scene`.
-
-    Without this file, return the default options.
-    """
-    try:
-        given = json.loads((folder / "metrics.json").read_bytes())["background"]
-        return AutoRenderer.Config.model_validate({"background": tuple(given)})
-    except (OSError, ValueError, KeyError, TypeError):
-        return AutoRenderer.Config()

@@ -9,6 +9,7 @@ from typing import Any
 import av
 import numpy as np
 from av.error import FFmpegError
+from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
 from PIL import Image
 
 from qgs.wording import counted
@@ -26,6 +27,8 @@ _JUDGED = 8
 _SIDE = 640
 # Height and width of the pictures that motion is measured by.
 _THUMB = (48, 64)
+# Keeps its table of colours, which takes a second, from frame to frame.
+_REFORMATTER = VideoReformatter()
 _WINDOW = np.outer(np.hanning(_THUMB[0]), np.hanning(_THUMB[1]))
 
 
@@ -44,7 +47,7 @@ def extract(
     seconds done, and the seconds of the video. Raises PosesError for a file that is not a video or
     has fewer than LEAST frames.
     """
-    times, damaged = _times(video)
+    times, aspect, damaged = _times(video)
     if len(times) < LEAST:
         raise PosesError(
             f"{video} has {counted(len(times), 'frame')} that can be read, but poses need at least "
@@ -70,13 +73,13 @@ def extract(
             continue
         # a frame is written once its interval is over: large ones take long
         if best and path not in scores:
-            _write(*best)
+            _write(*best, aspect)
         score = _sharpness(frame)
         if score > scores.get(path, -1.0):
             scores[path] = score
             best = (frame, path)
     if best:
-        _write(*best)
+        _write(*best, aspect)
     if len(scores) < LEAST:
         raise PosesError(
             f"{video} has {counted(len(scores), 'frame')} that can be decoded, but poses need at "
@@ -170,15 +173,16 @@ def _opened(video: Path) -> Any:
     return container
 
 
-def _times(video: Path) -> tuple[list[Fraction], bool]:
-    """Return the times of all frames, ascending, in seconds, and whether the file is damaged.
+def _times(video: Path) -> tuple[list[Fraction], float, bool]:
+    """Return the times of all frames in seconds, ascending, a pixel's aspect, and if it is damaged.
 
-    Packets are read, but not decoded.
+    The aspect is the width of a pixel over its height. Packets are read, but not decoded.
     """
     times = list[Fraction]()
     broken = False
     with _opened(video) as container:
         stream = container.streams.video[0]
+        aspect = float(stream.sample_aspect_ratio or 1)
         try:
             for packet in container.demux(stream):
                 if packet.pts is not None:
@@ -186,7 +190,7 @@ def _times(video: Path) -> tuple[list[Fraction], bool]:
                 broken |= packet.is_corrupt
         except FFmpegError:
             broken = True
-    return sorted(times), broken
+    return sorted(times), aspect, broken
 
 
 def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
@@ -223,9 +227,21 @@ def _grey(frame: Any, size: tuple[int, int]) -> np.ndarray:
     return grey.astype(np.float32)
 
 
-def _write(frame: Any, path: Path) -> None:
-    """Write a frame as JPEG, turned upright as the video's metadata says."""
+def _write(frame: Any, path: Path, aspect: float) -> None:
+    """Write a frame as JPEG with square pixels, turned upright as the video's metadata says.
+
+    aspect: width of a stored pixel over its height. HDR colours (HLG, PQ) become sRGB.
+    """
+    if frame.color_primaries == ColorPrimaries.BT2020:
+        frame = _REFORMATTER.reformat(
+            frame,
+            format="rgb24",
+            dst_color_primaries=ColorPrimaries.BT709,
+            dst_color_trc=ColorTrc.IEC61966_2_1,
+        )
     image = Image.fromarray(frame.to_ndarray(format="rgb24"))
+    if aspect != 1:
+        image = image.resize((round(aspect * image.width), image.height))
     # both count counterclockwise, in degrees
     if turn := round(frame.rotation / 90) % 4 * 90:
         image = image.rotate(turn, expand=True)
