@@ -16,6 +16,7 @@ from qgs_photos.refine.growth import FreeGaussians
 from qgs_photos.refine.refining import Extras, resized
 from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
+from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
 from tables import must_refuse
 from textured_room import INTRINSICS, SIZE, walk
@@ -245,15 +246,30 @@ def test_harmonics_grow_with_time():
     assert watched(given, 5) == given.sh.shape
 
 
-def test_what_masks_leave_out_is_background():
+def test_what_masks_leave_out_is_black():
     views = photos(2)
     masks = torch.zeros(1, 2, 1, 24, 24)
     masks[..., :12] = 1
-    background = torch.tensor([0.1, 0.2, 0.3])
-    found = masked(replace(views, masks=masks), background.tolist()).images
+    found = masked(replace(views, masks=masks)).images
     assert torch.equal(found[..., :12], views.images[..., :12])
-    assert torch.allclose(found[..., 12:], background[:, None, None])
-    must_refuse("--masks", masked, views, background.tolist())
+    assert not found[..., 12:].any()
+    must_refuse("--masks", masked, views)
+
+
+def test_surroundings_hide_what_is_behind_them():
+    views = photos(2)
+    color = edge_color(views)
+    found = surrounded(coloured(), views, color)
+    assert torch.equal(found.means[:, :60], cloud(60).means)
+    black, white = (
+        AutoRenderer(AutoRenderer.Config(background=(b, b, b), far=1e4))(found, views.cameras)
+        for b in (0, 1)
+    )
+    assert black.alpha.min() > 0.99
+    assert torch.allclose(black.rgb, white.rgb, 0, 0.01)
+    empty = surrounded(replace(cloud(60), opacities=torch.zeros(1, 60)), views, color)
+    seen = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0), far=1e4))(empty, views.cameras)
+    assert torch.allclose(seen.rgb[0, 0, :, 12, 12], torch.tensor(color), 0, 0.01)
 
 
 def coloured():

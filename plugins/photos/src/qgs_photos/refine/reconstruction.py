@@ -18,6 +18,7 @@ from qgs.types import Views
 from qgs.wording import listed
 from qgs_photos.record import Record, has_record, read_record
 from qgs_photos.refine.refining import RefinedScene, refine
+from qgs_photos.refine.surroundings import edge_color, surrounded
 
 # JSON keeps float32 poses whole; photos whose poses were made again differ by far more.
 _SAME_POSE = 1e-3
@@ -119,12 +120,15 @@ def refine_reconstruction(
     )
     photos = every.select(slice(len(frames)))
     compared = every.select(slice(len(frames), None))
+    color = edge_color(photos)
+    renderer = start.model.renderer
+    options = renderer.config.model_copy(update={"background": color})
     refined = refine(
         start.gaussians,
         photos,
         seconds,
         count=count,
-        renderer=start.model.renderer,
+        renderer=type(renderer)(options),
         console=console,
     )
     _tell(start, refined, photos, console)
@@ -143,7 +147,8 @@ def refine_reconstruction(
         "photos": [scene.frame_name(frame) for frame in frames],
         "stopped_by": refined.stopped_by,
     }
-    found = reconstruct_sample(start.model, sample, seen, refined.gaussians)
+    whole = surrounded(refined.gaussians, photos, color)
+    found = reconstruct_sample(start.model, sample, seen, whole)
     worse = found.worse_than_nearest
     remarks = [worse] if worse else []
     return replace(found, tuning=start.tuning, refinement=record, remarks=remarks)

@@ -271,12 +271,17 @@ def partly_swept(
     kept = gaussians.most_opaque(count - new)
     if not new:
         return kept
-    others = swept(views, new, distance(gaussians, views), generator)
+    return joined(kept, swept(views, new, distance(gaussians, views), generator))
+
+
+def joined(gaussians: Gaussians, others: Gaussians) -> Gaussians:
+    """Return all Gaussians (1, G); the others get zeros as harmonics and features if missing."""
     for name in ("sh", "features"):
-        given = getattr(kept, name)
+        given = getattr(gaussians, name)
         if given is not None:
-            others = replace(others, **{name: given.new_zeros(1, new, *given.shape[2:])})
-    return concatenated([kept, others], 1)
+            zeros = given.new_zeros(1, others.count, *given.shape[2:])
+            others = replace(others, **{name: zeros})
+    return concatenated([gaussians, others], 1)
 
 
 def distance(gaussians: Gaussians, views: Views) -> float:

@@ -17,12 +17,13 @@ from qgs.drawing.images import rgb_picture
 from qgs.extensions import INSTALL_ALL
 from qgs.files import replacing_entries, write_text
 from qgs.geometry.harmonics import seen_colors
+from qgs.geometry.poses import scaled
 from qgs.geometry.transforms import moved, to_camera, to_pixels
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
-from qgs.reconstruction.scene_formats import save_ply, save_splat
+from qgs.reconstruction.scene_formats import load_ply, save_ply, save_splat
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Cameras, Gaussians, Rendering, Views
 from qgs_photos.printing import say
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
@@ -31,7 +32,9 @@ from qgs_photos.refine.scene_photos import ScenePhotos
 _SHOWN = 6
 # Photos on the page.
 _ON_PAGE = 12
-_SCORES = ("psnr", "ssim", "nearest_input")
+_SCORES = ("psnr", "ssim", "alpha", "nearest_input")
+# As viewers show a file of Gaussians: over black, however far they are.
+_RENDERER = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0), far=1e4))
 
 PageWriter = Callable[[Gaussians, Views, tuple[float, float, float]], str]
 
@@ -48,7 +51,6 @@ class Result:
     command: str
     world: tuple[Tensor, Tensor]
     refined: RefinedScene
-    renderer: AutoRenderer
     photos: ScenePhotos
     views: Views
     judged: Views
@@ -58,14 +60,21 @@ class Result:
         reference, scale = self.world
         return moved(gaussians, reference, 1 / float(scale))
 
+    def read_back(self, file: Path) -> "Result":
+        """Return the result with the Gaussians that `file` holds, so that the file is scored."""
+        reference, scale = self.world
+        pose = scaled(torch.linalg.inv(reference.double()), scale)
+        gaussians = moved(load_ply(file).to(reference.device), pose, float(scale))
+        return replace(self, refined=replace(self.refined, gaussians=gaussians))
+
     def photo(self, frame: int) -> str:
         """Return the file name of the photo with index `frame`."""
         return self.photos.small.frame_name(frame)
 
-    def render(self, views: Views) -> Tensor:
-        """Render the scene from the cameras of `views` (1, V): RGB (1, V, 3, H, W)."""
+    def render(self, views: Views) -> Rendering:
+        """Render the scene from the cameras of `views` (1, V)."""
         gaussians = replace(self.refined.gaussians, features=None)
-        return self.renderer(gaussians, views.cameras).rgb
+        return _RENDERER(gaussians, views.cameras)
 
 
 @torch.no_grad()
@@ -80,11 +89,12 @@ def write_scene(
     refined = result.refined
     # neither .splat files nor the page show harmonics
     shown = plain(refined.gaussians, refined.cameras)
-    record = scores(result)
     # all files or none: a scene without its scores is none
     with replacing_entries(out, "scene.ply") as fresh:
         save_ply(result.in_photos_world(refined.gaussians), fresh / "scene.ply")
         save_splat(result.in_photos_world(shown), fresh / "scene.splat")
+        result = result.read_back(fresh / "scene.ply")
+        record = scores(result)
         if result.photos.held_out:
             picture = held_out_picture(result, record["held_out"])
             images.write_png(picture, fresh / "held_out.png")
@@ -92,7 +102,7 @@ def write_scene(
             views = replace(result.views, cameras=refined.cameras)
             every = max(len(result.photos.frames) // _ON_PAGE, 1)
             few = views.select(slice(None, None, every))
-            write_text(fresh / "index.html", page(shown, few, result.renderer.config.background))
+            write_text(fresh / "index.html", page(shown, few, (0, 0, 0)))
         record["total_seconds"] = round(perf_counter() - began, 1)
         write_text(fresh / "metrics.json", json.dumps(record, indent=1))
         names = sorted(entry.name for entry in fresh.iterdir())
@@ -106,8 +116,15 @@ def write_scene(
         say(
             console,
             f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
-            f"{mean['ssim']:.3f}; a copy of the nearest photo: PSNR {mean['nearest_input']:.2f} dB",
+            f"{mean['ssim']:.3f}, alpha {mean['alpha']:.3f}; a copy of the nearest photo: PSNR "
+            f"{mean['nearest_input']:.2f} dB",
         )
+        if mean["psnr"] < mean["nearest_input"]:
+            say(
+                console,
+                "the scene is worse than the nearest photo: the poses are wrong, or the time is "
+                "too short; run `qgs data check` on the photos",
+            )
     for name in names:
         say(console, f"wrote {out / name}")
 
@@ -118,15 +135,16 @@ def scores(result: Result) -> dict[str, Any]:
     rows = list[dict[str, Any]]()
     for place, frame in enumerate(result.photos.held_out):
         photo = result.judged.select([place])
-        rgb = result.render(photo)
+        rendering = result.render(photo)
         # what no optimisation is needed for
         nearest = nearest_input(result.views, photo.cameras)
         rows.append(
             {
                 "frame": frame,
                 "photo": result.photo(frame),
-                "psnr": float(psnr(rgb, photo.images).mean()),
-                "ssim": float(ssim(rgb, photo.images).mean()),
+                "psnr": float(psnr(rendering.rgb, photo.images).mean()),
+                "ssim": float(ssim(rendering.rgb, photo.images).mean()),
+                "alpha": float(rendering.alpha.mean()),
                 "nearest_input": float(psnr(nearest, photo.images).mean()),
             }
         )
@@ -134,7 +152,6 @@ def scores(result: Result) -> dict[str, Any]:
     return {
         "command": result.command,
         "gaussians": refined.gaussians.count,
-        "background": list(result.renderer.config.background),
         "steps": refined.steps,
         "seconds": round(refined.seconds, 1),
         "stopped_by": refined.stopped_by,
@@ -153,7 +170,7 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
     views = result.judged.select(slice(None, None, every))
     pictures = {
         "photo": [rgb_picture(image) for image in views.images[0]],
-        "render": [rgb_picture(image) for image in result.render(views)[0]],
+        "render": [rgb_picture(image) for image in result.render(views).rgb[0]],
     }
     titles = [f"{Path(row['photo']).name}\n{row['psnr']:.2f} dB" for row in rows[::every]]
     return figure_picture(grid_figure(pictures, titles), 120)

@@ -1,6 +1,5 @@
 """Run `qgs scene`: make the files of the best scene from photos in a given time."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -8,16 +7,18 @@ from time import perf_counter
 import torch
 from rich.console import Console
 
-from qgs.contracts import Scene
 from qgs.data.samples import views_in
+from qgs.paths import opened_path
 from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians, Views
+from qgs_photos.datatools.check import faults_of_poses
 from qgs_photos.printing import say
 from qgs_photos.refine.initial import chosen_initialisation, photos_start
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import refine, seconds_of_step
 from qgs_photos.refine.result import Result, page_writer, write_scene
 from qgs_photos.refine.scene_photos import TIMED, ScenePhotos, affordable
+from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
 
 END = 4.0
@@ -26,6 +27,8 @@ PART_OF_END = 0.03
 """Fraction of the whole time that is reserved for scores and files in addition to END."""
 # Of the time for the optimisation, however long all else took.
 _LEAST_PART = 0.1
+# Photos that given poses are judged by, a second each.
+_JUDGING = 4
 SWEEP = 0.12
 """Fraction of the optimisation's time to spend on finding depths of pixels."""
 
@@ -47,17 +50,21 @@ def make_scene(
         return options.seconds or max(ends - perf_counter(), _LEAST_PART * seconds)
 
     photos = ScenePhotos(path, options)
+    # those that COLMAP makes are checked by `qgs poses`
+    for finding in faults_of_poses(opened_path(path), options.scene, _JUDGING)[:1]:
+        say(console, str(finding))
     start = chosen_initialisation(photos, options)
-    background = backdrop(photos.small, photos.frames)
-    renderer = AutoRenderer(AutoRenderer.Config(background=background))
     small = views_in(start.world, photos.small, photos.frames).to(options.device)
+    # What masks leave out is empty, and black in viewers.
+    color = (0.0, 0.0, 0.0) if options.masks else edge_color(small)
+    renderer = AutoRenderer(AutoRenderer.Config(background=color))
     few, seconds_of_pixel = timed_sweep(small)
     # on this machine, with these options: exposure and harmonics cost time too
     step = seconds_of_step(few, small, renderer, options.extras)
     size, count = affordable(step, small.cameras.size, photos, left(), options)
     frames = (*photos.frames, *photos.held_out)
     every = views_in(start.world, photos.at(size), frames).to(options.device)
-    every = masked(every, background) if options.masks else every
+    every = masked(every) if options.masks else every
     budget = left()
     chosen = replace(
         options,
@@ -87,21 +94,23 @@ def make_scene(
         console=console,
         extras=options.extras,
     )
+    if not options.masks:
+        whole = surrounded(refined.gaussians, every, color)
+        refined = replace(refined, gaussians=whole)
     judged = every.select(slice(len(photos.frames), None))
-    result = Result(command, start.world, refined, renderer, photos, views, judged)
+    result = Result(command, start.world, refined, photos, views, judged)
     write_scene(result, out, page, began, console)
 
 
-def masked(views: Views, background: Sequence[float]) -> Views:
-    """Return the views with pixels outside their masks replaced by the background (RGB in [0, 1]).
+def masked(views: Views) -> Views:
+    """Return the views with black pixels outside of their masks.
 
     The optimisation then leaves these pixels without Gaussians. Raises ValueError for photos
     without masks.
     """
     if views.masks is None:
         raise ValueError("--masks: these photos have no masks: leave --masks out, or add masks")
-    color = views.images.new_tensor(background)[:, None, None]
-    return replace(views, images=views.masks * views.images + (1 - views.masks) * color)
+    return replace(views, images=views.masks * views.images)
 
 
 def timed_sweep(views: Views) -> tuple[Gaussians, float]:
@@ -109,13 +118,3 @@ def timed_sweep(views: Views) -> tuple[Gaussians, float]:
     began = perf_counter()
     found = swept(views, TIMED, 1.0, torch.Generator().manual_seed(0))
     return found, (perf_counter() - began) / found.count
-
-
-def backdrop(scene: Scene, frames: Sequence[int]) -> tuple[float, float, float]:
-    """Return the median RGB in [0, 1] along the edges of photos, as background of the scene."""
-    # 16 photos show the background as well as all
-    few = frames[:: max(len(frames) // 16, 1)]
-    pixels = scene.images(few)
-    edges = [pixels[..., 0, :], pixels[..., -1, :], pixels[..., 0], pixels[..., -1]]
-    red, green, blue = torch.cat(edges, -1).transpose(0, 1).flatten(1).median(1).values.tolist()
-    return red, green, blue

@@ -68,13 +68,13 @@ def _on_photo(
     rows = pixels // cameras.size[1]
     columns = pixels % cameras.size[1]
     depths = _depths(views, photo, rows, columns, size)
-    rays = _rays(cameras, photo, rows, columns)
+    rays = pixel_rays(cameras, photo, rows, columns)
     means = cameras.c2w[0, photo, :3, 3] + rays * depths[:, None]
     scales = (_PIXELS * depths / cameras.intrinsics[0, photo, 0])[:, None].expand(-1, 3)
     return means, scales, views.images[0, photo][:, rows, columns].T
 
 
-def _rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
+def pixel_rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
     """Return the world directions (..., 3) of pixels, scaled to depth 1 in the camera."""
     fx, fy, cx, cy = cameras.intrinsics[0, photo]
     x = (columns + 0.5 - cx) / fx
@@ -96,7 +96,7 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
     rows = (rows[:, None] + down).clamp(0, height - 1)
     columns = (columns[:, None] + right).clamp(0, width - 1)
     colors = views.images[0, photo][:, rows, columns]
-    rays = _rays(cameras, photo, rows, columns)
+    rays = pixel_rays(cameras, photo, rows, columns)
     points = cameras.c2w[0, photo, :3, 3] + rays[:, :, None] * tried[:, None]
     costs = list[Tensor]()
     for other in _others(cameras, photo, size):
