@@ -7,7 +7,7 @@ import typer
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="PLY file in the format of 3DGS.")],
+    source: Annotated[Path, typer.Argument(metavar="IN", help="PLY file of 3DGS, or .splat.")],
     out: Annotated[
         Path,
         typer.Argument(

@@ -11,6 +11,9 @@ from qgs.geometry.harmonics import rotated
 from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians
 
+MOVED = 1e-3
+"""Part of a Gaussian's size by which a smaller dtype may move it."""
+
 
 @full_precision
 def quat_to_matrix(quats: Tensor) -> Tensor:
@@ -62,16 +65,30 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
 
 @full_precision
 def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
-    """Scale Gaussians by `factor` about the origin, then move them by the rigid `pose` (4, 4)."""
+    """Scale Gaussians by `factor` about the origin, then move them by the rigid `pose` (4, 4).
+
+    The result is computed in float64; its means stay so where `narrowed` leaves them.
+    """
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
-    pose = pose.to(gaussians.means)
+    pose = pose.to(gaussians.means.device, torch.float64)
     rotation = pose[:3, :3]
-    turn = rotation_matrix_to_quaternion(rotation).expand_as(gaussians.quats)
-    return replace(
+    turn = rotation_matrix_to_quaternion(rotation).to(gaussians.quats).expand_as(gaussians.quats)
+    placed = replace(
         gaussians,
-        means=gaussians.means * factor @ rotation.T + pose[:3, 3],
+        means=gaussians.means.double() * factor @ rotation.T + pose[:3, 3],
         scales=gaussians.scales * factor,
         quats=quat_product(turn, gaussians.quats),
         sh=None if gaussians.sh is None else rotated(gaussians.sh, rotation),
     )
+    return narrowed(placed)
+
+
+def narrowed(gaussians: Gaussians) -> Gaussians:
+    """Return `gaussians` with means in the dtype of scales, or as they are if that moves them.
+
+    It must move most of them by more than MOVED of their size: as in coordinates of maps.
+    """
+    means = gaussians.means.to(gaussians.scales.dtype)
+    off = (means - gaussians.means).norm(dim=-1) > MOVED * gaussians.scales.norm(dim=-1)
+    return gaussians if off.float().mean() > 0.5 else replace(gaussians, means=means)

@@ -1,22 +1,29 @@
-"""Gaussians as files: PLY of the 3DGS release, .splat, and formats that distributions add."""
+"""Gaussians as files: PLY of the 3DGS release, .splat, and formats that distributions add.
+
+Files hold float32. Worlds that are too far from zero for it are written about a local origin, which
+PLY files name in a comment; read again, Gaussians are in their world, their means in float64.
+"""
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from plyfile import PlyData, PlyElement, PlyElementParseError, PlyHeaderParseError
+from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from qgs.containers import map_tensors, named_tensors
 from qgs.extensions import imported, installed
 from qgs.files import replacing
 from qgs.geometry.harmonics import SH_C0
+from qgs.geometry.transforms import narrowed
 from qgs.types import SH_COUNTS, Gaussians
-from qgs.wording import listed, warn_once
+from qgs.wording import listed, one_line, warn_once
 
 WRITER_GROUP = "qgs.scene_writers"
 """Entry points of functions (gaussians, path): the name is the suffix that they write, undotted."""
@@ -26,18 +33,13 @@ OPACITY_EPS = 1e-6
 SCALE_MIN = 1e-12
 """Smallest scale stored, world units: the logarithm of 0 is infinite."""
 
-_MEANS = ("x", "y", "z")
-_COLORS = ("f_dc_0", "f_dc_1", "f_dc_2")
-_SCALES = ("scale_0", "scale_1", "scale_2")
-_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-NEEDED = (*_MEANS, *_COLORS, "opacity", *_SCALES, *_QUATS)
-REST = tuple(f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1]))
+_MEANS = ["x", "y", "z"]
+_COLORS = ["f_dc_0", "f_dc_1", "f_dc_2"]
+_OTHERS = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+REST = [f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1])]
 """Spherical harmonics of degrees 1 to 3, all of red first, then green, then blue; always written,
 as zeros too: the viewer of the 3DGS release and plugins of game engines need all of them."""
-PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, "opacity", *_SCALES, *_QUATS)
-
-SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-"""A Gaussian of a .splat file, 32 bytes. Source: github.com/antimatter15/splat, convert.py."""
+PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, *_OTHERS)
 
 # Bytes of a header, at most: that of the 3DGS release has 1,500.
 _HEADER = 2**16
@@ -74,121 +76,137 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), as binary little-endian float32.
 
     Colours become f_dc, spherical harmonics f_rest, opacities logits, scales logarithms;
-    quaternions stay w x y z; normals are zero. Warns that `features` are left out.
-    Raises ValueError for several scenes or for numbers that are not finite.
+    quaternions stay w x y z; normals are zero. Warns that `features` are left out, and of a local
+    origin, which the comment `local origin X Y Z` names. Raises ValueError for several scenes or
+    for numbers that are not finite.
     """
-    scene = one_scene(gaussians, "PLY", "features")
+    scene, origin = one_scene(gaussians, "PLY", "features")
     sh = scene.means.new_zeros(scene.count, SH_COUNTS[-1], 3) if scene.sh is None else scene.sh
-    rest = F.pad(sh, (0, 0, 0, SH_COUNTS[-1] - sh.shape[1]))
-    columns = {
-        _MEANS: scene.means,
-        _COLORS: (scene.colors - 0.5) / SH_C0,
-        ("opacity",): scene.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
-        _SCALES: scene.scales.clamp_min(SCALE_MIN).log(),
-        _QUATS: scene.quats,
+    columns = [
+        scene.means,
+        torch.zeros_like(scene.means),
+        (scene.colors - 0.5) / SH_C0,
         # Channel by channel.
-        REST: rest.mT.flatten(1),
-    }
-    vertices = np.zeros(scene.count, dtype=[(name, "<f4") for name in PROPERTIES])
-    for names, values in columns.items():
-        for name, column in zip(names, values.unbind(-1), strict=True):
-            vertices[name] = column
+        F.pad(sh, (0, 0, 0, SH_COUNTS[-1] - sh.shape[1])).mT.flatten(1),
+        scene.opacities.logit(OPACITY_EPS)[:, None],
+        scene.scales.clamp_min(SCALE_MIN).log(),
+        scene.quats,
+    ]
+    vertices = unstructured_to_structured(torch.cat(columns, 1).numpy(), names=PROPERTIES)
+    comments = [f"local origin {origin}"] if origin else []
+    whole = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
+        whole.write(file)
 
 
 def save_splat(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), the largest and most opaque Gaussians first.
 
     Colours, opacities and quaternions, w x y z, get 8 bits. Warns that spherical harmonics and
-    `features` are left out. Raises as `save_ply`.
+    `features` are left out, and of a local origin. Raises as `save_ply`.
     """
-    scene = one_scene(gaussians, ".splat", "sh", "features")
+    scene, _ = one_scene(gaussians, ".splat", "sh", "features")
     # Viewers draw a file while it loads, so what covers most comes first.
     covering = scene.scales.prod(-1) * scene.opacities
     scene = scene[covering.argsort(descending=True, stable=True)]
 
-    def as_bytes(values: Tensor) -> Tensor:
-        return values.round().clamp(0, 255).byte()
-
-    records = np.empty(scene.count, SPLAT)
-    records["mean"] = scene.means
-    records["scale"] = scene.scales
-    records["rgba"] = as_bytes(torch.cat([scene.colors, scene.opacities[:, None]], -1) * 255)
-    records["quat"] = as_bytes(F.normalize(scene.quats, dim=-1) * 128 + 128)
+    # Source: github.com/antimatter15/splat, convert.py.
+    numbers = torch.cat([scene.means, scene.scales], 1).view(torch.uint8)
+    rgba = torch.cat([scene.colors, scene.opacities[:, None]], 1) * 255
+    rest = torch.cat([rgba, F.normalize(scene.quats, dim=-1) * 128 + 128], 1)
+    rows = torch.cat([numbers, rest.round().clamp(0, 255).byte()], 1)
     with replacing(path) as temporary:
-        temporary.write_bytes(records.tobytes())
+        temporary.write_bytes(rows.numpy().tobytes())
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Return the Gaussians (1, G) of a PLY file in the layout of the 3DGS release.
+    """Return the Gaussians (1, G) of a PLY file in the layout of the 3DGS release, in its world.
 
-    `sh` ends with the last degree of f_rest that is not all zeros, None without one. Raises
-    FileNotFoundError, and ValueError for another kind of file or of PLY, such as a compressed one,
-    and for numbers that are not finite.
+    A .splat file is read, too. Gaussians that are not finite are left out, with a warning. The
+    3D filter of Mip-Splatting is applied. `sh` ends with the last degree that is not all zeros; it
+    is None without one. Means are float64 if float32 would lose them. Raises FileNotFoundError, and
+    ValueError for another kind of file.
     """
-    vertices, names = _vertices(Path(path))
-    count = sum(name.startswith("f_rest_") for name in names)
-    rest = REST[:count]
-    if count not in (0, *(3 * n for n in SH_COUNTS)) or not names.issuperset(rest):
-        raise ValueError(
-            f"{path} has {count} properties f_rest_*; spherical harmonics of degrees 1, 2 or 3 "
-            "are f_rest_0 to f_rest_8, f_rest_23 or f_rest_44: write the file anew, or without them"
-        )
-
-    def columns(*names: str) -> Tensor:
-        return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
-
-    # In float64 norms are finite; a quaternion of 0 becomes NaN, which is refused below.
-    quats = columns(*_QUATS).double()
-    scene = Gaussians(
-        means=columns(*_MEANS),
-        scales=columns(*_SCALES).exp(),
-        quats=(quats / quats.norm(dim=-1, keepdim=True)).float(),
-        opacities=columns("opacity")[:, 0].sigmoid(),
-        colors=columns(*_COLORS) * SH_C0 + 0.5,
-        sh=_used_degrees(columns(*rest).unflatten(-1, (3, -1)).mT) if rest else None,
-    )
-    try:
-        return one_scene(scene, "PLY")[None]
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
-def _vertices(path: Path) -> tuple[np.ndarray, set[str]]:
-    """Return the vertices of a PLY file of Gaussians, and the names of their numbers."""
+    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no file at {path}")
     try:
-        with path.open("rb") as start:
-            header, end, _ = start.read(_HEADER).partition(b"end_header")
-        counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))
-        # plyfile takes the memory that a header promises.
-        if not end or max(counts, default=0) > path.stat().st_size:
-            raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
-        elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
-    except (PlyHeaderParseError, PlyElementParseError, ValueError, MemoryError) as error:
-        raise ValueError(f"{path} is no whole PLY file ({error}): copy it again") from error
-    vertices = elements.get("vertex", np.empty(0))
-    kinds = vertices.dtype.fields or {}
-    # Lists are objects to NumPy.
-    names = {name for name, kind in kinds.items() if not kind[0].hasobject}
-    if missing := [name for name in NEEDED if name not in names]:
-        kind = "a compressed PLY" if "chunk" in elements else "no PLY of Gaussians"
+        scene = (_of_splat if path.suffix.lower() == ".splat" else _of_ply)(path)
+    # Readers raise anything of a damaged file.
+    except Exception as error:
         raise ValueError(
-            f"{path} is {kind}: it lacks {listed(missing)}; give one with the properties of the "
-            "3DGS release, as SuperSplat's uncompressed export writes it"
+            f"{path} cannot be read as Gaussians ({one_line(error)}): copy it again if it is a PLY "
+            "or .splat; compressed PLY, .spz, .sog and others become a PLY by "
+            "`npx @playcanvas/splat-transform IN OUT.ply`"
+        ) from error
+    # In float64 norms are finite; a quaternion of 0 becomes NaN, which is left out.
+    quats = scene.quats.double()
+    scene = replace(scene, quats=(quats / quats.norm(dim=-1, keepdim=True)).float())
+    whole = _finite(scene)
+    count = int(whole.sum())
+    if not count:
+        raise ValueError(f"{path} holds no Gaussians, or none with finite numbers")
+    if count < scene.count:
+        warn_once(
+            f"{path}: left out {scene.count - count} of {scene.count} Gaussians, which are not "
+            "finite, or too large"
         )
-    if not len(vertices):
-        raise ValueError(f"{path} holds no Gaussians")
-    return vertices, names
+    return narrowed(scene[whole][None])
 
 
-def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
+def _finite(scene: Gaussians) -> Tensor:
+    """Return which of Gaussians (G,) have numbers whose squares are finite in float32."""
+    squares = [part.float().square()[..., None].flatten(1) for _, part in named_tensors(scene)]
+    return torch.cat(squares, -1).isfinite().all(-1)
+
+
+def _of_splat(path: Path) -> Gaussians:
+    rows = np.frombuffer(path.read_bytes(), "3f4,3f4,4u1,4u1")
+    means, scales, rgba, quats = (torch.tensor(rows[f"f{part}"]).float() for part in range(4))
+    return Gaussians(means, scales, quats - 128, rgba[:, 3] / 255, rgba[:, :3] / 255)
+
+
+def _of_ply(path: Path) -> Gaussians:
+    with path.open("rb") as file:
+        header, end, _ = file.read(_HEADER).partition(b"end_header")
+    counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))
+    # plyfile takes the memory that a header promises.
+    if not end or max(counts, default=0) > path.stat().st_size:
+        raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
+    elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
+    vertices = elements["vertex"]
+    names = vertices.dtype.names or ()
+    count = sum(name.startswith("f_rest_") for name in names)
+    if count not in (0, 9, 24, 45):
+        raise ValueError(f"it has {count} properties f_rest_*, not 0, 9, 24 or 45")
+
+    def columns(names: list[str], kind: type = np.float32) -> Tensor:
+        return torch.from_numpy(structured_to_unstructured(vertices[names], kind, copy=True))
+
+    numbers = columns([*_COLORS, *_OTHERS, *REST[:count]])
+    colors, opacities, scales, quats, rest = numbers.split((3, 1, 3, 4, count), 1)
+    means = columns(_MEANS, np.float64)
+    if origin := re.search(rb"comment local origin (\S+) (\S+) (\S+)\s", header):
+        means += torch.tensor([*map(float, origin.groups())], dtype=torch.float64)
+    scales = scales.exp()
+    opacities = opacities.sigmoid()
+    if "filter_3D" in names:
+        # Source: github.com/autonomousvision/mip-splatting, create_fused_ply.
+        wide = torch.hypot(scales, columns(["filter_3D"]))
+        opacities = opacities * (scales / wide).prod(-1, keepdim=True)
+        scales = wide
+    sh = rest.unflatten(-1, (3, count // 3)).mT
+    used = sh.any(0).any(-1).nonzero().flatten().tolist()
+    kept = next(kept for kept in (0, *SH_COUNTS) if kept > max(used, default=-1))
+    colors = colors * SH_C0 + 0.5
+    return Gaussians(means, scales, quats, opacities[:, 0], colors, sh[:, :kept] if kept else None)
+
+
+def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, str]:
     """Return the Gaussians (G, ...) of (G, ...) or (1, G, ...), float32 on the CPU, for a file.
 
-    Warns about the parts in `lost`. Raises ValueError for several scenes or for numbers whose
-    squares are not finite. kind: of the file.
+    And the origin that they are about, see `about_origin`. Warns about the parts in `lost`. Raises
+    ValueError for several scenes or for numbers whose squares are not finite. kind: of the file.
     """
     batch = gaussians.means.shape[:-2]
     if batch not in ((), (1,)):
@@ -199,15 +217,21 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
     if names := [f"`{name}`" for name in lost if getattr(gaussians, name) is not None]:
         warn_once(f"{kind} files have no place for {listed(names)}: left out")
     scene = gaussians[0] if batch else gaussians
-    scene = map_tensors(Tensor.detach, scene).to("cpu", torch.float32)
-    squares = [part.square()[..., None].flatten(1) for _, part in named_tensors(scene)]
-    if broken := int((~torch.cat(squares, -1).isfinite().all(-1)).sum()):
+    scene = map_tensors(Tensor.detach, scene).to("cpu")
+    if broken := int((~_finite(scene)).sum()):
         raise ValueError(f"{broken} of {scene.count} Gaussians are not finite, or too large")
-    return scene
+    return about_origin(replace(scene.to(torch.float32), means=scene.means))
 
 
-def _used_degrees(sh: Tensor) -> Tensor | None:
-    """Return the coefficients (G, C, 3) without degrees that are zeros; None without any."""
-    used = sh.any(0).any(-1).nonzero().flatten().tolist()
-    count = next(count for count in (0, *SH_COUNTS) if count > max(used, default=-1))
-    return sh[:, :count] if count else None
+def about_origin(gaussians: Gaussians) -> tuple[Gaussians, str]:
+    """Return Gaussians (..., G) with float32 means about a local origin, and this origin, "X Y Z".
+
+    It is empty where float32 holds the world. Warns of another origin.
+    """
+    scene = narrowed(gaussians)
+    if scene.means.dtype == scene.scales.dtype:
+        return scene, ""
+    middle = scene.means.flatten(0, -2).median(0).values.round()
+    origin = " ".join(map(str, middle.tolist()))
+    warn_once(f"too far from zero for float32: positions are from the local origin {origin} on")
+    return replace(scene, means=(scene.means - middle).float()), origin

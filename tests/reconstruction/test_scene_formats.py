@@ -16,7 +16,7 @@ from torch.testing import assert_close
 import qgs
 from qgs.containers import named_tensors
 from qgs.extensions import ExtensionError
-from qgs.reconstruction.scene_formats import PROPERTIES, SPLAT, load_ply, save_gaussians, save_ply
+from qgs.reconstruction.scene_formats import PROPERTIES, load_ply, save_gaussians, save_ply
 from qgs.types import Gaussians
 
 
@@ -97,16 +97,48 @@ def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_files_of_others_are_read(tmp_path):
-    """Text, float64, big-endian, properties in another order, quaternions that are not unit."""
-    gaussians = random_gaussians(5)
-    vertices = vertices_of(saved(tmp_path / "scene.ply", gaussians))
+def test_files_of_others_are_understood(tmp_path, caplog):
+    """Text, float64, big-endian, properties in another order, quaternions that are not unit.
+
+    Numbers that are not finite, filters of Mip-Splatting, coordinates of maps.
+    """
+    given = random_gaussians(9)
+    path = saved(tmp_path / "a.ply", given)
     few = [name for name in PROPERTIES if not name.startswith(("f_rest", "n"))]
-    smaller = np.empty(5, dtype=[(name, ">f8") for name in reversed(few)])
+    vertices = np.zeros(9, [(name, ">f8") for name in ("filter_3D", *reversed(few))])
     for name in few:
-        smaller[name] = vertices[name] * (2 if name.startswith("rot") else 1)
-    PlyData([PlyElement.describe(smaller, "vertex")], text=True).write(tmp_path / "other.ply")
-    assert_close(load_ply(tmp_path / "other.ply").quats[0], gaussians.quats)
+        vertices[name] = vertices_of(path)[name] * (2 if name.startswith("rot") else 1)
+
+    def read(name, values):
+        other = vertices.copy()
+        other[name] += values
+        PlyData([PlyElement.describe(other, "vertex")], text=True).write(path)
+        return load_ply(path)
+
+    # the square of the last one's exponential overflows
+    broken = read("scale_1", [np.nan, np.inf, 88, *[0] * 6])
+    assert_close(broken.quats[0], given.quats[3:])
+    assert "left out 3 of 9" in caplog.text
+    filtered = read("filter_3D", 0.3)[0]
+    wide = (given.scales**2 + 0.3**2).sqrt()
+    assert_close(filtered.scales, wide)
+    assert_close(filtered.opacities, given.opacities * (given.scales / wide).prod(-1))
+    far = read("y", 5_412_250.125)
+    save_gaussians(far, tmp_path / "far.splat")
+    assert caplog.text.count(" 5412250.0 ") == 1
+    place = torch.tensor([0, 5_412_250.125, 0], dtype=torch.float64)
+    for gaussians in (far, load_ply(saved(path, far))):
+        assert_close(gaussians.means[0] - place, given.means.double(), atol=1e-6, rtol=1e-5)
+    assert np.abs(vertices_of(path)["y"]).max() < 20
+
+
+def test_compressed_files_are_named_with_their_converter(tmp_path):
+    chunk = np.zeros(1, [("min_x", "<f4")])
+    packed = ply(chunk=chunk, vertex=chunk.repeat(256))
+    for name, content in (("a.ply", packed), ("4.spz", b"NGSP\4\0\0\0\5\0\0\0")):
+        path = tmp_path / name
+        path.write_bytes(content)
+        must_refuse("splat-transform", load_ply, path)
 
 
 def test_files_of_fewer_degrees_are_read(tmp_path):
@@ -135,8 +167,6 @@ def test_other_files_are_refused_by_name(tmp_path):
     some = random_gaussians(3)
     whole = saved(tmp_path / "whole.ply", some).read_bytes()
     still = saved(tmp_path / "still.ply", replace(some, quats=some.quats * 0)).read_bytes()
-    large = bytearray(whole)
-    large[-28:-24] = np.float32(88).tobytes()  # the square of its exponential overflows
     faces = b"element face 100000000\nproperty list uint float v\nend_header"
     for name, content in {
         "compressed": ply(vertex=points, chunk=chunks),
@@ -146,7 +176,6 @@ def test_other_files_are_refused_by_name(tmp_path):
         "long": whole.replace(b"element", b"comment x\n" * 10_000 + b"element"),
         "faces": whole.replace(b"end_header", faces),
         "without rotation": still,
-        "large": bytes(large),
         "without any": saved(tmp_path / "none.ply", random_gaussians(0)).read_bytes(),
     }.items():
         path = tmp_path / f"{name}.ply"
@@ -203,11 +232,13 @@ def test_the_bytes_of_a_splat_file(tmp_path):
     given = random_gaussians(1, 300)
     qgs.save_ply(given, tmp_path / "scene.ply")
     run_qgs("convert", tmp_path / "scene.ply", tmp_path / "scene.splat")
-    read = np.frombuffer((tmp_path / "scene.splat").read_bytes(), SPLAT)
-    assert SPLAT.itemsize == 32
+    read = np.frombuffer((tmp_path / "scene.splat").read_bytes(), "3f4,3f4,4u1,4u1")
     given = given[0][(given.scales.prod(-1) * given.opacities)[0].argsort(descending=True)]
-    assert_array_equal(read["mean"], given.means)
-    assert_allclose(read["scale"], given.scales, rtol=1e-6)
+    assert_array_equal(read["f0"], given.means)
+    assert_allclose(read["f1"], given.scales, rtol=1e-6)
     rgba = torch.cat([given.colors, given.opacities[:, None]], 1)
-    assert_allclose(read["rgba"] / 255, rgba, atol=0.002)
-    assert_allclose((read["quat"].astype(float) - 128) / 128, given.quats, atol=0.008)
+    assert_allclose(read["f2"] / 255, rgba, atol=0.002)
+    assert_allclose((read["f3"].astype(float) - 128) / 128, given.quats, atol=0.008)
+    assert_close(load_ply(tmp_path / "scene.splat").quats[0], given.quats, atol=0.02, rtol=0)
+    (tmp_path / "cut.splat").write_bytes(bytes(33))
+    must_refuse("cut.splat", load_ply, tmp_path / "cut.splat")

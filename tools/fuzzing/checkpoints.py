@@ -1,4 +1,4 @@
-"""Fuzz cases of checkpoints and PLY files, damaged in many ways.
+"""Checkpoints, PLY and .splat files, damaged in many ways: each is used, or refused by its name.
 
 Each file must be used without an error, or refused by an error that names the file. In half of the
 checkpoints the checksum of the metadata is updated after the damage, as an attacker would do. If a
@@ -24,6 +24,7 @@ from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.tensors import SEAL, seal
 from qgs.contracts import LearnedQueries
 from qgs.recipe import resolve
+from qgs.reconstruction.scene_formats import save_splat
 from qgs.train.initial import initialise
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
@@ -132,7 +133,7 @@ def start_from(file: Path) -> bytes:
 
 
 def convert(file: Path) -> None:
-    """Read a PLY file and write it again."""
+    """Read Gaussians and write them again."""
     qgs.save_ply(qgs.load_ply(file), file.with_name("again.ply"))
 
 
@@ -153,10 +154,11 @@ def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None)
 
 
 def prepare(scratch: Path) -> None:
-    """Write an undamaged checkpoint and an undamaged PLY file to `scratch`."""
+    """Write a checkpoint, a PLY and a .splat file."""
     model = qgs.compose(RECIPE, SMALL)
     qgs.save(model, scratch / "a.safetensors", extra={"step": "3"})
     decode(scratch / "a.safetensors")
+    save_splat(qgs.load_ply(scratch / "a.ply"), scratch / "a.splat")
 
 
 def case_in(scratch: Path, folder: Path) -> tuple[str, Use]:
@@ -165,11 +167,11 @@ def case_in(scratch: Path, folder: Path) -> tuple[str, Use]:
     Returns a description of the case, and the function that uses it.
     """
     use = choice((decode, start_from, convert))
-    original = scratch / ("a.ply" if use is convert else "a.safetensors")
+    original = scratch / (choice(("a.ply", "a.splat")) if use is convert else "a.safetensors")
     path = folder / original.name
     path.write_bytes(original.read_bytes())
     damage = damage_ply if use is convert else damage_checkpoint
-    if random.random() < 0.15:
+    if random.random() < 0.15 or original.suffix == ".splat":
         damage = other_bytes
     what = damage(path)
     whole = use(original) if what == other_metadata.__name__ else None

@@ -48,8 +48,8 @@ class FigureName(StrEnum):
 SourceName = Annotated[
     str,
     typer.Argument(
-        help="Run folder, checkpoint, shipped model (PLUGIN/NAME), PLY file, or the folder that "
-        "qgs reconstruct wrote."
+        help="Run folder, checkpoint, shipped model (PLUGIN/NAME), .ply or .splat file, or "
+        "the folder that qgs reconstruct wrote."
     ),
 ]
 ModelPhotos = Annotated[

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,7 +32,6 @@ from qgs.reconstruction.scenes import (
     size_multiple,
     whole_size,
 )
-from qgs.wording import short_names
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
 WINDOWS = 6
@@ -174,9 +174,13 @@ class Model:
 def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
     """Return short names of models or recipes, numbered where a path is repeated.
 
-    `a/x.yaml`, `b/x.yaml`, `b/x.yaml` give a/x, b/x, b/x (2); see `short_names`.
+    Common folders and suffixes are left out: `a/x.yaml`, `b/x.yaml`, `b/x.yaml` give a/x, b/x,
+    b/x (2).
     """
-    names = short_names(paths)
+    files = [os.path.abspath(path) for path in paths]
+    shared = os.path.commonpath([os.path.dirname(file) for file in files])
+    suffix = r"\.(ya?ml|safetensors)$"
+    names = [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]
     before = [names[:index].count(name) for index, name in enumerate(names)]
     return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 

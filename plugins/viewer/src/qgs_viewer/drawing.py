@@ -33,7 +33,7 @@ SOLID = 0.1
 
 @dataclass(frozen=True)
 class Choice:
-    """What the user chose to see in the viewer.
+    """Choices of the user of the viewer.
 
     query: index of the picked query; None for all. by_query: colour Gaussians by their query.
     layer: decoder layer whose anchors and attention are shown; 0 is before the first layer. others:

@@ -20,7 +20,7 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import checked_window, choose_frames
 from qgs.reconstruction.scale import constant_scale, find_scale, photo_settings
-from qgs.reconstruction.scene_formats import load_ply
+from qgs.reconstruction.scene_formats import about_origin, load_ply
 from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene
 from qgs.types import Cameras
 from qgs.wording import listed
@@ -28,6 +28,7 @@ from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 
 PLY = "gaussians.ply"
+_SCENES = (".ply", ".splat", ".spz", ".sog", ".ksplat")
 CAMERAS = "cameras.json"
 """The two files that `qgs reconstruct --out FOLDER` writes into FOLDER."""
 REFINED = "refined"
@@ -40,7 +41,7 @@ SAME = 0.02
 
 @dataclass
 class Source:
-    """What the viewer shows: Gaussians without a model, whose input photos cannot be changed.
+    """Gaussians without a model in the viewer, whose input photos cannot be changed.
 
     `ModelSource` derives from this class and can change them. title: heading of the viewer. notes:
     remarks for the user. fixed: the Gaussians; None with a model. frames: indices of the first
@@ -103,14 +104,14 @@ class ModelSource(Source):
 
 
 def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
-    """Open what `name` says: a PLY file, the folder of a reconstruction, a run folder or a model.
+    """Open what `name` says: a file of Gaussians, a reconstruction, a run folder or a model.
 
     options: passed to `open_model`. Raises ValueError when options are given for a PLY or a
     reconstruction, which have none, and what the readers of files raise.
     """
     path = Path(name).expanduser()
     finished = is_finished(path)
-    if not finished and path.suffix.lower() != ".ply":
+    if not finished and path.suffix.lower() not in _SCENES:
         return open_model(name, device, **options)
     if given := [option for option, value in options.items() if value]:
         raise ValueError(
@@ -118,8 +119,10 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
         )
     if finished:
         return open_finished(path, device)
-    note = "A PLY file holds neither queries nor photos; name the model to see them."
-    return Source(path.name, (note,), QueryScene(load_ply(path)))
+    note = "A file of Gaussians has neither queries nor photos; name the model to see them."
+    # the browser gets float32
+    gaussians, _ = about_origin(load_ply(path))
+    return Source(path.name, (note,), QueryScene(gaussians))
 
 
 def open_model(
