@@ -1,9 +1,7 @@
 """Functions that word parts of messages and tables."""
 
 import logging
-import os
-import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from functools import lru_cache
 
@@ -67,11 +65,3 @@ def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
     """
     near = nearest(word, choices)
     return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices), 30) or 'none'}"
-
-
-def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Return names of models or recipes: paths without their common folder and without suffix."""
-    files = [os.path.abspath(path) for path in paths]
-    shared = os.path.commonpath([os.path.dirname(file) for file in files])
-    suffix = r"\.(ya?ml|safetensors)$"
-    return [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]

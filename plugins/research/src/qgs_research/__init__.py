@@ -1,1 +1,12 @@
 """Studies, benchmarks, and import of published weights."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def short_names(recipes: Sequence[str | Path]) -> list[str]:
+    """Return names of recipes without the folders they have in common and without suffixes."""
+    files = [Path(recipe).absolute() for recipe in recipes]
+    shared = os.path.commonpath([file.parent for file in files])
+    return [os.path.relpath(file.with_suffix(""), shared) for file in files]

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from qgs.terminal import print_table
-from qgs.wording import short_names
+from qgs_research import short_names
 
 MEBIBYTE = 2**20
 TITLES = {

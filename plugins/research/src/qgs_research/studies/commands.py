@@ -8,7 +8,7 @@ from rich.console import Console
 
 from qgs.cli.inspect import RecipeFile
 from qgs.cli.options import Device
-from qgs.wording import short_names
+from qgs_research import short_names
 
 app = typer.Typer(help="Train variants of a model with several seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
