@@ -179,7 +179,7 @@ BROKEN = (
     ({"frames": 0}, ""),
     ({"cameras": changed(2, 9, torch.nan)}, r", frame 2 \(2000\).*NaN"),
     ({"cameras": changed(1, 7, 3.0)}, ", frame 1 .*not rigid"),
-    ({"cameras": changed(1, 7, -1.0)}, ", frame 1 .*mirrors"),
+    ({"cameras": changed(1, 7, -1.0)}, ", frame 1 .*is mirrored"),
     ({"cameras": changed(3, 0, 500.0)}, ", frame 3 .*pixels"),
     ({"cameras": changed(3, 1, -1.0)}, ", frame 3 .*focal"),
     ({"images": [torch.zeros(9).byte()] * 4}, ", frame 0 "),

@@ -37,7 +37,7 @@ _FIXED = struct.Struct("<Q3d3BdQ")
 
 @dataclass(frozen=True)
 class Initialisation:
-    """How the optimisation starts.
+    """Start of the optimisation.
 
     model: name of the model, or "none". world: reference pose (4, 4) and scale of the world of the
     Gaussians, see `own_world`. gaussians: (1, G) of the model; None places Gaussians by the photos.

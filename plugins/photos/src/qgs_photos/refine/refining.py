@@ -79,7 +79,7 @@ class RefinedScene:
 
 @dataclass(frozen=True)
 class Extras:
-    """What to optimise in addition to means, shapes, opacities and colours of the Gaussians.
+    """Parts to optimise in addition to means, shapes, opacities and colours of the Gaussians.
 
     degree: spherical harmonics up to this degree, 0 to 3, are added in steps if the first Gaussians
     have none. exposure: an affine map of the colours of each photo. poses: the pose of each photo.

@@ -13,7 +13,7 @@ from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians, Views
 from qgs_photos.datatools.check import faults_of_poses
 from qgs_photos.printing import say
-from qgs_photos.refine.initial import chosen_initialisation, photos_start
+from qgs_photos.refine.initial import Initialisation, chosen_initialisation, photos_start
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import refine, seconds_of_step
 from qgs_photos.refine.result import Result, page_writer, write_scene
@@ -36,17 +36,15 @@ SWEEP = 0.12
 def make_scene(
     path: str, out: Path, options: Options, began: float, seconds: float, console: Console
 ) -> None:
-    """Choose the settings, optimise the scene, score it on held-out photos, and write its files.
+    """Optimise a scene of the photos at `path`, score it, and write its files into `out`.
 
-    path: photos. out: new folder. began: time of `perf_counter` at the start of the command.
-    seconds: time from `began` to the last file.
+    began: time of `perf_counter` at the start. seconds: time from `began` to the last file.
     """
     # its remark comes first, before minutes of bars
     page = page_writer(console)
     ends = began + seconds - END - PART_OF_END * seconds
 
     def left() -> float:
-        """Return the seconds for the optimisation: those of --seconds, or the time that is left."""
         return options.seconds or max(ends - perf_counter(), _LEAST_PART * seconds)
 
     photos = ScenePhotos(path, options)
@@ -66,16 +64,8 @@ def make_scene(
     every = views_in(start.world, photos.at(size), frames).to(options.device)
     every = masked(every) if options.masks else every
     budget = left()
-    chosen = replace(
-        options,
-        model=start.model,
-        frames=start.frames,
-        scale=float(start.world[1]) if start.frames else None,
-        size=size,
-        gaussians=count,
-        seconds=budget,
-    )
-    command = chosen.command(path, str(out))
+    chosen = replace(options, size=size, gaussians=count, seconds=budget)
+    command = with_start(chosen, start).command(path, str(out))
     # before the optimisation: an interrupted one can be repeated
     say(console, command)
     gaussians = start.gaussians
@@ -95,11 +85,16 @@ def make_scene(
         extras=options.extras,
     )
     if not options.masks:
-        whole = surrounded(refined.gaussians, every, color)
-        refined = replace(refined, gaussians=whole)
+        refined = replace(refined, gaussians=surrounded(refined.gaussians, every, color))
     judged = every.select(slice(len(photos.frames), None))
     result = Result(command, start.world, refined, photos, views, judged)
     write_scene(result, out, page, began, console)
+
+
+def with_start(options: Options, start: Initialisation) -> Options:
+    """Return the options that choose this start again."""
+    scale = float(start.world[1]) if start.frames else None
+    return replace(options, model=start.model, frames=start.frames, scale=scale)
 
 
 def masked(views: Views) -> Views:

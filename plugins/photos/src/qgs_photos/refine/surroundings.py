@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 
+from qgs.containers import map_tensors
 from qgs.types import Gaussians, Views
 from qgs_photos.refine.refining import distance, joined
 from qgs_photos.refine.sweeping import pixel_rays
@@ -49,4 +50,5 @@ def surrounded(gaussians: Gaussians, views: Views, color: Sequence[float]) -> Ga
         opacities=torch.full_like(sphere[..., 0], _OPACITY),
         colors=sphere.new_tensor(color).expand_as(sphere),
     )
-    return joined(gaussians, far)
+    # First in the file, so that viewers which have not sorted yet draw them behind all others.
+    return map_tensors(lambda part: part.roll(far.count, 1), joined(gaussians, far))
