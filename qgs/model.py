@@ -38,7 +38,7 @@ class QueryGaussianModel(nn.Module):
 
     refinements: the distinct refinement modules; layers may share one. `refinement_of` has the
         index of the refinement for each decoder layer.
-    recipe: the resolved recipe of this model; None for a model built by hand.
+    recipe: the complete recipe of this model; None for a model built by hand.
     releases: distribution and version of the recipe's plugins when the model was built.
     trained_on: range of the training's cameras, from the checkpoint; None if it is unknown.
     loaded_from: absolute path of the checkpoint that `qgs.load` read; "" for other models.

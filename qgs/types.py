@@ -154,7 +154,10 @@ class ImageMemory(TensorContainer):
     def __post_init__(self) -> None:
         shape = tuple(self.features.shape)
         if self.grid is not None and shape[1:2] != (patches := math.prod(self.grid),):
-            raise ValueError(f"ImageMemory.grid {self.grid} has {patches} tokens, features {shape}")
+            raise ValueError(
+                f"ImageMemory.grid {self.grid} needs {patches} tokens, but the features have shape "
+                f"{shape}"
+            )
         check_shapes(
             self, features="B M C", keys="B h M D/h", values="B h M D/h", patch_rays="B M 6"
         )

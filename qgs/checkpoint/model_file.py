@@ -164,7 +164,7 @@ def save(
     extra: Mapping[str, str] | None = None,
     weights: Weights | None = None,
 ) -> None:
-    """Write the weights of `model` and its resolved recipe to `path`, atomically.
+    """Write the weights of `model` and its complete recipe to `path`, atomically.
 
     extra: additional metadata, such as {"step": "1000"}. weights: weights to write in place of the
     model's present weights, by the names of `unique_tensors`.
@@ -193,7 +193,7 @@ def write_checkpoint(
 ) -> None:
     """Write a checkpoint from its parts, without copying a tensor.
 
-    tensors: on the CPU, contiguous, by the names of `unique_tensors`. tree: resolved recipe.
+    tensors: contiguous CPU tensors by the names of `unique_tensors`. tree: complete recipe.
     releases: see `Recipe.releases`. extra: additional metadata.
     """
     metadata = {

@@ -108,14 +108,14 @@ class TensorFile:
             return found
 
     def stored_recipe(self, key: str) -> Recipe:
-        """Return the resolved recipe in the metadata entry `key`, without reading any other file.
+        """Return the complete recipe in the metadata entry `key`, without reading any other file.
 
         Raises CheckpointError for a damaged entry, and RecipeError if the installed components do
         not fit the recipe.
         """
         tree = self.mapping(key)
         if unresolved := [name for name in ("extends", "swap") if name in tree]:
-            raise self.damaged(f"its recipe has `{unresolved[0]}`, but qgs writes resolved recipes")
+            raise self.damaged(f"its recipe has `{unresolved[0]}`, which qgs never stores")
         with self.entry(key):
             return resolve(tree)
 

@@ -170,7 +170,7 @@ class ViewSampler(Component):
 
     @abstractmethod
     def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
-        """Draw input frames, ascending, and target frames; raise ValueError for too few frames.
+        """Draw input frames, ascending, and target frames; raise ValueError for scenes too short.
 
         There are at most `views.inputs` input frames, equally many in all samples of a step.
         Held-out frames are never drawn.

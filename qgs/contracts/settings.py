@@ -98,7 +98,7 @@ class TrainingConfig(ComponentConfig):
     wandb, or a tracker of a plugin."""
 
     def scenes_per_batch(self, processes: int) -> int:
-        """Return the scenes per batch of one process; raise ValueError for an uneven split."""
+        """Return the scenes per batch of one process; raise ValueError if it is no integer."""
         parts = processes * self.accumulate
         scenes, left = divmod(self.batch_size, parts)
         if left:

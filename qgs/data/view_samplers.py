@@ -37,7 +37,7 @@ def training_frames(scene: Scene) -> list[int]:
 def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
     """Group frames by time, in ascending order; without times, each frame is a group.
 
-    frames: by default `training_frames`.
+    frames: frames to group; default: `training_frames`.
     """
     frames = training_frames(scene) if frames is None else frames
     if scene.times is None:

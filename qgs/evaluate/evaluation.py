@@ -183,7 +183,7 @@ class _Scorer:
 
     @torch.no_grad()
     def score(self, scene: str, samples: Iterable[Sample]) -> SceneScore:
-        """Return the score of a scene: means over its samples. Raises ValueError for NaN."""
+        """Return the mean score of a scene over its samples. Raises ValueError if it is NaN."""
         found: list[dict[str, float]] = []
         views: list[Window] = []
         names: dict[int, str] = {}

@@ -83,7 +83,7 @@ class EvaluationPlan:
 
     views_of: function that returns the view settings of a sample, such as its scale; None uses
     `views`. depths: load true depth for targets if the scene has it. wanted: names of the scenes.
-    Raises ValueError without test scenes, and the errors of `read_index`.
+    Raises ValueError if the data has no test scenes, and the errors of `read_index`.
     """
 
     source: SceneSource
@@ -177,8 +177,8 @@ def _named(scene: Scene, index: EvaluationIndex) -> Window:
     # frames are positions, which a missing image moves
     if scene.missing:
         raise ValueError(
-            f"{len(scene.missing)} of its listed images do not exist, so positions in the "
-            f"index would mean other frames: {listed(scene.missing, 3)}"
+            f"{len(scene.missing)} images of the scene do not exist, so the frame numbers in the "
+            f"evaluation index would mean other frames: {listed(scene.missing, 3)}"
         )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:

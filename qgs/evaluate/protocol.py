@@ -18,7 +18,7 @@ from qgs.recipe import Recipe
 class Protocol:
     """Settings of an evaluation. Results are comparable if the hashes of their protocols are equal.
 
-    name: for people, not hashed. content: all settings that influence the scores of given
+    name: title for people, not hashed. content: all settings that influence the scores of given
     Gaussians. Paths, device and the renderer's type are left out: all renderers give the same
     image.
     """

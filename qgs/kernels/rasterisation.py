@@ -64,7 +64,7 @@ def _exp2(x):
 def _by_depth(splats, top, bottom, width):
     """Return the indices of splats that touch image rows [top, bottom), by ascending depth.
 
-    width: of the image. Splats at the same depth keep their order.
+    width: image width in pixels. Splats at the same depth keep their order.
     """
     count = splats.shape[0]
     order = np.empty(count, np.int32)

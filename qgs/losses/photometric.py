@@ -99,7 +99,7 @@ class Mask(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """Return the loss; raise ValueError for views without masks."""
+        """Return the loss; raise ValueError if the target views have no masks."""
         if target.masks is None:
             raise ValueError(
                 "the loss qgs/mask needs views with masks, but these have none; "

@@ -66,8 +66,8 @@ class Visibility(Loss):
 
     class Config(VisibilityOptions):
         infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
-        """Pixel coordinate used in place of x / 0 with x != 0. It has no effect if `clamp` is
-        set."""
+        """Pixel coordinate of points at depth 0 beside the optical axis, negative on the left or
+        above. It has no effect if `clamp` is set."""
 
     config: Config
 

@@ -55,7 +55,7 @@ class Ssim(Metric):
         return {"": Column(f"SSIM{form}", "higher")}
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return the SSIM of each view, (1, T); ValueError for images smaller than the window."""
+        """Return the SSIM of each view, (1, T); raise ValueError if images are below the window."""
         return ssim(given.images, given.targets.images, self.config.covariance)
 
 

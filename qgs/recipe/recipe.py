@@ -123,7 +123,7 @@ class Recipe:
         return build(self.parts["view_sampler",])
 
     def build_data(self) -> contracts.SceneSource:
-        """Build the data source; raise ValueError for a recipe without data."""
+        """Build the data source; raise ValueError if the recipe names none."""
         if ("data",) not in self.parts:
             raise ValueError("this recipe has no data; add `data: {type: PLUGIN/NAME}`")
         return build(self.parts["data",])
@@ -286,7 +286,7 @@ def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[st
 
 
 def annotated(recipe: Recipe) -> str:
-    """Write the resolved recipe as YAML with comments that name file and line of each value."""
+    """Write the complete recipe as YAML with comments that name file and line of each value."""
 
     def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():

@@ -156,11 +156,11 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
 
 @dataclass(frozen=True)
 class Draft:
-    """A recipe whose components are known, but not yet checked together.
+    """Recipe whose components are chosen, before the check that they fit each other.
 
     tree: all files and overrides merged, with the default losses and metrics.
     settings: a `Layout` with all settings.
-    parts: components by path; each decoder layer has its own.
+    parts: chosen components by path in the recipe; each decoder layer has separate paths.
     """
 
     tree: MapNode

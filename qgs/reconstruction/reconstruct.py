@@ -49,7 +49,7 @@ def reconstruct(
     overrides: changes of the recipe's `views`, such as "views.scale=auto".
     tune: part to fit to the inputs first, see `tuning_settings`; None fits nothing.
 
-    Raises ValueError without a recipe, for several scenes, for images outside of [0, 1].
+    Raises ValueError if the model has no recipe, for several scenes, for images outside of [0, 1].
     """
     recipe = _recipe(model, overrides, tune)
     seen: Sequence[int] | None = None
@@ -86,7 +86,7 @@ def reconstruct(
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
-    """Return the model's recipe with changed `views` and tuning; ValueError without a recipe."""
+    """Return the model's recipe, changed by `overrides` of `views` and by the preset `tune`."""
     if model.recipe is None:
         raise ValueError(
             "this model was built by hand and has no recipe, so the frame and scale of its world "

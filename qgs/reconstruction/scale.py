@@ -195,8 +195,8 @@ class _Trial:
     """Scores of factors of camera positions; the factor of a place is low * step ** place.
 
     views: (1, V), whose cameras have the factor 1; the first `inputs` of them are given to the
-    model. weights: of the views in the mean PSNR. nearest: factor below which PENALTY lowers the
-    score. tried: mean PSNR by place.
+    model. weights: weights of the views in the mean PSNR. nearest: factor below which PENALTY
+    lowers the score. tried: mean PSNR by place.
     """
 
     model: QueryGaussianModel

@@ -154,7 +154,7 @@ def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
     """Convert photos named by the user, "0,8,x.jpg" or [0, 8, "x.jpg"], to frame numbers.
 
     File names may lack leading folders. Raises ValueError for text that is neither a number nor the
-    name of exactly one photo of `scene`. option: name of the option, for the message.
+    name of exactly one photo of `scene`. option: name of the option that the message names.
     """
     names = [scene.frame_name(frame) for frame in range(len(scene))]
     numbers: list[int] = []

@@ -146,7 +146,7 @@ def _weights(
 ) -> Tensor:
     """Return the blending weights (G, H, W) of splats at all pixels of an image.
 
-    means, conics, opacities: of the splats, (G, ...), sorted front to back.
+    means, conics, opacities: values of the splats (G, ...), sorted front to back.
     """
     height, width = size
     # Pixel centres are at .5: (0, 0) is the corner of the image.

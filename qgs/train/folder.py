@@ -60,7 +60,7 @@ model learns. If the budget changes, the learning rate follows the new budget fr
 
 
 class OtherRunError(ValueError):
-    """Error: a run cannot be continued with the given recipe, processes or data."""
+    """Error for a run that cannot be continued with the given recipe, processes or data."""
 
 
 class RunFolder:
@@ -219,7 +219,7 @@ class Saver:
 
 
 def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, State]) -> None:
-    """Write `states` to `path`, completely or not at all. recipe: resolved recipe of the run."""
+    """Write `states` to `path`, completely or not at all. recipe: complete recipe of the run."""
     # safetensors refuses views and tensors that share memory.
     tensors = {
         place: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)

@@ -322,7 +322,7 @@ def first_bad_tensor(
     batch = batches[0]
 
     def see(name: str, value: Any) -> None:
-        """Check `value`, a tensor or a nested container of tensors. name: for the message."""
+        """Check `value`, a tensor or a nested container of tensors. name: names it in messages."""
         for path, tensor in named_tensors(value, name):
             bad = tensor[~tensor.isfinite()]
             if bad.numel() and not found:

@@ -74,7 +74,7 @@ class Counters:
 
     @property
     def used(self) -> float:
-        """Used fraction of the budget: of the steps or of the seconds, whichever is larger."""
+        """Used fraction of the budget: that of the steps or of the seconds, whichever is larger."""
         of_seconds = self.seconds / (self.config.seconds or math.inf)
         return max(self.step / self.config.steps, of_seconds)
 

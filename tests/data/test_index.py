@@ -99,7 +99,7 @@ def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(tmp
     reasons = {
         "broken": r"transforms\.json",
         "cut": r"view_002\.png",
-        "gap": r"1 of its listed images do not exist.*view_001\.png",
+        "gap": r"1 images of the scene do not exist.*view_001\.png",
     }
     for scene, reason in reasons.items():
         with pytest.raises((ValueError, OSError), match=reason):

@@ -175,7 +175,7 @@ class Maker:
     photos = views
 
     def memory(self) -> ImageMemory:
-        """Return a random image memory with camera rays of patches of PATCH x PATCH pixels."""
+        """Return a random `ImageMemory` with one camera ray per patch of PATCH x PATCH pixels."""
         height, width = self.shape("HW")
         grid = (self.axes["V"], -(-height // PATCH), -(-width // PATCH))
         dims = self.case.dims

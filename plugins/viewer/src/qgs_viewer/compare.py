@@ -41,8 +41,8 @@ def compare_models(
 ) -> None:
     """Evaluate `models` (default: some that come with qgs), and write a report into `target`.
 
-    photos: folder or video; None takes unseen scenes of the models' data. size: of the photos, as
-    --size takes it. scale: factor of camera positions; None searches for one.
+    photos: folder or video; None takes unseen scenes of the models' data. size: that of the photos,
+    as --size takes it. scale: factor of camera positions; None searches for one.
     """
     pixels = parse_size(size)
     # models of 128 pixels need photos of that size at least

@@ -89,7 +89,8 @@ class ModelSource(Source):
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
         """Reconstruct from the photos `frames`, and place the result in the viewer's world.
 
-        Raises ValueError without frames, and for frames that are missing, repeated or too many.
+        Raises ValueError if no frames are given, and for frames that are missing, repeated or too
+        many.
         """
         if not frames:
             raise ValueError("a reconstruction needs an input photo: choose at least one")
@@ -173,9 +174,10 @@ def open_model(
 
 
 def _scene(recipe: Recipe, photos: str | None, size: Size | None, name: str | None) -> Scene:
-    """Return the scene of `photos`, or a scene of the recipe's data: `name`, or the first of tests.
+    """Return the scene of the folder `photos`, or without photos a scene of the recipe's data.
 
-    Raises ValueError for a recipe without data, and for a size without photos.
+    name: None is the first test scene. Raises ValueError if photos are not given and the recipe has
+    no data, or `size` is given.
     """
     if photos is not None:
         return chosen_scene(recipe, photos, size, name)[0]

@@ -169,7 +169,8 @@ class Panel:
     def under(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
         """Return the query whose anchor or Gaussian a ray hits; None if it hits nothing.
 
-        origin, direction: of the ray, both (3,) in the viewer's world. Anchors precede Gaussians.
+        origin, direction: start and direction of the ray, both (3,) in the viewer's world. Anchors
+        precede Gaussians.
         """
         # anchors are drawn over Gaussians, so they are hit first
         found = self.scene.support(self.choice.layer) if self.choice.anchors else None

@@ -103,7 +103,8 @@ def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
     """Return the index of the Gaussian with the largest blending weight on a ray.
 
     None if all weights are below LEAST_WEIGHT. The alpha of a Gaussian is its greatest value along
-    the ray; alphas are blended from near to far. origin, direction: of the ray, both (3,).
+    the ray; alphas are blended from near to far. origin, direction: start and direction of the ray,
+    both (3,).
     """
     offsets = origin - found.centers.astype(np.float64)
     # flat Gaussians have no inverse

@@ -22,7 +22,7 @@ NEUTRAL: Background = RendererConfig().background
 class Inside:
     """The model of a scene, with its intermediate results.
 
-    memory: tokens of the input photos. states: of the queries, before the first decoder layer and
+    memory: tokens of the input photos. states: query states before the first decoder layer and
     after each layer.
     """
 

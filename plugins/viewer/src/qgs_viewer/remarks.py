@@ -30,7 +30,7 @@ def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
 
 
 def remarks(models: Sequence[Model]) -> list[str]:
-    """Return all remarks: on chosen photos, on the evaluation of each model, on scales.
+    """Return remarks on chosen photos, on the evaluation of each model, and on scales.
 
     A remark that holds for several models stands once, with their names.
     """

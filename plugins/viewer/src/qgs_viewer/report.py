@@ -30,9 +30,9 @@ TARGETS = 2
 class Comparison:
     """Contents of a report that compares models on the same scenes.
 
-    models: in the order of the report. facts: lines on the training, text by label. commands:
-    commands that a reader may run next, and what each does. scenes: heading of the pictures. notes:
-    sentences below the table of scores.
+    models: compared models, in the order of the report. facts: lines on the training, text by
+    label. commands: commands that a reader may run next, and what each does. scenes: heading of the
+    pictures. notes: sentences below the table of scores.
     """
 
     models: Sequence[Model]

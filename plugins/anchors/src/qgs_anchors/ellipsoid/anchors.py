@@ -82,7 +82,7 @@ def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     The recipe must keep LocusGS's head. Each radius becomes three equal radii, which the refinement
     changes by equal steps. Rotations are the identity. If the refinement has `rotation: false`, the
     model then computes the same as LocusGS. Weights of the MLP that refines rotations are missing,
-    so load the result with `strict=False`. Raises KeyError for weights without radii.
+    so load the result with `strict=False`. Raises KeyError if the weights have no radii.
     """
     converted = {name: _tripled(name, values) for name, values in weights.items()}
     converted["queries.raw_radii"] = converted.pop("queries.raw_radius")

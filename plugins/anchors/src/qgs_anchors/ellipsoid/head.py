@@ -46,8 +46,8 @@ class EllipsoidHead(GaussianHead):
 def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
     """Return the radii (B, N, K, 3) of ellipsoids in the directions of their Gaussians' axes.
 
-    radii: of the ellipsoid's own axes. quats: rotation from Gaussian to anchor. In direction u of
-    the anchor's frame an ellipsoid with radii r has the radius 1 / |u / r|.
+    radii: those along the ellipsoid's axes. quats: rotation from Gaussian to anchor. In direction u
+    of the anchor's frame an ellipsoid with radii r has the radius 1 / |u / r|.
     """
     return 1 / (quat_to_matrix(quats_BNK4) / radii_BN3[:, :, None, :, None]).norm(dim=-2)
 

@@ -160,7 +160,7 @@ def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
     for where, views in _wide_and_tall(case, case.size):
         memory = module(views)
         if memory.patch_rays is None:
-            raise CannotCheck("its memory has no patch rays")
+            raise CannotCheck("its image memory has no patch rays")
         patch = _patch_size(where, views, memory)
         rays = patch_rays(plucker_rays(views.cameras), patch)
         where = f"{where}, compared with the mean rays of patches of {patch} pixels"

@@ -97,9 +97,9 @@ def check_inputs_are_not_changed(case: Case) -> None:
 def check_outputs_share_no_memory(case: Case) -> None:
     """Require that outputs share no memory with inputs, parameters or buffers.
 
-    Inputs that a component passes on unchanged are exempt: for a refinement, fields that it does
-    not provide and the features; for a layer, such fields and the image memory; for a feedback,
-    such fields, the features and the image memory.
+    Inputs that a component passes on unchanged are not checked. All kinds pass on the query fields
+    that they do not write. Besides, a refinement passes on the query features, a layer the image
+    memory, and a feedback both of these.
     """
     trial = Trial(case)
     outputs = leaves(trial())

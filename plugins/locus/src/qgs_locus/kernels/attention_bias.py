@@ -86,10 +86,10 @@ class AttentionBias(ABC):
     def gradients(
         self, queries_nF: Tensor, tokens_GM: Tensor, gradient_nM: Tensor
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Return gradients of the queries (n, F) and the tokens (G, M).
+        """Return the gradients of `queries_nF` and `tokens_GM`; None for one that needs none.
 
-        gradient: of the bias (n, M). A result is None if `self.queries` or `self.tokens` needs no
-        gradient. At least one of them must need it.
+        gradient_nM: gradient of the loss with respect to the bias. `self.queries` and `self.tokens`
+        say by `requires_grad` which gradients are needed: at least one.
         """
         of_queries = self.queries.requires_grad
         of_tokens = self.tokens.requires_grad

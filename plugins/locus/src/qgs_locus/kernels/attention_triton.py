@@ -58,7 +58,7 @@ def _bias(queries, tokens, step):
 def _bias_gradients(queries, tokens, step, gradient, sums):
     """Return `sums`, five tensors (n,), plus the gradients of the queries' five numbers.
 
-    gradient: of the bias (n, m). With e = mu x d - m, the result of `_moment`, the gradient of
+    gradient: that of the bias (n, m). With e = mu x d - m, the result of `_moment`, the gradient of
     |e|^2 to mu is 2 d x e.
     """
     e0, e1, e2 = _moment(queries, tokens, step)

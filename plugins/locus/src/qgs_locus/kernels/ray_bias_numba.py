@@ -44,7 +44,7 @@ def write(queries, tokens, out):
 def gradients(queries, tokens, gradient, out):
     """Write gradients of the queries' five numbers to `out`.
 
-    gradient: of the bias. The bias depends on |e|^2 with e = mu x d - m, whose gradient to the
+    gradient: that of the bias. The bias depends on |e|^2 with e = mu x d - m, whose gradient to the
     anchor's centre mu is 2 d x e.
     """
     m0 = tokens[0]

@@ -42,7 +42,7 @@ class Encoding:
 
 
 def encoded(pixels: np.ndarray, format: str = "PNG", **options: int) -> bytes:
-    """Encode pixels (H, W, 3) or (H, W), uint8, as an image file. options: of Pillow's `save`."""
+    """Encode uint8 pixels (H, W, 3) or (H, W) as an image. options: those of Pillow's `save`."""
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format, **options)
     return file.getvalue()

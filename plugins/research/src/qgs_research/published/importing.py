@@ -170,7 +170,7 @@ def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool)
 def new_checkpoint_path(path: str | Path) -> Path:
     """Return `path`, after a check that it is free and ends in .safetensors.
 
-    Raises ValueError for another suffix, and FileExistsError for an existing file.
+    Raises ValueError if the suffix is another, and FileExistsError for an existing file.
     """
     path = Path(path)
     if path.suffix.lower() != ".safetensors":

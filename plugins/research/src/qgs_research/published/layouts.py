@@ -43,10 +43,10 @@ class Names:
     def from_published(
         self, weights: Mapping[str, Tensor], origin: object = "the file"
     ) -> dict[str, Tensor]:
-        """Translate a published state dict to the names in qgs, without the `unused` tensors.
+        """Rename the tensors of a published state dict as in qgs; leave out those in `unused`.
 
-        Raises PublishedError that lists all differences in names and shapes. origin: name of the
-        file in this message.
+        origin: name of the published file, for the error message. Raises PublishedError that lists
+        all differences in names and shapes.
         """
         wanted = {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
         found = [f"{name} has no published name" for name in self.unnamed]

@@ -67,7 +67,7 @@ def _planks(x, y, seed, fade):
 
 @inner
 def _picture(p, q, seed):
-    """Return the weights of `mixture` for a landscape: hills under a sky with a sun."""
+    """Return the colour weights (m, n) for a landscape: hills under a sky with a sun."""
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
     # hills farther off are higher and paler
     far = hill + 0.35 * _noise(1.2 * p + 40, 8.5, seed) + 0.1
@@ -84,7 +84,7 @@ def _picture(p, q, seed):
 
 @inner
 def _rug(p, q, x, y, seed):
-    """Return the weights of `mixture` for a rug: two borders, a central ring, and diamonds."""
+    """Return the colour weights (m, n) for a rug: two borders, a central ring, and diamonds."""
     edge = min(1 - abs(p), 1 - abs(q))
     ring = abs(p) + abs(q)
     if edge < 0.06 or 0.14 < edge < 0.18:
@@ -101,7 +101,7 @@ def _rug(p, q, x, y, seed):
 
 @inner
 def _window(p, q, seed):
-    """Return the weights of `mixture` for a window: frame, glazing bars, trees and sky."""
+    """Return the colour weights (m, n) for a window: frame, glazing bars, trees and sky."""
     if abs(p) < 0.03 or abs(q - 0.25) < 0.025 or abs(p) > 0.94 or abs(q) > 0.95:
         return 0.0, 1.0
     trees = -0.5 + 0.5 * _noise(3 * p, 0.5, seed) + 0.15 * _noise(11 * p, 3.5, seed)
@@ -112,7 +112,7 @@ def _window(p, q, seed):
 
 @inner
 def _spines(x, seed):
-    """Return the weights of `mixture` for spines of books, some with a band."""
+    """Return the colour weights (m, n) for spines of books, some with a band."""
     i = math.floor(x + 0.3 * _noise(x, 0.5, seed))
     return _hash(i, 1, seed), (0.9 * _hash(i, 2, seed) if _hash(i, 3, seed) > 0.5 else 0.0)
 

@@ -72,7 +72,7 @@ class WorldsConfig(DrawnConfig):
 
 
 class WorldScene(DrawnScene):
-    """Abstract scene and its cameras. World frame: metres, z up, scaled by `drawn.scale`."""
+    """Random scene of simple shapes, and its cameras. World frame: z up, in units of metres."""
 
     _config: WorldsConfig
 

@@ -48,7 +48,7 @@ class MergingHead(Head):
 
     class Config(ComponentConfig):
         candidates: int = Field(default=16, ge=1)
-        """Number of candidates of each token, a power of two."""
+        """Number of candidate Gaussians of each token, a power of two."""
         level: float = Field(default=3.0, ge=0)
         """Base-2 logarithm of the number of Gaussians per token. Between two whole numbers, the
         Gaussians of both are rendered and blended."""
@@ -62,9 +62,9 @@ class MergingHead(Head):
         scale_bias: float = -2.0
         """Number added to raw log scales before they are bounded."""
         scale_min: float = Field(default=1e-4, gt=0)
-        """Bound of the scales of candidates, which are at least `scale_min` / e, world units."""
+        """Sets the smallest scale of a candidate Gaussian, `scale_min` / e, in world units."""
         scale_max: float = Field(default=0.05, gt=0)
-        """Bound of the scales of candidates, which are at most `scale_max` e^2, world units."""
+        """Sets the largest scale of a candidate Gaussian, `scale_max` e^2, in world units."""
         opacity_bias: float = -5.0
         """Number added to the logits of opacities."""
 

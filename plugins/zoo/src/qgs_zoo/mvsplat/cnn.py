@@ -47,7 +47,7 @@ class ResidualBlock(nn.Module):
 class CNN(nn.Module):
     """CNN: 7 x 7 convolution to half size, three stages of two residual blocks, 1 x 1 convolution.
 
-    width: channels of the last convolution. strides: of the second and the third stage. widths:
+    width: channels of the last convolution. strides: those of stages two and three. widths:
     channels of the three stages. Instance norms have neither parameters nor running statistics, so
     the CNN computes the same in training and evaluation.
     """

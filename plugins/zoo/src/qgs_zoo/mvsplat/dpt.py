@@ -85,8 +85,9 @@ def _to_depth(features: int) -> nn.Sequential:
 class DptHead(nn.Module):
     """Head that makes one full-size map of four ViT maps at 1/8 size and maps of other networks.
 
-    width: channels of the ViT's maps. channels: of the head at the four resolutions. features: F,
-    channels of the result. joined: total channels of the other networks' maps at 1/2, 1/4 and 1/8.
+    width: channels of the ViT's maps. channels: those of the head at its four resolutions.
+    features: F, channels of the result. joined: total channels of the other networks' maps at 1/2,
+    1/4 and 1/8.
     ends_in_depth: return one channel, a correction of depth.
     """
 

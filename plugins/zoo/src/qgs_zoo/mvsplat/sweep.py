@@ -74,7 +74,8 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
     """Project pixels at given depths into another view: positions (N, D, h, w, 2).
 
     Positions are in the units of torch's `grid_sample`. depth: camera-frame z of pixels, world
-    units. lens: fx, fy, cx, cy of both views. pose: from this view's camera to the other view's.
+    units. lens: fx, fy, cx, cy of both views. pose: transform from this view's camera to the
+    other's.
     """
     height, width = depth_NDhw.shape[-2:]
     fx, fy, cx, cy = (x[:, None, None] for x in lens_N4.unbind(-1))
