@@ -74,7 +74,7 @@ class Encoder(ModelComponent):
         """
         # Recipes that need it are refused, see `tunable`.
         raise NotImplementedError(
-            f"{type(self).__name__} cannot recompute a memory from new features"
+            f"{type(self).__name__} cannot recompute an image memory from new features"
         )
 
 

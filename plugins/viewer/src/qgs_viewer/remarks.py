@@ -32,7 +32,7 @@ def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
 def remarks(models: Sequence[Model]) -> list[str]:
     """Return remarks on chosen photos, on the evaluation of each model, and on scales.
 
-    A remark that holds for several models stands once, with their names.
+    A remark on several models is given once, with their names.
     """
     names: dict[str, list[str]] = {}
     for model in models:

@@ -62,7 +62,7 @@ class EllipsoidQueries(LearnedQueries):
     def start(self, batch_size: int) -> QueryState:
         """Return initial queries: features (B, N, D), and the fields of their anchors.
 
-        Those are centres (B, N, 3), unit quaternions (B, N, 4) and raw radii (B, N, 3).
+        The fields are centres (B, N, 3), unit quaternions (B, N, 4) and raw radii (B, N, 3).
         """
         # The optimiser changes the meaningless lengths; components get unit quaternions.
         quats = F.normalize(self.rotation, dim=-1)

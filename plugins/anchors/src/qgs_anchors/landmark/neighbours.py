@@ -1,4 +1,4 @@
-"""`landmark/neighbours`: self-attention of each query to those with the nearest anchors."""
+"""`landmark/neighbours`: each query attends to the queries with nearest anchors."""
 
 import torch
 from pydantic import Field

@@ -69,7 +69,7 @@ def spans(numbers: Iterable[int]) -> str:
 def merged(findings: Sequence[Finding]) -> list[Finding]:
     """Join findings that differ only in their frames.
 
-    If more than three findings still have the same remedy, join those too.
+    If more than three findings still have the same remedy, join these findings too.
     """
     equal = _joined(findings, attrgetter("reason", "fix", "severity"))
     kinds = Counter(finding.fix for finding in equal)

@@ -139,7 +139,7 @@ class Round(DecoderLayer):
 class Stream(nn.Module):
     """Layers of one stream in a round: cross-attention to the memory, MLP and ViT blocks.
 
-    They have pre-norms. Each update is multiplied by a LayerScale and added.
+    The layers have pre-norms. Each update is multiplied by a LayerScale and added.
     """
 
     # This bias adds the same number to all logits of a query.

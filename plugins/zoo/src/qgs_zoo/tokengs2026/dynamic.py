@@ -105,7 +105,7 @@ class DynamicQueries(Queries):
 
 
 class BlockCausalSelfAttention(ContentSelfAttention):
-    """Self-attention in which static queries read static ones only, and dynamic queries read all.
+    """Self-attention in which static queries read only each other, and dynamic queries read all.
 
     So static queries do not depend on the requested time.
     """
