@@ -139,7 +139,8 @@ class ImageMemory(TensorContainer):
     grid: (V, H/P, W/P) for patches of side P, with the product M; tokens are ordered by view, row,
         column. None for tokens that are not patches, such as learned latents.
 
-    The encoder's `writes` lists the parts that are not None.
+    The encoder's `writes` lists the parts that are not None. `once(name, compute)` returns a tensor
+    computed from this memory, and keeps it for later layers.
     """
 
     features: Tensor

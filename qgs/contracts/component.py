@@ -50,7 +50,7 @@ class FieldSpec:
     """Description of a named tensor that one component writes and later components read.
 
     shape: sizes of the axes after the first two, batch and item; a str is a symbolic size ("D").
-    frame: the coordinate frame of its numbers.
+    frame: the coordinate frame of its numbers, "none", "world" or "camera".
     encoding: a name for the meaning of raw numbers that could be read in several ways. Writer and
         reader must use the same one.
     """

@@ -26,13 +26,14 @@ class Loss(Component, torch.nn.Module):
         loss with a few views at a time and average the results. "all": the loss needs all target
         views at once. "none": the loss reads no rendering; it gets all target views and a rendering
         of no views, (B, 0, ...).
+    reads_depths: True if the loss reads `Views.depths`. Training then loads depth maps if the data
+        has any.
     """
 
     slot: ClassVar[str] = "losses"
     renderings: ClassVar[Literal["each", "all", "none"]] = "all"
     scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     reads_depths: ClassVar[bool] = False
-    """True if the loss reads `Views.depths`. Training then loads depth maps if the data has any."""
 
     class Config(ComponentConfig):
         weight: float = Field(default=1.0, ge=0)

@@ -49,7 +49,7 @@ SEPARATE = 200
 
 
 def check_gradients_reach_inputs(case: Case) -> None:
-    """Require a gradient for every floating-point input of the slot and every required field.
+    """Require a gradient for each input that the slot must read and for each required field.
 
     If a component stops a gradient on purpose, for example that of reference points, list this
     check and `gradients_match_differences` as expected failures. A component for ablations, which
