@@ -109,7 +109,7 @@ def load_plugins(
 ) -> Registry:
     """Load the plugins `names`; add a problem for each plugin that cannot be used.
 
-    tree: the merged recipe, for the lines of problems. given: plugins that need not be installed.
+    tree: the merged recipe, which gives problems their lines. given: plugins passed as objects.
     """
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
     plugins = {"qgs": BUILTIN}

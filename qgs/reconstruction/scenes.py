@@ -178,7 +178,8 @@ def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
 class GivenScene(Scene):
     """Views (1, V) that a user gave, as a scene.
 
-    Raises ValueError for several scenes, images out of range and a target time.
+    Raises ValueError for several scenes, for pixels far outside of [0, 1], and for views with a
+    target time.
     """
 
     name = "views"

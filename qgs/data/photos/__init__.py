@@ -120,7 +120,7 @@ def present_frames(
     if len(present) < 2:
         raise FileNotFoundError(
             f"{found.file} names {count} images, but {len(present)} exist and 2 are needed: add "
-            f"{listed(missing, 3) or 'photos'}, or name the folder that they are in as `images`"
+            f"{listed(missing, 3) or 'photos'}, or set the option `images` to their folder"
         )
     if missing:
         warn_once(f"{len(missing)} of {count} images of {folder} are missing: {listed(missing, 3)}")

@@ -56,7 +56,7 @@ def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
 
 
 class RayBias(AttentionBias):
-    """Bias gamma b as max(-factor D^2, lower), with D the distance of anchor centre and ray.
+    """Attention bias max(-factor D^2, lower), with D the distance of anchor centre and ray.
 
     Each query has five numbers: the anchor's centre mu, factor = gamma / (2 sigma^2) and
     lower = gamma bias_min. Each token has six: moment m and direction d of its ray. So kernels

@@ -114,7 +114,7 @@ class ScaleSearch:
         self.found: dict[tuple[str, Frames, Frames], FoundScale] = {}
 
     def __call__(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
-        """Return the settings for a window; call `find_scale` if they ask for a search."""
+        """Return the scale settings for a window of frames; search the scale if they say so."""
         if self.views.scale != "search":
             return self.views
         key = (scene.name, tuple(inputs), tuple(compared))

@@ -193,7 +193,7 @@ def plain(text: str) -> str:
 
 
 def description(scene: QueryScene, query: int, layer: int) -> str:
-    """Describe a query in Markdown: its Gaussians, its anchor, and why attention is missing."""
+    """Describe a query in Markdown: its Gaussians, its anchor, and, if it has no attention, why."""
     members = scene.members(query)
     lines = [f"**query {query}**, layer {layer}"]
     lines.append(f"Gaussians {members.start} to {members.stop - 1}")

@@ -67,7 +67,7 @@ class Geometry:
 
     @property
     def pixels(self) -> float:
-        """Median of the pairs' distances in pixels of the files."""
+        """Median distance of matches over all pairs, in pixels of the stored photos."""
         return self.fraction * self.diagonal
 
 

@@ -141,7 +141,7 @@ def _store(spans, k, found, t):
 
 @inner
 def _inside_row(kind, extra, heights, steps, o, base, step, spans):
-    """Write to `spans` (4, R) entry t, exit t, entry face and exit face for the rays of a row.
+    """Write the entry t, exit t, entry face and exit face of a row's R rays to `spans` (4, R).
 
     Each kind of primitive has its own loop, because LLVM vectorises loops without branches.
     """
