@@ -6,6 +6,7 @@ import re
 import shutil
 import struct
 import sys
+from dataclasses import replace
 from functools import partial
 from unittest.mock import MagicMock
 
@@ -19,6 +20,7 @@ from plyfile import PlyData
 from qgs_photos.refine.initial import from_points, photos_start, photos_world, sparse_points
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.result import page_writer
+from qgs_photos.refine.scene import faults_of_given_poses
 from qgs_photos.refine.scene_photos import (
     TIMED,
     ScenePhotos,
@@ -91,6 +93,21 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     rgb = RENDERER(qgs.load_ply(again / "scene.ply"), views.cameras).rgb
     psnr = -10 * (rgb - views.images).square().mean().log10()
     assert float(psnr) == pytest.approx(record["mean"]["psnr"], abs=0.01)
+
+
+def test_poses_that_came_with_the_photos_are_looked_at(taken, photos_of_scene, tmp_path):
+    assert faults_of_given_poses(photos_of_scene) == []
+    c2w = taken.c2w.copy()
+    c2w[2, 0, 3] += 1e4
+    stray = write_nerfstudio(tmp_path / "stray", replace(taken, c2w=c2w))
+    photos = ScenePhotos(str(stray), Options())
+    assert len(photos.small) == 8
+    (fault,) = faults_of_given_poses(photos)
+    assert fault.names == ("images/2.png",)
+    # COLMAP makes the poses of a video in a folder beside it
+    photos.path = str(tmp_path / "walk.mp4")
+    (tmp_path / "walk.mp4").touch()
+    assert faults_of_given_poses(photos) == []
 
 
 def test_a_model_makes_the_start(photos, tmp_path):

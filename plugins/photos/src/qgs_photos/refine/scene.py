@@ -1,5 +1,6 @@
 """Run `qgs scene`: make the files of the best scene from photos in a given time."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -7,11 +8,14 @@ from time import perf_counter
 import torch
 from rich.console import Console
 
+from qgs.data.photos.finding import is_inside
+from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import views_in
 from qgs.paths import opened_path
 from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians, Views
 from qgs_photos.datatools.check import faults_of_poses
+from qgs_photos.datatools.findings import Finding
 from qgs_photos.printing import say
 from qgs_photos.refine.initial import Initialisation, chosen_initialisation, photos_start
 from qgs_photos.refine.options import Options
@@ -48,8 +52,7 @@ def make_scene(
         return options.seconds or max(ends - perf_counter(), _LEAST_PART * seconds)
 
     photos = ScenePhotos(path, options)
-    # those that COLMAP makes are checked by `qgs poses`
-    for finding in faults_of_poses(opened_path(path), options.scene, _JUDGING)[:1]:
+    for finding in faults_of_given_poses(photos)[:1]:
         say(console, str(finding))
     start = chosen_initialisation(photos, options)
     small = views_in(start.world, photos.small, photos.frames).to(options.device)
@@ -89,6 +92,15 @@ def make_scene(
     judged = every.select(slice(len(photos.frames), None))
     result = Result(command, start.world, refined, photos, views, judged)
     write_scene(result, out, page, began, console)
+
+
+def faults_of_given_poses(photos: ScenePhotos) -> Sequence[Finding]:
+    """Return errors of poses that came with the photos; none for poses that COLMAP made here."""
+    path = opened_path(photos.path)
+    # Poses of a video or of photos without cameras lie in a folder beside them.
+    if isinstance(photos.small, PhotoScene) and not is_inside(path, photos.small.folder):
+        return []
+    return faults_of_poses(path, photos.name, _JUDGING)
 
 
 def with_start(options: Options, start: Initialisation) -> Options:
