@@ -3,7 +3,7 @@
 import os
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -28,7 +28,7 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     images: the folder in `folder` that photos are read from. outside: files elsewhere are taken,
     too. Raises ValueError where two files may be meant, and for a file outside of `folder`.
     """
-    photos = dict.fromkeys(frame.path for frame in found.frames if frame.name)
+    photos = [frame.path for frame in found.frames if frame.name]
     maps = [file for frame in found.frames for file in (frame.mask, frame.depth) if file]
     where = found_files(folder, photos, maps, images, outside)
     for file in () if outside else (*photos, *maps):
@@ -61,8 +61,8 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
 
 def found_files(
     folder: UPath,
-    photos: Collection[UPath],
-    maps: Collection[UPath] = (),
+    photos: Iterable[UPath],
+    maps: Iterable[UPath] = (),
     images: str | None = None,
     outside: bool = False,
 ) -> dict[UPath, UPath]:
@@ -74,13 +74,16 @@ def found_files(
     """
     indexed = cache(_index)
     photo_folder = image_folder(folder, images)
+    # By hash: a listing may name thousands.
+    photos = dict.fromkeys(photos)
+    files = (*photos, *maps)
     where = dict[UPath, UPath]()
-    for file in (*photos, *maps):
-        read_there = not images or file not in photos
-        if read_there and (outside or is_inside(folder, file)):
-            where.update({file: file} if (0, file.name) in indexed(file.parent) else {})
+    for file in files:
+        read_there = (outside or is_inside(folder, file)) and not (images and file in photos)
+        if read_there and (0, file.name) in indexed(file.parent):
+            where[file] = file
     taken = {*where}
-    for file in (*photos, *maps):
+    for file in files:
         if file in where:
             continue
         parts = inside(folder, file) if is_inside(folder, file) else file.parts[1:]

@@ -13,10 +13,10 @@ from upath import UPath
 
 from qgs.extensions import ExtensionError, installed, load
 from qgs.paths import listing
+from qgs.types import Size
 from qgs.wording import listed, numbered, warn_once
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
-Size: TypeAlias = tuple[int, int]
 GROUP = "qgs.photo_readers"
 """Entry-point group for readers of plug-ins: FORMAT = "module:subclass of `PhotoReader`"."""
 UNLESS = (
@@ -219,6 +219,8 @@ def mended(found: Listing) -> Listing:
 
     Metashape multiplies all rotations by one number.
     """
+    if not found.frames:
+        return found
     poses = torch.from_numpy(np.stack([frame.c2w for frame in found.frames]))
     scales = torch.linalg.det(poses[:, :3, :3]).abs() ** (1 / 3)
     # A shear and NaN stay as they are, and are refused.

@@ -4,8 +4,9 @@ Names of values decide what they mean; an ambiguous name is refused.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,8 @@ class CamerasJson(PhotoReader):
             raise ValueError(f"{file} lists no cameras: expected {_FORM}")
         if any(names):
             listed = [folder / name for name in names]
-            found = found_files(folder, listed, images=images)
+            named = [folder / name for name in names if name]
+            find = cache(partial(found_files, folder, named, images=images))
         else:
             place = image_folder(folder, images)
             listed = image_files(place)
@@ -101,8 +103,8 @@ class CamerasJson(PhotoReader):
                     f"{file} lists {len(cameras)} cameras without names of images, but {place} has "
                     f"{len(listed)} images: name the images, as in {_FORM}"
                 )
-            found = {}
-        read = [_Camera(*pair, found) for pair in zip(cameras, listed, strict=True)]
+            find = dict
+        read = [_Camera(*pair, find) for pair in zip(cameras, listed, strict=True)]
         if any(camera.in_parts for camera in read):
             warn_once(f"intrinsics in {file} are read as fractions of width and height")
         return Listing(file, [camera.frame(folder) for camera in read])
@@ -147,15 +149,16 @@ def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
 class _Camera:
     """A camera of the file.
 
-    values: its entry. path: its photo as listed. found: where listed photos are.
+    values: its entry. path: its photo as listed. find: function that returns where listed photos
+    are; called only if no size is listed.
     """
 
     def __init__(
-        self, values: Mapping[str, Any], path: UPath, found: Mapping[UPath, UPath]
+        self, values: Mapping[str, Any], path: UPath, find: Callable[[], Mapping[UPath, UPath]]
     ) -> None:
         self.values = values
         self.path = path
-        self.real = found.get(path, path)
+        self.find = find
         self.problems = list[FrameProblem]()
         sides = [values.get(s, values.get(long)) for s, long in (("h", "height"), ("w", "width"))]
         self.size: Size | None = None
@@ -223,7 +226,7 @@ class _Camera:
         """Return (H, W) as listed, or else that of the image file; None if it cannot be read."""
         if self.size is None:
             with suppress(ValueError):
-                self.size = read_image(self.real, image_size)
+                self.size = read_image(self.find().get(self.path, self.path), image_size)
         return self.size
 
     def frame(self, folder: UPath) -> PhotoFrame:

@@ -18,8 +18,8 @@ from qgs_photos.datatools.photos import DecodedScene
 
 # Of a rotation's entries.
 _SAME = 2e-6
-# Of the cameras' extent: the largest distance that counts as none.
-_OF_EXTENT = 1e-4
+# Of the cameras' extent: the largest distance that counts as none, the rounding of float32.
+_OF_EXTENT = 5e-7
 
 
 def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
