@@ -15,16 +15,16 @@ from rich.progress import Progress
 from torch import Tensor
 
 from qgs.contracts import Renderer
+from qgs.data.samples import in_world
 from qgs.drawing.images import rgb_picture
 from qgs.files import replacing
-from qgs.geometry.poses import relative_to, scaled
-from qgs.geometry.transforms import moved
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians
 from qgs_photos.poses.paths import KINDS, path_of, read_path
 from qgs_photos.record import GAUSSIANS, has_record, read_record
+from qgs_photos.viewing import VIEWER, in_own_world
 
 SUFFIXES = (".mp4", ".webp")
 # Of x264; 0 loses nothing, 23 is its default.
@@ -118,9 +118,7 @@ def cameras_of(
         found = path_of(path, scene.cameras, seen_depth(scene), max(frames, 2))
         return Cameras(found.c2w, lenses(found, size, fov), size)
     c2w, intrinsics = read_path(Path(path), size, fov)
-    reference, scale = scene.world
-    inside = scaled(relative_to(reference, c2w), scale)
-    return Cameras(inside.float()[None], intrinsics.float()[None], size)
+    return in_world(scene.world, Cameras(c2w, intrinsics, size))[None]
 
 
 def _film_size(photos: tuple[int, int]) -> tuple[int, int]:
@@ -182,24 +180,12 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
         )
     if photos is None:
         raise ValueError(f"{file} holds no cameras: name the photos, `qgs video {source} PHOTOS`")
-    # as viewers show files of Gaussians
-    renderer = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0)))
-    cameras = photo_scene(photos, None, name).cameras
-    return _in_own_world(load_ply(file), cameras, renderer)
-
-
-def _in_own_world(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> FilmScene:
-    """Move Gaussians (1, G) and cameras (V,) from the photos' world to that of the first camera."""
-    # near and far of renderers are made for worlds in which what is seen is about 1 away
-    reference = cameras.c2w[0].double()
-    scale = 1 / _median_depth(gaussians, reference)
-    inside = scaled(relative_to(reference, cameras.c2w.double()), scale)
-    return FilmScene(
-        gaussians=moved(gaussians, scaled(torch.linalg.inv(reference), scale), float(scale)),
-        cameras=Cameras(inside.float()[None], cameras.intrinsics.float()[None], cameras.size),
-        renderer=renderer,
-        world=(reference, scale),
-    )
+    gaussians = load_ply(file)
+    cameras = photo_scene(photos, None, name).cameras.to(torch.float64)
+    # near of renderers is made for worlds in which what is seen is about 1 away
+    world = (cameras.c2w[0], 1 / _median_depth(gaussians, cameras.c2w[0]))
+    inside = in_world(world, cameras)[None]
+    return FilmScene(in_own_world(world, gaussians), inside, VIEWER, world)
 
 
 def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:

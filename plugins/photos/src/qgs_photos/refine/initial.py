@@ -23,7 +23,7 @@ from qgs.types import Gaussians, Views
 from qgs_photos.datasets.colmap import Colmap
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.scene_photos import TIMED, ScenePhotos
-from qgs_photos.refine.sweeping import swept
+from qgs_photos.refine.sweeping import balls, swept
 
 ENOUGH = 4
 """Number of photos from which on Gaussians placed at pixels are as good a start as those of a
@@ -185,7 +185,5 @@ def from_points(
     # a point that stands alone, or on others, is as large as the usual one
     middle = gaps.nanmedian().nan_to_num(1.0)
     gaps = gaps.nan_to_num(float(middle)).clamp(0.1 * middle, 5 * middle).clamp_min(1e-6)
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(1, len(means), 4)
-    opacities = torch.full((1, len(means)), _OPACITY)
     scales = gaps[None, :, None].expand(-1, -1, 3)
-    return Gaussians(means[None], scales, quats, opacities, colors[drawn].float()[None])
+    return balls(means[None], scales, _OPACITY, colors[drawn].float()[None])

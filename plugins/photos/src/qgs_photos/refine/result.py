@@ -17,24 +17,21 @@ from qgs.drawing.images import rgb_picture
 from qgs.extensions import INSTALL_ALL
 from qgs.files import replacing_entries, write_text
 from qgs.geometry.harmonics import seen_colors
-from qgs.geometry.poses import scaled
 from qgs.geometry.transforms import moved, to_camera, to_pixels
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.reconstruction.scene_formats import load_ply, save_ply, save_splat
-from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Rendering, Views
 from qgs_photos.printing import say
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
+from qgs_photos.viewing import VIEWER, in_own_world
 
 # Held-out photos in the picture.
 _SHOWN = 6
 # Photos on the page.
 _ON_PAGE = 12
 _SCORES = ("psnr", "ssim", "alpha", "nearest_input")
-# As viewers show a file of Gaussians: over black, however far they are.
-_RENDERER = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0), far=1e4))
 
 PageWriter = Callable[[Gaussians, Views, tuple[float, float, float]], str]
 
@@ -62,9 +59,7 @@ class Result:
 
     def read_back(self, file: Path) -> "Result":
         """Return the result with the Gaussians that `file` holds, so that the file is scored."""
-        reference, scale = self.world
-        pose = scaled(torch.linalg.inv(reference.double()), scale)
-        gaussians = moved(load_ply(file).to(reference.device), pose, float(scale))
+        gaussians = in_own_world(self.world, load_ply(file).to(self.world[0].device))
         return replace(self, refined=replace(self.refined, gaussians=gaussians))
 
     def photo(self, frame: int) -> str:
@@ -74,7 +69,7 @@ class Result:
     def render(self, views: Views) -> Rendering:
         """Render the scene from the cameras of `views` (1, V)."""
         gaussians = replace(self.refined.gaussians, features=None)
-        return _RENDERER(gaussians, views.cameras)
+        return VIEWER(gaussians, views.cameras)
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from qgs.containers import map_tensors
 from qgs.types import Gaussians, Views
 from qgs_photos.refine.refining import distance, joined
-from qgs_photos.refine.sweeping import pixel_rays
+from qgs_photos.refine.sweeping import balls, pixel_rays
 
 # Angle between neighbours, in radians; also their standard deviation.
 _GAP = 0.1
@@ -43,12 +43,8 @@ def surrounded(gaussians: Gaussians, views: Views, color: Sequence[float]) -> Ga
     directions = F.normalize(centres[:, None] + radius * rays, dim=-1).flatten(0, 1)
     # Many photos look the same way: one Gaussian for each cell.
     sphere = F.normalize((directions / _GAP).round().unique(dim=0), dim=-1)[None]
-    far = Gaussians(
-        means=middle + radius * sphere,
-        scales=torch.full_like(sphere, radius * _GAP),
-        quats=sphere.new_tensor([1.0, 0, 0, 0]).expand(*sphere.shape[:2], 4),
-        opacities=torch.full_like(sphere[..., 0], _OPACITY),
-        colors=sphere.new_tensor(color).expand_as(sphere),
-    )
+    means = middle + radius * sphere
+    scales = torch.full_like(sphere, radius * _GAP)
+    far = balls(means, scales, _OPACITY, sphere.new_tensor(color).expand_as(sphere))
     # First in the file, so that viewers which have not sorted yet draw them behind all others.
     return map_tensors(lambda part: part.roll(far.count, 1), joined(gaussians, far))

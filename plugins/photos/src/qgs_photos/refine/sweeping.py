@@ -52,8 +52,13 @@ def swept(views: Views, count: int, size: float, generator: torch.Generator) -> 
         own = drawn[drawn // pixels == photo] % pixels
         parts += [_on_photo(views, photo, few, size) for few in own.split(_AT_ONCE)]
     means, scales, colors = (torch.cat(part)[None] for part in zip(*parts, strict=True))
-    quats = means.new_tensor([1.0, 0, 0, 0]).expand(1, count, 4)
-    return Gaussians(means, scales, quats, torch.full_like(means[..., 0], _OPACITY), colors)
+    return balls(means, scales, _OPACITY, colors)
+
+
+def balls(means: Tensor, scales: Tensor, opacity: float, colors: Tensor) -> Gaussians:
+    """Return round Gaussians (1, G), all of one opacity. means, scales, colors: (1, G, 3)."""
+    quats = means.new_tensor([1.0, 0, 0, 0]).expand(*means.shape[:2], 4)
+    return Gaussians(means, scales, quats, torch.full_like(means[..., 0], opacity), colors)
 
 
 def _on_photo(

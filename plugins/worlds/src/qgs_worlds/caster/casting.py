@@ -7,14 +7,12 @@ from itertools import product
 import numpy as np
 import torch
 
+from qgs.types import Size
 from qgs_worlds.caster.raycast import trace
 from qgs_worlds.caster.tables import Room, World
 
 # Rows of an image that one thread casts at a time: small enough to share, and to stay in its cache.
 _BAND = 64
-
-Size = tuple[int, int]
-"""Image height and width in pixels."""
 
 
 def cast(

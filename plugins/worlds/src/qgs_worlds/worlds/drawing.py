@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from qgs.types import Size
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.casting import Size, cast
+from qgs_worlds.caster.casting import cast
 from qgs_worlds.caster.effects import Effects
 from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.caster.shading import paint

@@ -1,0 +1,22 @@
+"""Show Gaussians of a file as viewers do, in a world that suits a renderer."""
+
+import torch
+from torch import Tensor
+
+from qgs.geometry.poses import scaled
+from qgs.geometry.transforms import moved
+from qgs.renderers import AutoRenderer
+from qgs.types import Gaussians
+
+VIEWER = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0), far=1e4))
+"""Renderer over black, however far Gaussians are, as in most viewers."""
+
+
+def in_own_world(world: tuple[Tensor, Tensor], gaussians: Gaussians) -> Gaussians:
+    """Move Gaussians (1, G) from the photos' world into `world`; twin of `in_world` of cameras.
+
+    world: reference pose (4, 4) and scale, see `own_world`.
+    """
+    reference, scale = world
+    pose = scaled(torch.linalg.inv(reference.double()), scale)
+    return moved(gaussians, pose, float(scale))
