@@ -1,4 +1,4 @@
-"""Trackers for `training.trackers`: TensorBoard and Weights & Biases, by way of accelerate."""
+"""Trackers for `training.trackers`: TensorBoard and Weights & Biases, through `accelerate`."""
 
 import uuid
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from qgs.train.tracking import Tracker
 
 
 class _OfAccelerate(Tracker):
-    """Base of trackers that use a tracker of accelerate, `_tracker`."""
+    """Base class of trackers that log by a tracker of the package `accelerate`, `_tracker`."""
 
     _tracker: Any
     _of_pictures: ClassVar[Mapping[str, str]] = {}
@@ -41,7 +41,7 @@ class _OfAccelerate(Tracker):
 
 
 class TensorBoard(_OfAccelerate):
-    """TensorBoard tracker, which writes to RUN/tensorboard."""
+    """TensorBoard tracker, which writes to `tensorboard/` in the run folder."""
 
     package = "tensorboard"
     _of_pictures: ClassVar = {"dataformats": "NHWC"}
@@ -53,9 +53,9 @@ class TensorBoard(_OfAccelerate):
 
 
 class WeightsAndBiases(_OfAccelerate):
-    """Weights & Biases tracker, which writes to RUN/wandb.
+    """Weights & Biases tracker, which writes to `wandb/` in the run folder.
 
-    A resumed training continues the same run of Weights & Biases.
+    A resumed training continues its earlier run of Weights & Biases.
     """
 
     package = "wandb"

@@ -1,4 +1,4 @@
-"""Checks of a study before training: all variants are resolved, built and compared."""
+"""Checks of a study before training: the recipes of all variants are checked and compared."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -24,10 +24,10 @@ from qgs_research.studies.study import Study
 
 
 def planned(study: Study, folder: Path) -> Plan:
-    """Resolve all variants and check the whole study. Nothing is written or trained.
+    """Check the recipes of all variants and the whole study. Nothing is written or trained.
 
     Raises the errors of `composed` and of data sources. Raises ValueError if `folder` has results
-    of a variant or an evaluation that has changed since.
+    of a variant or an evaluation whose recipe has changed since they were made.
     """
     plan = Plan(study, folder, composed(study))
     check_data(plan)
@@ -36,7 +36,7 @@ def planned(study: Study, folder: Path) -> Plan:
 
 
 def composed(study: Study) -> dict[str, Recipe]:
-    """Return the resolved recipes of all variants, with the budget of the study.
+    """Return the checked recipes of all variants, with the budget of the study.
 
     Raises RecipeError with all faults of the recipes and all forbidden differences between them.
     Raises the errors of building the models.
@@ -69,7 +69,11 @@ def composed(study: Study) -> dict[str, Recipe]:
 
 @contextmanager
 def _collected(problems: Problems, place: str, origin: Origin) -> Iterator[None]:
-    """Add the faults of a recipe to `problems` instead of raising them."""
+    """Add the faults of a RecipeError raised inside the block to `problems`, and go on.
+
+    place: name of the checked part in the study file. origin: its file and line, used for faults
+    without a line.
+    """
     try:
         yield
     except RecipeError as error:
@@ -89,7 +93,7 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
 
 
 def _build(recipe: Recipe) -> None:
-    """Build the model (without memory for weights), losses and optimiser, to find errors."""
+    """Build model, losses and optimiser to find errors; the model's weights take no memory."""
     recipe.build_optimizer()
     # Use the meta device, because published models would not fit into a laptop's memory.
     recipe.rate_factors(recipe.build_model("meta"))
@@ -113,7 +117,7 @@ INDEX = "evaluation.index"
 
 
 def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Add a problem for each difference between variants that `differs` does not allow."""
+    """Add a problem for each difference of a variant to the reference that is not in `differs`."""
     settings = study.settings
     first = recipes[settings.reference]
     used = set[str]()
@@ -147,7 +151,7 @@ def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems)
 
 
 def check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Add a problem for each variant that equals an earlier variant."""
+    """Add a problem for each variant whose recipe equals that of an earlier variant."""
     names: dict[str, str] = {}
     for name, recipe in recipes.items():
         tree = {key: part for key, part in recipe.tree.items() if key not in BESIDE}
@@ -160,9 +164,9 @@ def check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Proble
 
 
 def check_data(plan: Plan) -> None:
-    """Open every data source and evaluation index once.
+    """Open the data source and the evaluation index of every variant and evaluation.
 
-    Raises their errors, and OptionError for a metric that cannot be measured.
+    Raises the errors of opening, and OptionError for a metric that cannot be measured.
     """
     settings = plan.study.settings
     metrics = [settings.metric, *(h.metric for h in settings.hypotheses if h.metric)]
@@ -190,7 +194,7 @@ def check_data(plan: Plan) -> None:
 
 
 def refuse_changed(plan: Plan) -> None:
-    """Raise ValueError if existing runs or results were made by recipes that have changed since."""
+    """Raise ValueError if a recipe has changed since runs or results were made by it."""
     for variant, name in product(plan.recipes, plan.evaluations):
         recipe = plan.evaluation_recipe(variant, name)
         file = recipe_file(plan.folder, variant, name)

@@ -38,9 +38,10 @@ A random order of three variants equals the published order in 1 of 6 cases; of 
 
 
 class Judgement(NamedTuple):
-    """Verdict on a hypothesis: seen, contradicted or undecided, with a reason.
+    """Verdict on a hypothesis, with a reason: "seen" (supported), "contradicted" or "undecided".
 
-    estimate: left side minus right side; None if their runs have no scores in common.
+    estimate: left side of the hypothesis minus its right side; None if the runs of the two sides
+    have no scores for a common seed and scene.
     """
 
     hypothesis: Hypothesis
@@ -72,7 +73,7 @@ class Results(Scores):
 
     @property
     def shared(self) -> str | None:
-        """Name of the first evaluation with the same protocol for all runs, or None."""
+        """Name of the first evaluation by one protocol for all runs; None if all have several."""
         # The order is that of the study, so the recipes' own evaluation comes first.
         return next((n for n in self.plan.evaluations if len(self.protocols(n)) == 1), None)
 
@@ -103,10 +104,10 @@ class Results(Scores):
         )
 
     def rank_correlation(self) -> float | None:
-        """Return Spearman's rank correlation of measured means and published values.
+        """Return Spearman's rank correlation of measured means and published values, by variant.
 
-        The means are from the default evaluation. None for fewer than five variants, and if their
-        protocols differ.
+        The means are from the default evaluation. Returns None for fewer than five variants with
+        both values, and if the variants were evaluated by different protocols.
         """
         published = self.settings.published
         scores = {variant: self.score(variant, self.metric) for variant in published}
@@ -118,9 +119,9 @@ class Results(Scores):
 
 
 def write_files(results: Results) -> Path:
-    """Write results.json and table.md, and return the path of table.md.
+    """Write results.json and table.md into the study's folder; return the path of table.md.
 
-    When the same runs are trained again, only `times` in results.json may differ.
+    If the whole study is trained again, only `times` in results.json may differ.
     """
     study = results.plan.study
     head = "\n\n".join(filter(None, [f"# {study.title}", study.settings.question]))
@@ -131,7 +132,7 @@ def write_files(results: Results) -> Path:
 
 
 def answer(results: Results) -> str:
-    """Return one line that says whether a variant is better than the reference."""
+    """Return one line that says whether a variant is better than the reference variant."""
     text = _verdict(results)
     if results.failed:
         text += f" Failed: {listed(results.failed)}."
@@ -141,11 +142,12 @@ def answer(results: Results) -> str:
 
 
 def _verdict(results: Results) -> str:
-    """Return whether the best variant is better than the reference, without missing runs.
+    """Return a sentence that says whether the best variant is better than the reference.
 
-    The evaluation is `Results.shared`. The best of n variants counts as better if its interval at
-    confidence 1 - 0.05 / n does not contain 0 (Bonferroni correction). The claim that all variants
-    are worse needs no correction, because each of them must be worse (intersection-union test).
+    The scores are from the evaluation `Results.shared`. The best of n variants counts as better if
+    its interval at confidence 1 - 0.05 / n does not contain 0 (Bonferroni correction). The
+    statement that all variants are worse needs no correction, because it needs n intervals below 0
+    (intersection-union test).
     """
     if results.metric not in results.columns:
         return "Not known yet: no run is finished."
@@ -201,7 +203,10 @@ def notes(results: Results) -> list[str]:
 
 
 def study_summary(results: Results) -> Summary:
-    """Return the answer, a table of verdicts, a table for each evaluation, and notes."""
+    """Return the results of a study as text for readers.
+
+    The tables are the verdicts on hypotheses and one table of scores for each evaluation.
+    """
     head = ["hypothesis", "metric", "left - right", "95 % interval", "verdict", "sample", "note"]
     judged = [_hypothesis_row(results, judgement) for judgement in results.judgements()]
     tables: list[tuple[str, Rows]] = [("", [head, *judged])] if judged else []
@@ -230,7 +235,7 @@ def _hypothesis_row(results: Results, judgement: Judgement) -> list[str]:
 
 
 def record(results: Results) -> dict[str, Any]:
-    """Return the content of results.json: all tables, verdicts, notes and training times."""
+    """Return the content of results.json: answer, scores, verdicts, notes and training times."""
     table = [row for name in results.plan.evaluations for row in table_records(results, name)]
     return {
         "answer": answer(results),
@@ -253,7 +258,7 @@ def record(results: Results) -> dict[str, Any]:
 
 
 def _times(results: Results) -> Iterator[dict[str, Any]]:
-    """Yield the number of steps and the training time in seconds of every run."""
+    """Yield a record for every run: variant, seed, number of steps, training time in seconds."""
     for run in results.plan.runs:
         # The clock of training stands still between sessions.
         for last in read_records(run.folder / "history.jsonl")[-1:]:

@@ -1,4 +1,4 @@
-"""Execution of a study. Each run has its own process, and `workers` runs are trained at a time.
+"""Train and evaluate the runs of a study, each in its own process, several at a time.
 
 A killed process loses only the training steps since its last save.
 """
@@ -40,7 +40,10 @@ _SECONDS = 0.3
 def run_study(
     file: str, out: Path, workers: int, threads: int | None, only: int | None, device: str
 ) -> int:
-    """Do the work of `qgs study`, and return the exit code."""
+    """Do the work of `qgs study`, and return the exit code.
+
+    only: number of the one run to train, from 0; None trains all runs.
+    """
     console = Console()
     with console.status("composing and checking all variants"):
         plan = planned(read_study(file), out)
@@ -79,9 +82,10 @@ def train_missing(
 ) -> tuple[list[Run], signal.Signals | None]:
     """Train and evaluate those of `runs` that are not done.
 
-    Returns the failed runs, and the signal that stopped training or None. If another call on this
-    machine trains one of the runs, this call waits for it, and continues the run if that call dies.
-    threads: CPU threads per run; None divides the threads among the workers. Runs share the GPUs.
+    Returns the failed runs, and the signal that stopped training (None if it was not stopped). If
+    another call on this machine trains a run, this call waits for the run, and continues the run if
+    that call dies. workers: number of runs trained at a time, which share the GPUs. threads: CPU
+    threads per run; None divides the threads among the workers.
     """
     threads = threads or max(torch.get_num_threads() // workers, 1)
     # Slurm, for example, sets this variable: the other GPUs belong to other jobs.
@@ -123,7 +127,7 @@ def train_missing(
 
 
 def started(plan: Plan, run: Run, threads: int, device: str, gpu: str) -> Popen[bytes]:
-    """Start a process that trains `run` and prints to its log file.
+    """Start a process that trains and evaluates `run` and prints to the log file of the run.
 
     gpu: value of CUDA_VISIBLE_DEVICES; "" leaves the variable unchanged.
     """
@@ -149,14 +153,14 @@ def _ended(plan: Plan, run: Run, code: int) -> str:
 
 
 def lock_of(run: Run) -> FileLock:
-    """Return the lock of a run. Entering it raises Timeout if another process trains the run."""
+    """Return the lock of a run. Entering the lock raises Timeout if another process holds it."""
     run.folder.parent.mkdir(parents=True, exist_ok=True)
     # The kernel releases the lock when a process dies, so a killed run is free at once.
     return FileLock(run.beside("lock"), blocking=False)
 
 
 def is_free(run: Run) -> bool:
-    """Return True if no process trains or evaluates `run`."""
+    """Return True if no process trains or evaluates `run` at this moment."""
     try:
         with lock_of(run):
             return True
@@ -165,10 +169,10 @@ def is_free(run: Run) -> bool:
 
 
 def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -> None:
-    """Train and evaluate a run of the study in `folder`. Existing results are kept.
+    """Train and evaluate one run of the study in `folder`. Existing results are kept.
 
-    If another process trains the run, this one does nothing. An error is written to a file beside
-    the run folder.
+    If another process trains the run, nothing is done. An error is written to a file beside the run
+    folder.
     """
     # a call that is killed cannot end its runs, so each run watches its call
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
@@ -191,7 +195,10 @@ def _end_with(parent: int) -> None:
 
 
 def _train_and_evaluate(folder: Path, run: Run, device: str, evaluations: Sequence[str]) -> None:
-    """Train `run` to the end and do its missing evaluations. Raises the errors of both."""
+    """Train `run` to the end, then do its missing evaluations.
+
+    Raises the errors of training and evaluation. A stopped training is saved but not evaluated.
+    """
 
     def recipe_of(evaluation: str) -> Recipe:
         return resolve(recipe_file(folder, run.variant, evaluation), [f"seed={run.seed}"])

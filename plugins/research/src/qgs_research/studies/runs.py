@@ -21,7 +21,10 @@ BESIDE = ("seed", "plugins")
 
 @dataclass(frozen=True)
 class Run:
-    """Training of one variant with one seed. folder: run folder, as of `qgs train`."""
+    """Training of one variant with one seed.
+
+    folder: run folder, with the same files as the run folder of `qgs train`.
+    """
 
     variant: str
     seed: int
@@ -31,7 +34,7 @@ class Run:
         return f"{self.variant} seed {self.seed}"
 
     def beside(self, suffix: str) -> Path:
-        """Return the path of a file beside the run folder, such as `seed-0.lock`."""
+        """Return the path of a file next to the run folder: `beside("lock")` is `seed-0.lock`."""
         return self.folder.with_name(f"{self.folder.name}.{suffix}")
 
     @property
@@ -54,11 +57,11 @@ class Run:
         return first_line.partition(". ")[0]
 
     def evaluation(self, name: str) -> Path:
-        """Return the folder with the run's results of the evaluation `name`."""
+        """Return the folder for the results of this run in the evaluation `name`."""
         return self.folder / (f"evaluation-{name}" if name else "evaluation")
 
     def evaluated(self, name: str) -> bool:
-        """Return True if the run's results of the evaluation `name` are complete."""
+        """Return True if the results of this run in the evaluation `name` are complete."""
         # An evaluation writes this file last.
         return (self.evaluation(name) / "protocol.json").is_file()
 
@@ -67,7 +70,8 @@ class Run:
 class Plan:
     """Runs and evaluations of a study in `folder`.
 
-    recipes: resolved recipes by variant, with the first seed of the study.
+    recipes: checked recipe of each variant, by name of the variant. All have the study's first
+    seed.
     """
 
     study: Study
@@ -81,7 +85,7 @@ class Plan:
 
     @property
     def runs(self) -> list[Run]:
-        """All runs of the study, ordered by seed, then by variant."""
+        """All runs of the study: each variant with the first seed, then with the second, ..."""
         seeds = self.study.settings.seeds
         # Seeds come first, so that an unfinished study has complete comparisons.
         return [run_of(self.folder, name, seed) for seed in seeds for name in self.recipes]
@@ -104,26 +108,29 @@ class Plan:
 
 
 def run_of(folder: Path, variant: str, seed: int) -> Run:
-    """Return the run of a variant with a seed. folder: folder of the study."""
+    """Return the run of `variant` with `seed` in the study folder `folder`."""
     return Run(variant, seed, folder / "runs" / variant / f"seed-{seed}")
 
 
 def recipe_file(folder: Path, variant: str, evaluation: str = MAIN) -> Path:
-    """Return the path of a variant's resolved recipe for training, or for an evaluation."""
+    """Return the path of a variant's checked recipe in the study folder.
+
+    The recipe is that of the training by default, or that of the evaluation `evaluation`.
+    """
     # Names have no @, which separates variant and evaluation in hypotheses too.
     name = f"{variant}@{evaluation}" if evaluation else variant
     return folder / "variants" / f"{name}.yaml"
 
 
 def changed_recipe(recipe: Recipe, changes: MapNode) -> Recipe:
-    """Apply the changes of an evaluation to `recipe`. Raises RecipeError for invalid options."""
+    """Return `recipe` with the changes of an evaluation. Raises RecipeError for invalid options."""
     tree = from_plain(recipe.tree, Origin("the variant"))
     assert isinstance(tree, MapNode)
     return resolve(merge(tree, changes))
 
 
 def write_plan(plan: Plan) -> None:
-    """Write the resolved recipes of all variants, which the training processes read."""
+    """Write the checked recipes of all variants, which the training processes read."""
     for variant, evaluation in product(plan.recipes, plan.evaluations):
         # Include the file and line that set each value, for readers of the folder.
         text = annotated(plan.evaluation_recipe(variant, evaluation))
@@ -131,6 +138,9 @@ def write_plan(plan: Plan) -> None:
 
 
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[str | None, str | None]]:
-    """Return the options in which two recipes differ, with both values, except those in BESIDE."""
+    """Return the options in which two recipes differ: both values, by path of the option.
+
+    A missing value is None. Options in BESIDE are left out, because they do not change the model.
+    """
     found = differing_options(ours.tree, theirs.tree)
     return {path: values for path, values in found.items() if path not in BESIDE}

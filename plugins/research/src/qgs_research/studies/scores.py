@@ -23,9 +23,9 @@ Terms: TypeAlias = Mapping[tuple[str, str], int]
 class Scores:
     """Stored results of several models, with their means and differences.
 
-    stored: results by (model, evaluation), then by seed. reference: model with which the others are
-    compared. metric: metric that decides which model is better. across_protocols: True allows
-    differences between results of different protocols.
+    stored: results by (model, evaluation), then by seed. reference: model with which the other
+    models are compared. metric: metric that decides which model is better. across_protocols: True
+    allows differences between results of different evaluation protocols.
     """
 
     stored: Mapping[tuple[str, str], Runs]
@@ -35,7 +35,7 @@ class Scores:
 
     @cached_property
     def columns(self) -> dict[str, Column]:
-        """Table formats of all metrics that at least one model has, by name."""
+        """Table formats of all metrics that at least one model has, by name of the metric."""
         columns: dict[str, Column] = {}
         for runs in self.stored.values():
             for result in runs.values():
@@ -45,7 +45,7 @@ class Scores:
 
     @property
     def column(self) -> Column:
-        """Table format of `metric`. Raises KeyError if there are no results."""
+        """Table format of `self.metric`. Raises KeyError if no result has this metric."""
         return self.columns[self.metric]
 
     def models(self, evaluation: str = MAIN) -> list[str]:
@@ -63,9 +63,10 @@ class Scores:
         evaluation: str = MAIN,
         confidence: float = CONFIDENCE,
     ) -> Estimate | None:
-        """Return the mean score of a model minus that of the reference.
+        """Return the mean score of a model minus that of the reference model.
 
-        None for the reference itself, and if both models were evaluated by different protocols.
+        Returns None for the reference itself, and if the two models were evaluated by different
+        protocols and `across_protocols` is False.
         """
         terms = {(model, evaluation): 1, (self.reference, evaluation): -1}
         # Values of two protocols do not measure the same.
@@ -76,7 +77,10 @@ class Scores:
     def differences(
         self, evaluation: str = MAIN, confidence: float = CONFIDENCE
     ) -> dict[str, Estimate]:
-        """Return the differences to the reference in `self.metric`, by model, where they exist."""
+        """Return the differences to the reference model in `self.metric`, by model.
+
+        Models without a difference (see `difference`) are left out.
+        """
         found: dict[str, Estimate] = {}
         for model in self.models(evaluation):
             if apart := self.difference(model, self.metric, evaluation, confidence):
@@ -88,7 +92,7 @@ class Scores:
     ) -> Estimate | None:
         """Return a weighted sum of mean scores over the seeds and scenes that all its terms share.
 
-        None if no seed or no scene is common.
+        Returns None if the terms share no seed or no scene.
         """
         parts = [(self.stored.get(term, {}), weight) for term, weight in terms.items()]
         seeds = [seed for seed in parts[0][0] if all(seed in runs for runs, _ in parts)]
@@ -102,10 +106,10 @@ class Scores:
         return Estimate(seeds=seeds, values=values, interval=interval(values, confidence))
 
     def baselines(self, evaluation: str) -> dict[str, dict[str, float]]:
-        """Return the mean scores of the baselines, by name of the baseline and metric.
+        """Return the mean scores of the baselines, by name of the baseline, then by metric.
 
-        The result is empty if runs were evaluated by different protocols, because each protocol has
-        its own baselines.
+        The result is empty if the results of `evaluation` have different protocols, because each
+        protocol has its own baselines.
         """
         if len(self.protocols(evaluation)) != 1:
             return {}
@@ -123,12 +127,12 @@ class Scores:
         return {result.protocol.sha256 for result in self.results_of(evaluation)}
 
     def results_of(self, evaluation: str) -> list[StoredResults]:
-        """Return the results of `evaluation` for all models and seeds."""
+        """Return all results of `evaluation` in one list: every model with every seed."""
         parts = (runs for (_, of), runs in self.stored.items() if of == evaluation)
         return [result for runs in parts for result in runs.values()]
 
     def unlike(self, terms: Terms) -> bool:
-        """Return True if a sum compares scores of one evaluation that have different protocols."""
+        """Return True if a sum compares scores of one evaluation by different protocols."""
         # Each evaluation may have its own protocol: `A@two - B@two < C - D` is a valid comparison.
         sums: dict[tuple[str, str], int] = defaultdict(int)
         for (model, evaluation), weight in terms.items():

@@ -1,4 +1,4 @@
-"""Command `qgs slurm`, which writes jobs that save before their time limit and continue later."""
+"""Command `qgs slurm`, which writes Slurm jobs that save before their time limit."""
 
 import shlex
 import sys
@@ -53,9 +53,10 @@ def train(
 @app.command()
 def study(
     file: Annotated[
-        str, typer.Argument(metavar="STUDY", help="Study file, or name of a study in qgs.")
+        str,
+        typer.Argument(metavar="STUDY", help="Study file, or name of a study that comes with qgs."),
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the study.")],
+    out: Annotated[Path, typer.Option(help="Folder for the runs and results of the study.")],
     threads: Annotated[int, typer.Option(min=1, help="CPU threads per run.")] = 1,
     device: Device = "auto",
 ) -> None:
@@ -69,7 +70,8 @@ def study(
     ]
     if not missing:
         raise ValueError(
-            f"no run is missing in {out}; to write the tables, call `qgs study` with --workers 0"
+            f"all runs in {out} are done or failed, so no job is needed; to write the tables, call "
+            "`qgs study` with --workers 0"
         )
     words = ["study", file, "--out", str(plan.folder), "--threads", str(threads)]
     workers = max(recipe.training.workers for recipe in plan.recipes.values())
@@ -90,7 +92,8 @@ def _write_job(
 ) -> None:
     """Fill a job template and write it to `script`.
 
-    words: arguments of Python. The job runs in the current folder.
+    words: arguments after `python` on the job's command line. values: further fields of the
+    template. The job runs in the current folder.
     """
     from qgs.files import write_text
 

@@ -18,11 +18,11 @@ from qgs.recipe.yaml_text import load_mapping
 class StoredResults:
     """Results of one evaluation, read from a folder.
 
-    name: path of the folder as given. scenes: values of `SceneScore.values`, by scene. frames:
-    input and target frames of each scene, as in scenes.csv. columns, missing, step: see
-    `Evaluation`.
-    recipe: resolved recipe of the training as JSON, without seed and evaluation; "" if unknown.
-    seed: seed of the training. trained: facts about the training, such as data and duration.
+    name: path of the folder as given. scenes: scores of each scene, in the form of
+    `SceneScore.values`. frames: input and target frames of each scene, as in scenes.csv. columns,
+    missing, step: see `Evaluation`. recipe: recipe of the training as JSON, with defaults filled
+    in, without seed and evaluation; "" if unknown. seed: seed of the training; None if unknown.
+    trained: facts about the training, such as data and duration.
     """
 
     name: str
@@ -37,12 +37,12 @@ class StoredResults:
     trained: Mapping[str, str] = field(default_factory=dict)
 
     def scores(self, metric: str, scenes: Iterable[str]) -> list[float]:
-        """Return the model's values of `metric` in `scenes`. Raises KeyError if one is missing."""
+        """Return the model's value of `metric` in each scene. Raises KeyError if one is missing."""
         return [self.scenes[scene][f"model_{metric}"] for scene in scenes]
 
 
 def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes that have a value of `metric` in all results."""
+    """Return the scenes that have a value of `metric` in each of `results`."""
     # scenes.csv has the baselines' values too.
     value = f"model_{metric}"
     scenes = common_scenes(results)
@@ -50,13 +50,13 @@ def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
 
 
 def common_scenes(results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes that all results share, in the order of the first result."""
+    """Return the scenes that occur in each of `results`, in the order of the first result."""
     first = results[0].scenes if results else {}
     return [scene for scene in first if all(scene in one.scenes for one in results)]
 
 
 def moved_scenes(results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes that all results share, but that were evaluated on different frames."""
+    """Return the scenes that occur in each of `results`, but with different frames."""
     # A protocol that draws views names no frames; they depend on the data.
     scenes = common_scenes(results)
     return [scene for scene in scenes if len({one.frames[scene] for one in results}) > 1]
@@ -65,7 +65,7 @@ def moved_scenes(results: Sequence[StoredResults]) -> list[str]:
 def read_results(path: str | Path) -> StoredResults:
     """Read results from a folder that `qgs eval` wrote, or from a run folder with `evaluation/`.
 
-    Raises FileNotFoundError if there are no results, ValueError if they cannot be read.
+    Raises FileNotFoundError if there are no results, and ValueError if they cannot be read.
     """
     # `path` is a folder of `qgs eval`, or the run folder of a training.
     folders = (Path(path), Path(path) / "evaluation")
@@ -110,9 +110,9 @@ def _read(folder: Path, name: str) -> StoredResults:
 
 
 def _training(recipe: Path) -> dict[str, Any]:
-    """Return the fields recipe, seed and trained of `StoredResults`, from a resolved recipe file.
+    """Return the fields recipe, seed and trained of `StoredResults`, read from a recipe file.
 
-    The result is empty if the file does not exist.
+    The recipe must have its defaults filled in. The result is empty if the file does not exist.
     """
     if not recipe.is_file():
         return {}

@@ -26,7 +26,7 @@ _BY_NAME = ("variants", "evaluations", "published")
 def _folder_name(name: str) -> str:
     if not re.fullmatch(NAME, name):
         fix = "use letters, digits, `_` and `.`, but no `.` at the start"
-        raise OptionError(f"{name!r} is no valid name of a variant or an evaluation", fix)
+        raise OptionError(f"{name!r} is not a valid name of a variant or an evaluation", fix)
     return name
 
 
@@ -42,7 +42,9 @@ def _variant_name(name: str, info: ValidationInfo) -> str:
 def _evaluation_section(key: str) -> str:
     if key not in SECTIONS:
         fix = f"an evaluation can only set {', '.join(SECTIONS)}"
-        raise OptionError(f"`{key}` would change the trained model", fix)
+        raise OptionError(
+            f"an evaluation must not set `{key}`, which would change the trained model", fix
+        )
     return key
 
 
@@ -52,7 +54,7 @@ Section: TypeAlias = Annotated[str, AfterValidator(_evaluation_section)]
 
 
 class Budget(ComponentConfig):
-    """Length of each training, either in steps or in seconds."""
+    """Length of each training: a number of steps or a time in seconds."""
 
     steps: int | None = Field(default=None, ge=1)
     """Number of optimiser steps. Null means that `seconds` limits the training."""
@@ -69,10 +71,10 @@ class Budget(ComponentConfig):
 
 
 class Hypothesis(ComponentConfig):
-    """Claim about mean scores of variants, checked when their runs are done."""
+    """A statement that compares mean scores of variants, checked when their runs are done."""
 
     claim: str
-    """Claim `A < B` or `A > B`, where A and B are variants. Each side may be a sum such as
+    """Statement `A < B` or `A > B`, where A and B are variants. Each side may be a sum such as
     `A@noisy - A`, where `noisy` is the name of an evaluation."""
     metric: str | None = None
     """Metric to compare. Null means the metric of the study."""
@@ -94,7 +96,7 @@ def _known_terms(hypothesis: Hypothesis, info: ValidationInfo) -> Hypothesis:
 class StudySettings(ComponentConfig):
     """Content of a study file, merged with the study files that it extends.
 
-    Each field is checked against the fields before it, so variants and evaluations come first.
+    Checks of a field may use earlier fields only, so variants and evaluations come first.
     """
 
     study: int = Field(ge=1, le=1)
@@ -104,17 +106,18 @@ class StudySettings(ComponentConfig):
     question: str = ""
     """Question that the study answers, in one or more sentences."""
     base: Any = None
-    """Recipe file that the variants change. In a list of recipes, each changes those before it."""
+    """Recipe file that the variants change. In a list, each recipe changes the recipes before
+    it."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Recipe options that are set in all variants, in the form of a recipe."""
+    """Recipe options to set in all variants, as sections and options like in a recipe file."""
     variants: dict[Name, dict[str, Any] | None] = Field(min_length=1, max_length=200)
     """Models to compare, by name. Each is a recipe file or a set of changes to `base`; null means
     `base` without changes."""
     evaluations: dict[Name, dict[Section, Any]] = Field(default_factory=dict)
-    """Additional evaluations of every model, by name. Each sets options of the evaluated recipe,
-    such as other data or views."""
+    """Additional evaluations of every model, by name. Each evaluation sets recipe options, such as
+    other data or views, and keeps all other options of the variant."""
     seeds: tuple[int, ...] = Field(default=(0, 1, 2), min_length=1)
-    """Random seeds; each variant is trained once with each of them. A seed determines the initial
+    """Random seeds; each variant is trained once with each seed. A seed determines the initial
     weights and the order of the data."""
     reference: VariantName
     """Variant with which all other variants are compared."""
@@ -123,29 +126,33 @@ class StudySettings(ComponentConfig):
     metric: str = "psnr"
     """Name of the metric that decides which variant is better."""
     differs: tuple[str, ...] = ()
-    """Options, outside model and optimiser, in which variants may differ."""
+    """Options, outside the sections model and optimizer, in which variants may differ, such as
+    `training.batch_size`."""
     hypotheses: tuple[Annotated[Hypothesis, AfterValidator(_known_terms)], ...] = ()
-    """Claims to check, such as `A > B`. A text is short for an entry with only a claim."""
+    """Statements to check, such as `A > B`. Each is a text, or a mapping with the text as
+    `claim`."""
     published: dict[VariantName, float] = Field(default_factory=dict)
-    """Published values of the metric, by variant. The table shows them beside the measured values,
-    with the rank correlation of both."""
+    """Published values of the metric, by variant. The table shows them beside the measured values.
+    A note gives the rank correlation of published and measured values."""
 
     @field_validator("seeds")
     @classmethod
     def _seeds_differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(seeds)) < len(seeds) or min(seeds) < 0:
             raise OptionError(
-                f"must be different integers from 0 on, got {list(seeds)}", "write `seeds: [0, 1]`"
+                f"seeds must be different integers of at least 0, got {list(seeds)}",
+                "write `seeds: [0, 1]`",
             )
         return seeds
 
 
 @dataclass(frozen=True)
 class Study:
-    """Study that was read from `file`.
+    """A study, as read from `file`.
 
-    variants: recipes by name, as input of `qgs.recipe.resolve`. evaluations: changes to the trained
-    recipe, by name of the evaluation. Both mappings keep the file and line of each value.
+    variants: the recipe of each variant, as input of `qgs.recipe.resolve`. evaluations: changes to
+    the recipe of a trained variant, by name of the evaluation. Both mappings keep the file and line
+    of each value.
     """
 
     file: Path
@@ -160,16 +167,16 @@ class Study:
 
     @cached_property
     def contrasts(self) -> Sequence[Contrast]:
-        """Hypotheses as weighted sums of mean scores."""
+        """The hypotheses as weighted sums of mean scores, in the order of the study file."""
         claims = [hypothesis.claim for hypothesis in self.settings.hypotheses]
         return [parsed(claim, self.variants, self.evaluations) for claim in claims]
 
 
 def read_study(file: str | Path) -> Study:
-    """Read the study in `file`, or the study of that name that comes with qgs.
+    """Read the study in `file`, which is a path or the name of a study that comes with qgs.
 
-    The recipes of the variants are not resolved yet. Raises RecipeError that lists all faults with
-    file and line.
+    The recipes of the variants are not checked yet. Raises RecipeError that lists all faults of the
+    study with file and line.
     """
     problems = Problems("study")
     found = found_recipe(Path(file), str(file))
@@ -190,7 +197,10 @@ def read_study(file: str | Path) -> Study:
 
 
 def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
-    """Read the study file `file` and merge it over the study that it extends."""
+    """Read the study file `file` and merge it over the study that it extends.
+
+    chain: files that extend this one, to find cycles.
+    """
     try:
         with open_file(file) as opened:
             text = opened.read().decode("utf-8")

@@ -1,4 +1,4 @@
-"""Tables of scores, with an answer above and notes below, as text, Markdown and JSON."""
+"""Summary of scores (an answer, tables and notes), as text, Markdown or JSON."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,8 @@ Rows: TypeAlias = Sequence[Sequence[str]]
 class Summary:
     """Results of a comparison for readers: an answer, tables and notes.
 
-    answer: one line, or "". tables: pairs of title and rows. notes: lines below the tables.
+    answer: one line; "" if there is none. tables: pairs of title and rows. notes: lines below the
+    tables.
     """
 
     answer: str
@@ -30,7 +31,7 @@ class Summary:
     notes: Sequence[str]
 
     def show(self, console: Console) -> None:
-        """Print answer, tables and notes."""
+        """Print the answer, the tables and the notes to `console`."""
         print_lines(console, filter(None, [self.answer]))
         for title, rows in self.tables:
             compact = {"collapse_padding": True, "pad_edge": False}
@@ -39,7 +40,7 @@ class Summary:
 
     @property
     def markdown(self) -> str:
-        """Answer, tables and notes as Markdown."""
+        """The answer, the tables and the notes as Markdown."""
         parts = [self.answer]
         for title, rows in self.tables:
             parts += [f"**{title}**" if title else "", markdown_table(rows)]
@@ -48,7 +49,7 @@ class Summary:
 
 
 def markdown_table(rows: Rows) -> str:
-    """Return a Markdown table; all columns but the first are aligned to the right."""
+    """Return a Markdown table with all columns but the first aligned to the right."""
     rule = [":---", *["---:"] * (len(rows[0]) - 1)]
     lines = [[cell.replace("|", "\\|") for cell in row] for row in (rows[0], rule, *rows[1:])]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -61,10 +62,11 @@ def table_rows(
     others: Sequence[str] = (),
     published: Mapping[str, float] | None = None,
 ) -> Rows:
-    """Return a table with one row for each model and baseline.
+    """Return a table of scores, with one row for each model and each baseline.
 
-    metric: metric with mean, standard deviation, difference and interval. others: metrics with
-    means only. published: published values of `metric`, by model.
+    metric: shown with mean, standard deviation, difference to the reference, and its interval.
+    others: further metrics, shown with means only. published: published values of `metric`, by
+    model.
     """
     column = scores.columns[metric]
     head = [column.title, "sd", "difference", "95 % interval"]
@@ -98,14 +100,20 @@ def table_rows(
 
 
 def steps_shown(runs: Iterable[StoredResults]) -> str:
-    """Return the number of training steps, for example "2,100", or a range if runs differ."""
+    """Return the number of training steps as text: "2,100", or "2,100 to 2,400" if runs differ.
+
+    Returns "–" if no run has a number of steps.
+    """
     # Budgets in seconds end at different steps.
     steps = sorted({stored.step for stored in runs if stored.step is not None})
     return " to ".join(f"{step:,}" for step in (*steps[:1], *steps[1:][-1:])) or "–"
 
 
 def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, Any]]:
-    """Yield a JSON record for each model and metric: mean and difference to the reference."""
+    """Yield a JSON record for each model and metric.
+
+    A record has the mean score and the difference to the reference model.
+    """
     for model in scores.models(evaluation):
         for metric in scores.columns:
             if score := scores.score(model, metric, evaluation):
@@ -121,9 +129,9 @@ def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, 
 
 
 def training_notes(scores: Scores) -> Iterator[str]:
-    """Yield a note for each model whose training differs from that of the reference.
+    """Yield a note for each model that was trained unlike the reference model.
 
-    Differences in data and length of training are noted.
+    The data and the length of the trainings are compared.
     """
 
     def facts(model: str) -> set[tuple[str, str]]:
@@ -139,7 +147,7 @@ def training_notes(scores: Scores) -> Iterator[str]:
 
 
 def interval_notes(differences: Iterable[Estimate]) -> Iterator[str]:
-    """Yield notes that explain what the intervals cover."""
+    """Yield notes that say for what the confidence intervals hold: new trainings, new scenes."""
     seeds = {len(estimate.seeds) for estimate in differences}
     if max(seeds, default=0) > 1:
         yield "95 % intervals cover trainings and scenes; sd is the standard deviation over seeds"
