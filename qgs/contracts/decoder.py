@@ -1,8 +1,8 @@
 """Contracts of the decoder's slots: `layer` and its sublayers, `refinement`, `feedback`.
 
-An attention or feed-forward component holds its norms and its output projection; the decoder layer
-multiplies the update that they return by LayerScale and adds it to the features. A refinement runs
-after each layer.
+An attention or feed-forward component has its own norms and output projection, and returns an
+update. The decoder layer multiplies this update by LayerScale and adds it to the query features. A
+refinement runs after each layer.
 """
 
 from abc import abstractmethod
@@ -23,12 +23,12 @@ LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 
 @dataclass(frozen=True)
 class AttentionWeights(TensorContainer):
-    """Attention of Q chosen queries to T tokens, for visualisation.
+    """Attention of Q chosen queries to T tokens, for visualisation; B scenes, h heads.
 
-    content: (B, h, Q, T) logits from content alone, finite.
-    geometry: the bias added to `content`, (B, 1, Q, T), or (B, h, Q, T) for one per head; -inf for
-        masked tokens. None without a bias.
-    weights: (B, h, Q, T) softmax over the tokens of `content` + `geometry`.
+    content: (B, h, Q, T) finite logits from query and token features alone.
+    geometry: the bias added to `content`, (B, 1, Q, T) for all heads or (B, h, Q, T) for each head;
+        -inf for masked tokens. None without a bias.
+    weights: (B, h, Q, T) softmax of `content` + `geometry` over the tokens.
     """
 
     content: Tensor
@@ -40,8 +40,9 @@ class AttentionWeights(TensorContainer):
 class LayerParts:
     """Parts from which a decoder layer is built.
 
+    dims: sizes that all parts of the model share, such as the width.
     sublayers: the component for each slot that the layer's class lists in `sublayers`.
-    layer_scale: the option `decoder.layer_scale`.
+    layer_scale: value of the option `decoder.layer_scale`.
     """
 
     dims: ModelDims
@@ -71,14 +72,15 @@ class DecoderLayer(ModelComponent):
 
     @abstractmethod
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Run the layer, without the refinement that follows it."""
+        """Return the state and memory after this layer, before the refinement that follows."""
 
 
 class CrossAttention(ModelComponent):
-    """Cross-attention: (QueryState, ImageMemory) -> update (B, N, D).
+    """Cross-attention: (QueryState, ImageMemory) -> update (B, N, D): scenes, queries, width.
 
-    Raises KeyError for a field that the state lacks (the composer prevents this by checking
-    `reads`), and RuntimeError (torch's) for a memory of another width or number of heads.
+    Raises KeyError if the state lacks a field; model construction prevents this by checking
+    `reads`. Raises torch's RuntimeError if the memory has another width or number of heads than the
+    model.
 
     ordered_views: True if the order of the views matters. If False, permuting the views of the
         memory must not change the update.
@@ -97,12 +99,15 @@ class CrossAttention(ModelComponent):
         memory: ImageMemory,
         queries: Tensor,  # (Q,) indices
     ) -> AttentionWeights | None:
-        """Return the attention weights of `queries` for visualisation; None if it has none."""
+        """Return the attention weights of chosen queries; None if the component has none.
+
+        queries: indices (Q,) of queries.
+        """
         return None
 
 
 class SelfAttention(ModelComponent):
-    """Self-attention: QueryState -> update (B, N, D).
+    """Self-attention: QueryState -> update (B, N, D) of the features: scenes, queries, width.
 
     Permuting the queries, with their fields, permutes the update.
     """
@@ -114,17 +119,18 @@ class SelfAttention(ModelComponent):
         """Return the update of the query features, before LayerScale."""
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights | None:
-        """Return the attention weights of `queries` for visualisation; None if it has none.
+        """Return the attention weights of chosen queries; None if the component has none.
 
-        queries: indices (Q,).
+        queries: indices (Q,) of queries.
         """
         return None
 
 
 class FeedForward(ModelComponent):
-    """Feed-forward network: features (B, N, D) -> update (B, N, D), for each query separately.
+    """Feed-forward network on each query separately: features (B, N, D) -> update (B, N, D).
 
-    Raises RuntimeError (torch's) for features of another width.
+    B, N and D are scenes, queries and width. Raises torch's RuntimeError for features of another
+    width than D.
     """
 
     slot: ClassVar[str] = "feed_forward"
@@ -135,9 +141,10 @@ class FeedForward(ModelComponent):
 
 
 class Refinement(ModelComponent):
-    """Refinement after each layer: QueryState -> QueryState with refined fields, same features.
+    """Refinement after each decoder layer: it changes fields of the QueryState, not its features.
 
-    shared_by_layers: True if all layers with equal options use the same module (as in LocusGS).
+    shared_by_layers: True if all layers with equal options use one module (as in LocusGS). If
+        False, every layer has a module of its own.
     """
 
     slot: ClassVar[str] = "refinement"
@@ -145,15 +152,15 @@ class Refinement(ModelComponent):
 
     @abstractmethod
     def forward(self, state: QueryState) -> QueryState:
-        """Return the refined state."""
+        """Return `state` with refined fields."""
 
 
 class Feedback(ModelComponent):
     """Feedback: (QueryState, ImageMemory, Rendering, Views) -> state and memory of the next round.
 
     A round renders the last layer's Gaussians from the cameras of the input photos, without
-    gradients. Then the last decoder layers run again and update the state once more. Their memory
-    is the one that the first of them read in the first pass.
+    gradients. Then it runs the last `layers` decoder layers again, which update the state once
+    more. The memory is the one that the first of these layers read in the first pass.
 
     layers: number of decoder layers that run again in each round.
     rounds: number of rounds in an evaluation; it may be changed on a built model.
@@ -165,11 +172,11 @@ class Feedback(ModelComponent):
     rounds: int = 0
 
     def drawn(self) -> int:
-        """Return the number of rounds of a forward pass in training; it may be random."""
+        """Return the number of feedback rounds for one pass in training; it may be random."""
         return self.rounds
 
     def compared(self, views: Views) -> Views:
-        """Return the input photos, scaled to the size at which a round renders."""
+        """Return the input photos, scaled to the image size at which a feedback round renders."""
         return views
 
     @abstractmethod
@@ -178,5 +185,5 @@ class Feedback(ModelComponent):
     ) -> tuple[QueryState, ImageMemory]:
         """Return the state and memory from which the first repeated layer starts.
 
-        photos: views (B, V) from `compared`, of the same shape as `rendering`.
+        photos: posed photos (B, V) from `compared`, of the same image size as `rendering`.
         """

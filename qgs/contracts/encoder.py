@@ -28,21 +28,21 @@ MEMORY_FIELDS: Fields = {
 
 
 def memory_fields(*names: str) -> Fields:
-    """Return entries of MEMORY_FIELDS by name, such as `memory_fields("keys", "values")`."""
+    """Return entries of MEMORY_FIELDS by short name, as in `memory_fields("keys", "values")`."""
     return {f"memory.{name}": MEMORY_FIELDS[f"memory.{name}"] for name in names}
 
 
 class Encoder(ModelComponent):
-    """Encoder: Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory, M tokens.
+    """Encoder: Views with images (B, V, 3, H, W) in [0, 1] -> ImageMemory of M tokens per scene.
 
-    It runs once per forward pass. A token may see all views. If the memory has a grid, a token
-    depends most on the patch at its view, row and column. Raises ValueError for images that it
-    cannot divide into patches.
+    The cameras are in the world frame. The encoder runs once per forward pass. A token may depend
+    on all views. If the memory has a grid, a token depends most on the patch at its view, row and
+    column. Raises ValueError for images that it cannot divide into patches.
 
     ordered_views: True if the order of the views matters. If False, permuting the views permutes
         the tokens.
-    reads_cameras: True if it reads `views.cameras`. If False, it also accepts `Photos`.
-    tunable: True if it implements `project`, which test-time tuning needs.
+    reads_cameras: True if the encoder reads `views.cameras`. If False, it accepts `Photos` too.
+    tunable: True if the encoder implements `project`, which test-time tuning needs.
     """
 
     slot: ClassVar[str] = "encoder"
@@ -55,10 +55,10 @@ class Encoder(ModelComponent):
 
     @classmethod
     def size_multiple(cls, config: ComponentConfig) -> int | None:
-        """Return a number that must divide both sides of an image.
+        """Return a number that must divide both sides of an image, or None.
 
-        None means that only the image size of the training works; photos are then cropped to it.
-        Otherwise photos of a user keep their aspect ratio.
+        None means that the model works only at the image size of the training; users' photos are
+        then cropped to this size. With a number, users' photos keep their aspect ratio.
         """
         return None
 
@@ -89,7 +89,7 @@ class PatchEncoder(Encoder):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Return a problem if patches do not divide the data's images."""
+        """Report a bad `patch_size`: one that does not divide the data's images."""
         size = context.image_size
         patch = config.patch_size
         if size and any(side % patch for side in size):
@@ -103,12 +103,15 @@ class PatchEncoder(Encoder):
 
     @classmethod
     def size_multiple(cls, config: ComponentConfig) -> int:
-        """Return the side of a patch."""
+        """Return the side of a patch in pixels, which must divide both sides of an image."""
         assert isinstance(config, PatchEncoder.Config)
         return config.patch_size
 
     def grid(self, views: Views) -> tuple[int, int, int]:
-        """Return (V, H/P, W/P); raise ValueError if patches do not divide the images."""
+        """Return (V, H/P, W/P): the views, and the rows and columns of patches of P pixels in each.
+
+        Raises ValueError if patches do not divide the images.
+        """
         patch = self.config.patch_size
         count, _, height, width = views.images.shape[1:]
         if height % patch or width % patch:

@@ -19,31 +19,33 @@ GAUSSIAN_FIELDS: Fields = {
 class Head(ModelComponent):
     """Head: QueryState -> GaussianAttributes of K Gaussians per query, in their valid ranges.
 
-    Untrained heads keep to the ranges too, for nonzero features. A head that outputs `sh` or
-    `features` declares them in `writes`, see GAUSSIAN_FIELDS, so that losses can require them.
+    Attributes of an untrained head are in these ranges too, for nonzero features. A head that
+    outputs `sh` or `features` declares them in `writes`, see GAUSSIAN_FIELDS, so that losses can
+    require them.
     """
 
     slot: ClassVar[str] = "head"
 
     @property
     def gaussians_per_query(self) -> int:
-        """Number K of Gaussians per query; the default reads the option `gaussians_per_query`."""
+        """Number K of Gaussians per query; by default the option `gaussians_per_query`."""
         return getattr(self.config, "gaussians_per_query")  # noqa: B009 (an option of subclasses)
 
     @abstractmethod
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """Return the attributes of all Gaussians, without their means."""
+        """Return all attributes of the Gaussians except their means."""
 
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
-        """Return False: a head has no weight decay (TokenGS release)."""
+        """Return whether weight decay applies to `parameter`: False (TokenGS release)."""
         return False
 
 
 class Centers(ModelComponent):
-    """Centers: (raw offsets (B, N, K, 3), QueryState) -> means (B, N, K, 3), world frame, float32.
+    """Centers: (raw offsets (B, N, K, 3), QueryState) -> world-frame means (B, N, K, 3) in float32.
 
-    The state is that of the decoded layer, after its refinement. Finite offsets give finite means.
-    Raises KeyError for a field that the state lacks (the composer prevents this).
+    B, N and K are scenes, queries and Gaussians per query. The state is the decoder layer's output
+    after its refinement. Finite offsets give finite means. Raises KeyError for a field that the
+    state lacks; model construction prevents this by checking `reads`.
     """
 
     slot: ClassVar[str] = "centers"

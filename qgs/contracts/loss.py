@@ -15,19 +15,19 @@ from qgs.types import LayerPrediction, Rendering, Views
 class Loss(Component, torch.nn.Module):
     """Loss: (LayerPrediction, Rendering, target Views, input Views) -> one term or several.
 
-    A loss defines `term`; this class multiplies it by `weight` and its schedule. Training calls
-    the loss for each supervised layer, with a rendering from the target cameras and all input views
-    of the prediction. It minimises the sum of all terms, weighted by layer. A term is one number to
-    minimise; `history.jsonl` has it under its name, which is unique within a recipe. Every term has
-    a gradient in the prediction or in the rendering.
+    A subclass defines `term`; this class multiplies the result by `weight`, which may follow a
+    schedule. Training calls the loss for each supervised layer, with a rendering from the target
+    cameras and all input views of the prediction. It minimises the sum of all terms, weighted by
+    layer. A term is one number to minimise; `history.jsonl` lists it under its name, which is
+    unique within a recipe. Every term has a gradient in the prediction or in the rendering.
 
-    renderings: the target views that one call needs, because training may render few at a time
+    renderings: the target views that one call needs; training may render few at a time
         (`training.render_views`). "each": a term is a mean over views, so training may call the
         loss with a few views at a time and average the results. "all": the loss needs all target
         views at once. "none": the loss reads no rendering; it gets all target views and a rendering
         of no views, (B, 0, ...).
-    reads_depths: True if the loss reads `Views.depths`. Training then loads depth maps if the data
-        has any.
+    reads_depths: True if the loss reads `Views.depths`. Training then loads the data's depth maps,
+        if any.
     """
 
     slot: ClassVar[str] = "losses"
@@ -37,7 +37,7 @@ class Loss(Component, torch.nn.Module):
 
     class Config(ComponentConfig):
         weight: float = Field(default=1.0, ge=0)
-        """Factor of this loss in the objective. 0 skips the loss and saves its time."""
+        """Factor of this loss in the objective. A loss with weight 0 is not computed."""
 
     config: Config
 
@@ -49,14 +49,14 @@ class Loss(Component, torch.nn.Module):
         target: Views,  # (B, V)
         inputs: Views,
     ) -> Tensor | Mapping[str, Tensor]:
-        """Return the unweighted loss, averaged over scenes: a 0-d term, or several by name."""
+        """Return the unweighted loss, averaged over scenes: a 0-d tensor, or several by name."""
 
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
-        """Return the weighted terms by name; none for weight 0.
+        """Return the weighted terms by name; an empty dict for weight 0.
 
-        A single term without a name gets the component's `name`.
+        A single tensor from `term` gets the component's `name`.
         """
         weight = self.config.weight
         # A weight of 0 takes no time: the term is not even computed.
@@ -69,14 +69,15 @@ class Loss(Component, torch.nn.Module):
 
 
 class Supervision(Component):
-    """The supervised decoder layers and their weights."""
+    """Choice of the decoder layers to which the losses apply, and the weights of these layers."""
 
     slot: ClassVar[str] = "supervision"
 
     @abstractmethod
     def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:
-        """Return the weight of each supervised layer, by ascending number; the weights sum to 1.
+        """Return the weight of each supervised layer by its number; the weights sum to 1.
 
-        1 is the first layer. 0 is the initial state, the only one in a decoder of depth 0.
+        The first layer has the number 1, and numbers ascend. 0 is the initial state, which is
+        supervised only in a decoder without layers.
         rounds: numbers of the last layers of feedback rounds, which are supervised too.
         """

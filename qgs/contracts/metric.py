@@ -15,8 +15,9 @@ from qgs.types import Gaussians, Views
 
 @dataclass(frozen=True)
 class Column:
-    """Display of a value in tables.
+    """Display of a metric's value in tables.
 
+    better: whether higher or lower values are better. unit: unit of the value; "" for none.
     digits: number of decimal places; tables that compare several results show one more.
     """
 
@@ -31,17 +32,20 @@ class Column:
         return f"{self.heading} {'↑' if self.better == 'higher' else '↓'}"
 
     def shown(self, value: float | None) -> str:
-        """Format `value` for a table; None gives a dash."""
+        """Format `value` for a table; a dash for None."""
         return "–" if value is None else f"{value:.{self.digits}f}"
 
     def best(self, values: Iterable[float | None]) -> float | None:
-        """Return the best of `values`; None if there is none."""
+        """Return the best of `values`, ignoring None; None if no number remains."""
         # A method without Gaussians has no values for metrics that need them.
         known = [value for value in values if value is not None]
         return (max if self.better == "higher" else min)(known, default=None)
 
     def beats(self, value: float | None, other: float | None) -> bool:
-        """Return whether `value` is better than `other` when both are rounded as in tables."""
+        """Return whether `value` is better than `other` after rounding as in tables.
+
+        False if `other` is None.
+        """
         # 14.463 and 14.457 both show as 14.46; ranking them would confuse readers
         if other is None or self.shown(value) == self.shown(other):
             return False
@@ -50,14 +54,14 @@ class Column:
 
 @dataclass(frozen=True)
 class MetricInput(TensorContainer):
-    """Input of a metric for one scene: the true views, and the images of a model or a baseline.
+    """Input of a metric for one scene: T true views, and the images of a model or a baseline.
 
-    images: (1, T, 3, H, W) as rendered, not clipped.
+    images: (1, T, 3, H, W) as rendered, not clipped to [0, 1].
     targets: the true Views (1, T).
-    gaussians: (1, G), ordered query by query, `gaussians_per_query` each; None for a baseline.
-    depth: like `Rendering.depth`, (1, T, 1, H, W); None for a baseline.
-    true_depth: depth maps of the data, in the model's units, 0 where unknown; None without maps, or
-        if no metric needs them.
+    gaussians: (1, G), ordered query by query, `gaussians_per_query` of each; None for a baseline.
+    depth: rendered depth (1, T, 1, H, W) as in `Rendering`; None for a baseline.
+    true_depth: depth maps (1, T, 1, H, W) of the data, in the model's units, 0 where unknown; None
+        without maps, or if no metric needs them.
     """
 
     images: Tensor
@@ -69,21 +73,23 @@ class MetricInput(TensorContainer):
 
     @property
     def masks(self) -> Tensor | None:
-        """Masks (1, T, 1, H, W) of the true views; None without masks."""
+        """Object masks (1, T, 1, H, W) of the true views; None if the data has no masks."""
         return self.targets.masks
 
 
 class Metric(Component, torch.nn.Module):
     """Metric: MetricInput -> values.
 
-    Called without gradients, for every sample, with the images of the model and of each baseline.
+    A metric is called without gradients, for every sample, with the images of the model and of each
+    baseline.
 
-    definition: a text that says what is measured. Like the options, it is part of the evaluation
-        protocol's hash; change it whenever the metric's values change.
-    not_in_protocol: options that change no value, such as a path.
+    definition: a text that says what is measured. Like the options, it enters the hash of the
+        evaluation protocol; change it whenever the metric's values change.
+    not_in_protocol: options that change no value, such as a path; they do not enter the hash.
     needs: fields of MetricInput that must not be None for the metric to have a value.
     column: display of the value in tables.
-    unavailable: reason why the metric has no values, such as a missing file of weights; else "".
+    unavailable: reason why the metric has no values, such as a missing file of weights; "" if it
+        has.
     """
 
     slot: ClassVar[str] = "metrics"
@@ -96,15 +102,16 @@ class Metric(Component, torch.nn.Module):
     def columns(self) -> Mapping[str, Column]:
         """Return the table columns by key; the default is `column` with the key "".
 
-        Override it if the metric has several values, or a heading that depends on options. In
-        results, a value has the metric's name in the recipe, plus `_KEY` unless the key is "".
+        Override this method if the metric has several values, or a heading that depends on options.
+        In results, the name of a value is the metric's name in the recipe, plus `_KEY` unless the
+        key is "".
         """
         return {"": self.column}
 
     @abstractmethod
     def forward(self, given: MetricInput) -> Tensor | Mapping[str, Tensor]:
-        """Return a tensor such as (1, T), one number per view, or a tensor for each of `columns`.
+        """Return a tensor of values, or one tensor for each key of `columns`.
 
-        The value of a sample is the mean over the tensor, in float64. The value of a scene is the
-        mean over its samples.
+        For example, a tensor (1, T) holds one value per view. The value of a sample is the mean
+        over the tensor, in float64. The value of a scene is the mean over its samples.
         """

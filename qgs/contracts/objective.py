@@ -16,10 +16,10 @@ class Outcome:
     """The loss that training minimises, and numbers to log; all tensors are 0-d.
 
     total: the sum of the terms, with gradients.
-    terms: the terms by name, weighted and detached.
-    signs: numbers by which training detects collapse: "psnr" and "alpha" are means over the
-        renderings. "deviation" is the mean distance of a rendering to the background colour, the
-        largest over views.
+    terms: the weighted terms by name, detached.
+    signs: numbers by which training detects that the model collapses, by name. "psnr" and "alpha"
+        are means over the renderings. "deviation" is the mean distance of a rendering to the
+        background colour, the largest over views.
     """
 
     total: Tensor
@@ -28,34 +28,36 @@ class Outcome:
 
 
 class Passes(Protocol):
-    """Functions that training gives to an objective for one step."""
+    """Functions of the training loop that an objective calls in one training step."""
 
     def predict(self, inputs: Views) -> Prediction:
-        """Run a forward pass of the model."""
+        """Run the model on `inputs` and return its prediction."""
         ...
 
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
-        """Compute the recipe's losses of every supervised layer, rendered from `targets`' cameras.
+        """Compute the recipe's losses for every supervised layer.
 
-        inputs: the views that `prediction` was made from. The gradients of the losses are computed
-        in this call, for one layer and `training.render_views` views at a time, so that memory does
-        not grow with the number of layers or views. The backward pass of `total` uses them.
+        Each layer is rendered from the cameras of `targets`. inputs: the views from which the model
+        made `prediction`. The gradients of the losses are computed in this call, for one layer and
+        `training.render_views` views at a time, so that memory does not grow with the number of
+        layers or views. The backward pass of `total` uses these gradients.
         """
         ...
 
     def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render with gradients; as in `judge`, autograd graphs exist for few views at a time."""
+        """Render with gradients; as in `judge`, memory does not grow with the number of views."""
         ...
 
 
 class Objective(Component):
     """Computation of a training step: (input Views, target Views) -> Outcome.
 
-    An objective has no parameters and keeps no state. Each extra pass of the model costs about as
-    much as an extra step. If it adds terms, their names must differ from those of the recipe's
-    losses.
+    An objective has no parameters and keeps no state. Each extra forward pass of the model costs
+    about as much as an extra step. The names of terms that an objective adds must differ from those
+    of the recipe's losses.
 
-    judges_inputs: True if input views may be targets too, see `training.judge_inputs`.
+    judges_inputs: True if the objective may compute losses on input views as well, as the option
+        `training.judge_inputs` demands.
     """
 
     slot: ClassVar[str] = "objective"

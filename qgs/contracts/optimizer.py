@@ -23,14 +23,14 @@ class OptimizerConfig(ComponentConfig):
     part. A part is the path of a component in the recipe's `model`, or the name of a module or
     parameter. `*`, `?` and `[...]` match within one segment of a path. A part includes everything
     below it: `decoder.layers.*.cross_attention` is all cross-attention. If several parts match a
-    parameter, the last one counts. A part that matches nothing is an error."""
+    parameter, the last match counts. A part that matches nothing is an error."""
 
 
 class ParameterGroup(TypedDict):
     """Parameters with equal weight decay and learning rate, as a group of torch's optimisers.
 
-    decays: True if weight decay applies. factor: factor of the learning rate, see the option
-        `parts`.
+    decays: True if weight decay applies to the parameters.
+    factor: factor of their learning rate, from the option `parts`.
     """
 
     params: list[nn.Parameter]
@@ -41,7 +41,7 @@ class ParameterGroup(TypedDict):
 class Optimizer(Component):
     """An optimiser of torch with its learning rate.
 
-    Training calls `build` once. Before each step it sets the learning rate of every group of
+    Training calls `build` once. Before each step, training sets the learning rate of every group of
     torch's optimiser to `learning_rate(...)` times the group's `factor`. Training saves and
     restores the state of torch's optimiser.
 
@@ -52,10 +52,10 @@ class Optimizer(Component):
     scheduled: ClassVar[frozenset[str]] = frozenset({"learning_rate"})
 
     class Config(OptimizerConfig):
-        """Options of this optimiser; by default only those of all optimisers."""
+        """Options of this optimiser; by default those of every optimiser."""
 
     def __init__(self, config: OptimizerConfig, training: TrainingConfig | None = None) -> None:
-        """Store the options and `training`, the settings with the budget of steps and seconds."""
+        """Store the options, and `training` with the budget of steps and seconds."""
         self.config = config
         # For use without a recipe, as in tests of a component.
         self.training = training or TrainingConfig()
@@ -63,19 +63,23 @@ class Optimizer(Component):
     def check(self) -> None:
         """Raise ValueError if the options do not fit the training's budget of steps and seconds.
 
-        Called after the constructor.
+        Training calls this method after the constructor.
         """
         return
 
     @abstractmethod
     def build(self, groups: Sequence[ParameterGroup]) -> torch.optim.Optimizer:
-        """Return torch's optimiser of `groups`; if it forms new groups, they keep the `factor`."""
+        """Return torch's optimiser for `groups`.
+
+        An override that splits a group must copy its `factor` to the new groups.
+        """
 
     def learning_rate(self, step: int, seconds: float) -> float:
-        """Return the rate of optimiser step `step` (0 is the first), `seconds` into training.
+        """Return the learning rate of optimiser step `step`, `seconds` into training.
 
-        Called with ascending steps; `config` has the values of this step. The default returns the
-        option `learning_rate`. An override should return this too if `follows_schedule` is true.
+        Step 0 is the first. Training calls this method with ascending steps, after it set `config`
+        to the option values of the step. The default returns the option `learning_rate`. An
+        override should return this option too if `follows_schedule` is true.
         """
         return self.config.learning_rate
 
@@ -85,8 +89,8 @@ class Optimizer(Component):
         return "learning_rate" in self.schedules
 
     def state(self) -> Mapping[str, Any]:
-        """Return the JSON values that `learning_rate` needs to continue in another process."""
+        """Return the values, as JSON, that `learning_rate` needs to continue in another process."""
         return {}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state` returned in another process."""
+        """Restore values that `state` returned in another process."""

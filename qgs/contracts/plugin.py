@@ -21,10 +21,10 @@ class Plugin:
     components: component classes; the `name` of each is unique within its slot.
     examples: options that `qgs check-plugin` tries in addition to the defaults of every component.
     models: files of trained models by name, relative to the folder of the module that the entry
-        point names. Commands accept PLUGIN/NAME in place of such a path. A Markdown file of the
+        point names. Commands accept PLUGIN/NAME in place of a file's path. A Markdown file of the
         same name describes each model: models/mine.md for models/mine.safetensors.
-    exemptions: known failures of the contract tests, {component class or options: {check:
-        reason}}. Use options as the key if the component passes with other options.
+    exemptions: checks of the contract that are known to fail, as {component class or options:
+        {check: reason}}. Give options as the key if the component passes with other options.
     """
 
     name: str

@@ -17,12 +17,12 @@ GROWTH_NOISE = 0.01
 class Queries(ModelComponent):
     """Queries: (ImageMemory, Views) -> QueryState of N queries.
 
-    The state has features (B, N, D) and the fields in `writes`. Spatial fields are (B, N, ...)
-    float32 in the world frame. Queries that read the memory list the parts that they read in
-    `reads`, such as `memory.features`. The state of a scene does not depend on other scenes of the
-    batch. If scenes have different numbers of queries, the state has a mask.
+    The state has features (B, N, D), for B scenes and width D, and the fields in `writes`. Spatial
+    fields are (B, N, ...) float32 in the world frame. A component that reads the memory lists the
+    parts that it reads in `reads`, such as `memory.features`. The state of a scene does not depend
+    on other scenes of the batch. If scenes have different numbers of queries, the state has a mask.
 
-    reads_cameras: True if the component reads `views.cameras`. If False, it also accepts `Photos`.
+    reads_cameras: True if the component reads `views.cameras`. If False, it accepts `Photos` too.
     """
 
     slot: ClassVar[str] = "queries"
@@ -30,7 +30,7 @@ class Queries(ModelComponent):
 
     @property
     def count(self) -> int | None:
-        """Number N of queries; None if it depends on the views. Default: the option `count`."""
+        """Number N of queries, by default the option `count`; None if N depends on the views."""
         return getattr(self.config, "count", None)
 
     @abstractmethod
@@ -43,9 +43,10 @@ class Queries(ModelComponent):
         """Return a state dict for these queries, made from one with another number of queries.
 
         learned: the old state dict, on the CPU. Its shapes differ from the new ones only in the
-        first axis, the queries. Shrinking keeps the first N queries. Growing keeps all n old ones;
-        new query i is a copy of old query i modulo n, plus noise of standard deviation 0.01 on all
-        parameters (LocusGS release, finetuning).
+            first axis, the queries. If there are fewer new queries, N, the first N are kept. If
+            there are more, all n old queries are kept; new query i is a copy of old query i modulo
+            n, plus noise of standard deviation 0.01 on all parameters (LocusGS release,
+            finetuning).
         """
         own = {name: values.shape for name, values in self.state_dict().items()}
         return {
@@ -70,15 +71,15 @@ class LearnedQueries(Queries):
 
     @abstractmethod
     def start(self, batch_size: int) -> QueryState:
-        """Return the initial state for `batch_size` scenes, the same in each."""
+        """Return the initial state for `batch_size` scenes, equal for all of them."""
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """Return the initial state of every scene in the memory."""
+        """Return the initial state for as many scenes as the memory has."""
         return self.start(memory.features.shape[0])
 
 
 def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Cut `values` to `count` items along the first axis, or append noisy copies of its items."""
+    """Cut `values` to `count` items along the first axis, or append noisy copies of the items."""
     if count <= len(values):
         return values[:count]
     # In turn, so that all learned queries get equally many copies.

@@ -20,17 +20,20 @@ class RendererConfig(ComponentConfig):
     """Splatting options of every renderer (defaults: TokenGS, LocusGS and gsplat 1.5.3)."""
 
     near: float = Field(default=0.025, gt=0)
-    """Drop Gaussians nearer than this camera-frame z, in world units."""
+    """Nearest camera-frame z, in world units, at which Gaussians are rendered."""
     far: float = Field(default=125.0, gt=0, validate_default=True)
-    """Drop Gaussians beyond this camera-frame z, in world units."""
+    """Farthest camera-frame z, in world units, at which Gaussians are rendered."""
     dilation: float = Field(default=0.3, ge=0)
-    """Number added to the diagonal of the projected covariance, in pixel^2. 0 adds nothing."""
+    """Variance in pixel^2 added to the diagonal of each Gaussian's projected covariance. 0 adds
+    nothing."""
     alpha_min: float = Field(default=1 / 255, gt=0, lt=1)
-    """Skip a Gaussian at pixels where its alpha is below this."""
+    """Least alpha of a Gaussian at a pixel. The Gaussian is skipped at pixels where its alpha is
+    lower."""
     alpha_cap: float = Field(default=0.999, gt=0, lt=1)
-    """Largest alpha of one Gaussian at a pixel. Larger values are lowered to it."""
+    """Largest alpha of one Gaussian at a pixel. Larger values are lowered to this."""
     transmittance_min: float = Field(default=1e-4, ge=0, lt=1)
-    """Stop adding Gaussians to a pixel before its transmittance falls to this."""
+    """Transmittance at which blending ends. A pixel skips the Gaussian that would lower its
+    transmittance to this value or below, and all Gaussians behind."""
     background: tuple[Channel, Channel, Channel] = (0.5, 0.5, 0.5)
     """Background colour, RGB in [0, 1]."""
 
@@ -50,12 +53,13 @@ class RendererConfig(ComponentConfig):
 class Renderer(Component, torch.nn.Module):
     """EWA splatting: (Gaussians (B, G), Cameras (B, V), background) -> Rendering (B, V).
 
-    Colours come from `Gaussians.sh`, along the direction from the camera's centre to the mean.
-    `Gaussians.features` are blended with the same weights as colours, over a background of 0. The
-    rendering is differentiable in all Gaussian parameters. Images and gradients are finite, even
-    without Gaussians and for Gaussians behind the camera, off screen or huge.
+    B, G and V are scenes, Gaussians and views. Colours come from `colors` and `sh` of the
+    Gaussians, along the direction from the camera's centre to the mean. `Gaussians.features` are
+    blended with the same weights as colours, over a background of 0. The rendering is
+    differentiable in all Gaussian parameters. Images and gradients are finite, even without
+    Gaussians and for Gaussians behind the camera, off screen or huge.
 
-    devices: types of torch devices that it renders on, such as "cpu", "cuda", "mps".
+    devices: types of torch devices on which the renderer runs, such as "cpu", "cuda", "mps".
     camera_gradients: the tensors of `Cameras` that get gradients on all these devices: "c2w" (for
         rotations and translations), "intrinsics", both or none. If a tensor not named here requires
         a gradient, `forward` raises ValueError.
@@ -67,7 +71,7 @@ class Renderer(Component, torch.nn.Module):
     camera_gradients: ClassVar[tuple[str, ...]] = ("c2w", "intrinsics")
 
     class Config(RendererConfig):
-        """Options of this renderer; by default only those of all renderers."""
+        """Options of this renderer; by default those of every renderer."""
 
     config: RendererConfig
     writes: ClassVar[Fields] = {
@@ -85,7 +89,7 @@ class Renderer(Component, torch.nn.Module):
     ) -> Rendering:
         """Render every scene from each of its cameras.
 
-        background: RGB (3,); None uses the option `background`.
+        background: RGB (3,) in [0, 1]; None uses the option `background`.
         Raises ValueError for Gaussians and cameras of different batch sizes or devices, and for
         cameras that require a gradient not listed in `camera_gradients`.
         """
@@ -110,16 +114,17 @@ def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 
 
 def raise_precision(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """Convert Gaussians and cameras to float64 if the means are float64, else to float32."""
+    """Return Gaussians and cameras in float64 if the means are float64, else in float32."""
     # Half precision would move the projection of a Gaussian by pixels.
     dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
     return gaussians.to(dtype), cameras.to(dtype)
 
 
 def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return the channels to blend: colours as each camera sees them, then features.
+    """Return the channels to blend: the colours of Gaussians from each camera, then their features.
 
-    Shape (B, V, G, 3 + F), or (B, 1, G, 3 + F) if all cameras see the same colours.
+    The shape is (B, V, G, 3 + F): scenes, views, Gaussians, RGB and F features; or (B, 1, G, 3 + F)
+    if colours do not depend on the camera.
     """
     colors = seen_colors(gaussians, cameras)
     if gaussians.features is None:
@@ -131,10 +136,12 @@ def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
 def background_of(
     background: Tensor | None, configured: tuple[float, float, float], like: Tensor
 ) -> Tensor:
-    """Return `background`, or else `configured`, as RGB (3,) in the dtype and device of `like`."""
+    """Return `background` as RGB (3,), or `configured` if None, in dtype and device of `like`."""
     if background is None:
         # A tensor of Python numbers would make the GPU wait for a copy.
         return constant(configured, like)
     if background.shape != (3,):
-        raise ValueError(f"background must be one RGB of shape (3,), got {tuple(background.shape)}")
+        raise ValueError(
+            f"background must be one RGB colour of shape (3,), got {tuple(background.shape)}"
+        )
     return background.to(like)

@@ -16,7 +16,7 @@ END = 2**53
 
 
 class Schedule(ComponentConfig):
-    """A number as a function of the count of finished optimiser steps (0 in the first step)."""
+    """A number that depends on how many optimiser steps are finished (0 during the first step)."""
 
     schedule: str
     """Kind of schedule."""
@@ -27,12 +27,18 @@ class Schedule(ComponentConfig):
 
     @property
     def corners(self) -> tuple[int, ...]:
-        """Steps after 0 between which the value is monotonic, so extremes lie there or at 0."""
+        """Steps after 0 at which the value may turn from rising to falling or back.
+
+        Between them the value is monotonic, so its extremes lie at one of them or at step 0.
+        """
         return ()
 
 
 def at_step(config: ConfigT, schedules: Mapping[str, Schedule], step: int) -> ConfigT:
-    """Return `config` with the values of `schedules` after `step` steps; integers are rounded."""
+    """Return `config` with the values of `schedules` after `step` steps.
+
+    Values of integer options are rounded.
+    """
     numbers = {name: schedule.number(step) for name, schedule in schedules.items()}
     for name in numbers:
         if isinstance(getattr(config, name), int):
