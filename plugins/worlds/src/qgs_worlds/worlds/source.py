@@ -29,12 +29,12 @@ class WorldsConfig(DrawnConfig):
     scenes: int = Field(default=100_000, ge=1)
     """Number of scenes in the training split."""
     complexity: int = Field(default=32, ge=4)
-    """Largest number of objects near the cameras. The number is random, log-uniform from 4 up. An
-    object consists of a few shapes."""
+    """Largest number of objects near the cameras. A scene has a random number, log-uniform from 4
+    to `complexity`. An object consists of a few shapes."""
     cameras: Variety = "varied"
     """Camera paths. `plain`: level walks along a line, with fields of view of 60 to 75 degrees.
-    `varied`: walks, orbits, turns on the spot, and scattered cameras that look at one point; with
-    pitch, roll, tiny to wide baselines, and fields of view of 18 to 90 degrees. Fields of view
+    `varied`: walks, orbits, turns on the spot, and scattered cameras that look at one point. These
+    have pitch, roll, tiny to wide baselines, and fields of view of 18 to 90 degrees. Fields of view
     are measured along the longer side of an image."""
     shapes: Variety = "varied"
     """Shapes of objects. `plain`: upright boxes, balls and cylinders in closed rooms.
@@ -66,7 +66,7 @@ class WorldsConfig(DrawnConfig):
 
     @cached_property
     def of_rooms(self) -> RoomsConfig:
-        """Options of `rooms/procedural` for the share `rooms` of the scenes."""
+        """Options of those scenes that are furnished rooms, from the source `rooms/procedural`."""
         alike = self.model_dump(include={"image_size", *DrawnConfig.model_fields})
         return RoomsConfig(**alike)
 
@@ -111,7 +111,10 @@ class WorldScene(DrawnScene):
 def world_or_room(
     name: str, index: int, config: WorldsConfig, split: Split, cache: ImageCache
 ) -> DrawnScene:
-    """Return scene `index` of a split: a room for a share `config.rooms`, otherwise a world."""
+    """Return scene `index` of a split: a furnished room or an abstract scene.
+
+    `config.rooms` is the probability of a furnished room.
+    """
     # a separate generator, so that the share changes no scene
     if Random(f"{config.seed} {split} {index}").random() >= config.rooms:
         return WorldScene(name, index, config, split, cache)

@@ -34,10 +34,11 @@ def any_angle(rng: Random) -> float:
 class Style(NamedTuple):
     """Distribution of the shapes of random objects.
 
-    kinds: kinds of primitives, repeated to be chosen more often. tilted: share of primitives with
-    a random 3D rotation. cut: share of objects with a cut. wired: share of objects made of bars or
-    wires. repeated: share of objects that repeat a shape in a row. even: True makes round
-    primitives as wide as deep. most: largest number of primitives in an object.
+    kinds: kinds of primitives to choose from; a kind that is listed twice is chosen twice as often.
+    tilted: share of primitives with a random 3D rotation. cut: share of composites with a piece cut
+    out of their primitives. wired: share of objects made of rods: frames, wires and bars. repeated:
+    share of objects that repeat a shape in a row. even: True makes round primitives as wide as
+    deep. most: largest number of primitives in an object.
     """
 
     kinds: tuple[int, ...]
@@ -71,7 +72,7 @@ class Things:
         self._textures = textures
 
     def texture(self) -> tuple[int, int]:
-        """Return a random first texture (index) for a shape, and its number of textures, 1 or 6."""
+        """Return a random index of a shape's first texture, and the number of textures, 1 or 6."""
         faces = 6 if self.rng.random() < 0.3 else 1
         # five more textures follow the first one if there are six faces
         return self.rng.randrange(self._textures - 5), faces
@@ -205,7 +206,7 @@ class Things:
 
 
 def lowest(thing: Thing) -> float:
-    """Return a lower bound for the z of all points of an object, close to the lowest point."""
+    """Return a number below the z of all points of an object, but close to their least z."""
     return min(shape.body.center[2] - shape.body.reach() for shape in thing)
 
 
@@ -214,8 +215,8 @@ def placed(
 ) -> Thing:
     """Return an object scaled by `size`, turned about z by `turn` and placed above the ground.
 
-    to: x, y and the height above the ground in metres. on: function of x, y that returns the z of
-    the ground.
+    to: x, y, and the height of the object's lowest point above the ground, in metres. turn:
+    radians. on: function of x, y that returns the z of the ground.
     """
     low = lowest(thing) * size
     place = (to[0], to[1], to[2] + on(to[0], to[1]) - low)

@@ -22,7 +22,8 @@ class JointLayer(DecoderLayer):
     """Decoder layer with self-attention over image tokens and queries together, then an MLP (C3G).
 
     It computes x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)), without LayerScale. It
-    updates the features of image tokens and queries, but not the keys, values and rays in memory.
+    updates the features of image tokens and queries, but not the keys, values and rays in the
+    encoder's memory.
     """
 
     name = "joint"
@@ -51,7 +52,7 @@ class JointLayer(DecoderLayer):
         return True
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Return queries and image tokens after attention. Masked queries are not read."""
+        """Return updated queries and image tokens. No token attends to masked queries."""
         # Image tokens come first, so that slices separate them from queries.
         tokens = memory.features.shape[1]
         x_BTD = torch.cat([memory.features, state.features], 1)
@@ -62,7 +63,10 @@ class JointLayer(DecoderLayer):
         return state.replace(features=queries_BND), memory.replace(features=tokens_BMD)
 
     def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:
-        """Return softmax(q k / sqrt(d)) v (B, T, D) over all tokens except masked queries."""
+        """Return attention (B, T, D) of each token to all tokens except masked queries.
+
+        It is a linear layer of softmax(q k / sqrt(d)) v.
+        """
         # Without a mask torch uses its fastest kernel.
         mask_B11T = None
         if mask_BN is not None:
@@ -77,7 +81,10 @@ CHANNELS = (3, 1, 3, 4, 3)
 
 
 class C3GHead(Head):
-    """Head with LayerNorm, a linear layer D -> K * 14 and the activations of the C3G release."""
+    """Head with LayerNorm, a linear layer, and the activations of the C3G release.
+
+    The linear layer maps the D features of a query to K Gaussians of 14 raw channels.
+    """
 
     name = "head"
 
@@ -85,9 +92,10 @@ class C3GHead(Head):
         gaussians_per_query: int = Field(default=1, ge=1)
         """K, the number of Gaussians decoded from each query."""
         scale_unit: float = Field(default=0.001, gt=0)
-        """Factor of scales, world units: a scale is `scale_unit` times softplus(raw scale)."""
+        """Unit of scales of Gaussians: a scale in world units is `scale_unit` times softplus(raw
+        scale)."""
         quat_eps: float = Field(default=1e-8, gt=0)
-        """Least length by which a raw quaternion is divided to normalise it."""
+        """Lower bound of the length by which a raw quaternion is divided when it is normalised."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
         """Number that the LayerNorm adds to the variance."""
 
@@ -109,7 +117,7 @@ class C3GHead(Head):
         return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
 
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
-        """Return attributes from raw channels (B, N, K, 14), in float32 or float64."""
+        """Return attributes of Gaussians, float32 or float64, from raw channels (B, N, K, 14)."""
         offsets, opacity, scale, rotation, sh = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         return GaussianAttributes(
             offsets=offsets,

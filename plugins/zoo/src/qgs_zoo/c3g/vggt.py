@@ -2,8 +2,8 @@
 
 Code and weights have their own licences, so this package neither contains nor downloads them. It
 assumes that `vggt.models.aggregator.Aggregator()` takes images (B, V, 3, H, W). The aggregator must
-return a list of tokens (B, V, P, 2048), one tensor for each layer, and the index of the first patch
-token.
+return a list with one tensor for each layer, P tokens of each view (B, V, P, 2048), and the index
+of the first patch token.
 """
 
 from collections.abc import Mapping
@@ -31,9 +31,9 @@ PREFIX = "aggregator."
 class VggtFeatures(PatchEncoder):
     """Encoder that returns the patch tokens of VGGT's last layer (C3G).
 
-    VGGT's tokens for cameras and registers are left out. It reads images but no cameras. If the
-    model's width is not 2048, a linear layer maps tokens to this width. A checkpoint contains all
-    weights, so only a new model needs the weight file.
+    VGGT's tokens for cameras and registers are left out. The encoder reads images but no cameras.
+    If the model's width is not 2048, a linear layer maps tokens to this width. A checkpoint
+    contains all weights, so only a new model needs the weight file.
     """
 
     name = "vggt_features"
@@ -44,12 +44,12 @@ class VggtFeatures(PatchEncoder):
 
     class Config(PatchEncoder.Config):
         patch_size: Literal[14] = 14
-        """Side of a patch, pixels. VGGT supports 14 only."""
+        """Side of a patch in pixels. VGGT supports 14 only."""
         weights: str = Field(min_length=1)
         """File of VGGT's weights: model.safetensors or model.pt."""
         images: Literal["signed", "unit"] = "signed"
-        """Give VGGT images in [-1, 1] ("signed", C3G release), or in [0, 1] ("unit", as VGGT was
-        trained)."""
+        """Range of the images that VGGT gets. `signed`: from -1 to 1, as in the C3G release.
+        `unit`: from 0 to 1, as in VGGT's training."""
 
     config: Config
 

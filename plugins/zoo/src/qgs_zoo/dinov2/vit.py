@@ -1,8 +1,9 @@
-"""DINOv2's vision transformer (Oquab et al., arXiv 2304.07193), with its parameter names.
+"""DINOv2's vision transformer (Oquab et al., arXiv 2304.07193), with the published parameter names.
 
 It covers ViT-S, B and L with patches of 14 x 14 pixels and MLPs with GELU, but no register tokens
 and no mask token. It is new code that follows facebookresearch/dinov2 (Apache-2.0). The encoder
-`dinov2/multiview_vit` adds DINOv2's tokens to embedded rays, and runs blocks over all views.
+`dinov2/multiview_vit` adds DINOv2's tokens to embedded rays, and runs transformer blocks over the
+tokens of all views.
 """
 
 import math
@@ -32,7 +33,7 @@ SHIFT = 0.1
 
 
 class VitConfig(ComponentConfig):
-    """Sizes and weights of the transformer, by default those of ViT-S."""
+    """Sizes of the transformer, by default those of ViT-S, and its file of weights."""
 
     width: int = Field(default=384, ge=1)
     """Width of tokens: 384 for ViT-S, 768 for ViT-B, 1024 for ViT-L."""
@@ -55,7 +56,10 @@ class VitConfig(ComponentConfig):
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention with one layer for queries, keys and values, on (X, T, C)."""
+    """Multi-head self-attention on (X, T, C): X images, T tokens, C channels.
+
+    One linear layer computes queries, keys and values.
+    """
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -85,7 +89,7 @@ class Block(nn.Module):
 
 
 class PatchEmbed(nn.Module):
-    """Embedding of patches of 14 x 14 pixels: (X, 3, 14 h, 14 w) -> (X, h w, C)."""
+    """Embedding of h x w patches of 14 x 14 pixels of X images: (X, 3, 14h, 14w) -> (X, h w, C)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -96,10 +100,10 @@ class PatchEmbed(nn.Module):
 
 
 class DinoV2(nn.Module):
-    """Transformer from images (X, 3, 14 h, 14 w) to tokens of their patches (X, h w, C).
+    """Transformer from X images (X, 3, 14 h, 14 w) to tokens of their h x w patches, (X, h w, C).
 
-    Images must be normalised by ImageNet's mean and standard deviation. Each of the X images is
-    processed alone.
+    Images must be normalised by ImageNet's mean and standard deviation. Each image is processed
+    alone.
     """
 
     def __init__(self, width: int, depth: int, heads: int) -> None:
@@ -118,10 +122,10 @@ class DinoV2(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def forward(self, images: Tensor, blocks: Collection[int]) -> list[Tensor]:
-        """Return a list of tokens (X, h w, C), one tensor for each of the `blocks`.
+        """Return the tokens (X, h w, C) after each of the `blocks`, as a list of tensors.
 
-        blocks: indices of blocks, from 0. Tokens of every block pass the norm that follows the last
-        block (DINOv2 release). Blocks after the largest index are not run.
+        blocks: indices of blocks, from 0. The LayerNorm that follows the last block is applied to
+        the tokens of every block (DINOv2 release). Blocks after the largest index are not run.
         """
         grid = images.shape[-2] // PATCH, images.shape[-1] // PATCH
         x_XPC = self.patch_embed(images)
@@ -152,9 +156,9 @@ class DinoV2(nn.Module):
     def load(self, file: str | None) -> None:
         """Read pretrained weights from a file. None keeps the present weights.
 
-        Names are those of DINOv2's files, possibly after a prefix, such as `pretrained.` in files
-        of Depth Anything V2. Further tensors in the file are ignored. Raises MissingExtraError for
-        a file that does not fit.
+        Tensors have the names in DINOv2's files, possibly after a prefix, such as `pretrained.` in
+        files of Depth Anything V2. Tensors with further names are ignored. Raises MissingExtraError
+        for a file that does not fit.
         """
         if file is not None:
             load_weights(
@@ -169,7 +173,7 @@ class DinoV2(nn.Module):
         mark = "patch_embed.proj.weight"
         prefix = next((n.removesuffix(mark) for n in weights if n.endswith(mark)), None)
         if prefix is None:
-            raise ValueError(f"the file has no tensor {mark}")
+            raise ValueError(f"no weights of DINOv2: the file has no tensor {mark}")
         # A mask token and registers in the file are ignored.
         found: dict[str, Any] = {n: weights[prefix + n] for n in own if prefix + n in weights}
         self.load_state_dict(found)
@@ -178,7 +182,7 @@ class DinoV2(nn.Module):
 class Tokens(nn.Module):
     """DINOv2, linear layer and LayerNorm, from images (X, 3, H, W) to tokens (X, H/P * W/P, D).
 
-    P is the side of a patch.
+    X: number of images. P: side of a patch in pixels. D: width of tokens.
     """
 
     def __init__(self, config: VitConfig, width: int, patch_size: int) -> None:
@@ -200,7 +204,7 @@ class Tokens(nn.Module):
 class DinoMultiViewViT(MultiViewViT):
     """Encoder `qgs/multiview_vit` with DINOv2 as the embedding of colours.
 
-    DINOv2 sees one photo at a time, resized so that each patch has 14 x 14 pixels. For example,
+    DINOv2 processes each photo alone, resized so that each patch has 14 x 14 pixels. For example,
     photos of 256 x 256 with patches of 16 x 16 are resized to 224 x 224.
     """
 

@@ -60,12 +60,15 @@ class PosedPatches(PatchEncoder):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the field of features, with its width, and the grid if there are no registers."""
+        """Return the fields of memory that the encoder writes.
+
+        These are the features, with their width, and the grid of patches if there are no registers.
+        """
         features = {"memory.features": FieldSpec((config.rgb_width + config.ray_width,))}
         return features if config.registers else {**features, **memory_fields("grid")}
 
     def forward(self, views: Views) -> ImageMemory:
-        """Return the tokens of patches and registers, with a grid if there are no registers."""
+        """Return the tokens of patches and registers. Without registers, also return the grid."""
         grid = self.grid(views)
         rgb_BVPC = _tokens(self.rgb_embedding, 2 * views.images - 1)
         ray_BVPC = _tokens(self.ray_embedding, plucker_rays(views.cameras))
@@ -89,9 +92,9 @@ def _tokens(embedding: nn.Conv2d, images: Tensor) -> Tensor:
 
 @full_precision
 def lens(cameras: Cameras) -> Tensor:
-    """Return (..., 4): logarithms of focal lengths, then principal point of cameras.
+    """Return logarithms of focal lengths, then the principal point, of each camera: (..., 4).
 
-    The unit along x is the width of the image, and along y its height.
+    Lengths along x are in units of the image's width, lengths along y in units of its height.
     """
     height, width = cameras.size
     sides = constant([width, height], cameras.intrinsics)
@@ -102,7 +105,7 @@ def lens(cameras: Cameras) -> Tensor:
 
 @full_precision
 def place(cameras: Cameras, bands: int) -> Tensor:
-    """Encode the centre x of each camera as (..., 3 + 6 bands).
+    """Encode the centre x of each camera as 3 + 6 `bands` numbers, in the last dimension.
 
     The numbers are x, then sin and cos of 2^k pi x for k = 0 .. bands - 1.
     """

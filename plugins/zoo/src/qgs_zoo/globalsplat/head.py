@@ -32,14 +32,14 @@ CHANNELS = (3, 3, 6, 1)
 
 
 class MergingHead(Head):
-    """Head that decodes candidates per token and merges blocks of them into 2^level Gaussians.
+    """Head that decodes each token into candidates and merges blocks of them into Gaussians.
 
     The geometry of a token gives position, log scale, 6D rotation, opacity and gate of each
-    candidate. Its texture gives coefficients of spherical harmonics. A merged Gaussian is the mean
-    of its block, weighted by the softmax of the gates. The mean is over positions, rotations,
-    coefficients, log scales and log(1 - opacity). Then log(size of the block) / 3 is added to log
-    scales. Between two whole levels, the Gaussians of both are rendered, with log(1 - opacity)
-    multiplied by the share of the level.
+    candidate. Its texture gives coefficients of spherical harmonics. A token has 2^level blocks. A
+    merged Gaussian is the mean of its block, weighted by the softmax of the gates. The mean is over
+    positions, rotations, coefficients, log scales and log(1 - opacity). Then log(size of the block)
+    / 3 is added to log scales. At a fractional level, the Gaussians of both adjacent whole levels
+    are rendered, with their log(1 - opacity) multiplied by the share of their level.
     """
 
     name = "merging_head"
@@ -50,8 +50,8 @@ class MergingHead(Head):
         candidates: int = Field(default=16, ge=1)
         """Number of candidate Gaussians of each token, a power of two."""
         level: float = Field(default=3.0, ge=0)
-        """Base-2 logarithm of the number of Gaussians per token. Between two whole numbers, the
-        Gaussians of both are rendered and blended."""
+        """Base-2 logarithm of the number of Gaussians per token. At a fractional level, the
+        Gaussians of both adjacent whole levels are rendered and blended."""
         sh_degree: int = Field(default=3, ge=0, le=3)
         """Degree of the spherical harmonics. 0 means colours that do not depend on the viewing
         direction."""
@@ -62,9 +62,11 @@ class MergingHead(Head):
         scale_bias: float = -2.0
         """Number added to raw log scales before they are bounded."""
         scale_min: float = Field(default=1e-4, gt=0)
-        """Sets the smallest scale of a candidate Gaussian, `scale_min` / e, in world units."""
+        """Sets the smallest scale of a candidate Gaussian in world units, which is `scale_min` / e
+        with e = 2.718."""
         scale_max: float = Field(default=0.05, gt=0)
-        """Sets the largest scale of a candidate Gaussian, `scale_max` e^2, in world units."""
+        """Sets the largest scale of a candidate Gaussian in world units, which is `scale_max` times
+        e^2 = 7.389."""
         opacity_bias: float = -5.0
         """Number added to the logits of opacities."""
 
@@ -103,13 +105,16 @@ class MergingHead(Head):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the field of spherical harmonics, or no field if their degree is 0."""
+        """Return the field of harmonics that the head writes, or no field if `sh_degree` is 0."""
         sh = "gaussians.sh"
         return {sh: GAUSSIAN_FIELDS[sh]} if config.sh_degree else {}
 
     @property
     def gaussians_per_query(self) -> int:
-        """Number of Gaussians per token: 2^level, or between whole levels the sum over both."""
+        """Number of Gaussians per token.
+
+        It is 2^level for a whole level, and the sum for both adjacent whole levels otherwise.
+        """
         return sum(count for count, _ in stages(self.config.level))
 
     def forward(self, state: QueryState) -> GaussianAttributes:
@@ -123,7 +128,8 @@ class MergingHead(Head):
     def activate(self, geometry: Tensor, texture: Tensor) -> GaussianAttributes:
         """Merge candidates from raw channels, and return attributes in float32 or float64.
 
-        geometry: (B, N, C, 14). texture: (B, N, C, 3 (degree + 1)^2).
+        geometry, texture: raw channels of candidates, (B, N, C, 14) and (B, N, C, 3 (degree +
+        1)^2).
         """
         gates = geometry[..., -1]
         candidates = torch.cat([self.bounded(geometry[..., :-1]), texture], -1)
@@ -139,7 +145,10 @@ class MergingHead(Head):
         return self._attributes(torch.cat(parts, 2))
 
     def bounded(self, raw: Tensor) -> Tensor:
-        """Return candidates (..., 13) with bounded log scales, and log(1 - opacity) at the end."""
+        """Return candidates (..., 13) with bounded log scales, and log(1 - opacity) at the end.
+
+        raw: position, log scale, rotation and opacity logit of candidates, (..., 13).
+        """
         place, log_scale, rotation, opacity = raw.split(CHANNELS, -1)
         config = self.config
         low = math.log(config.scale_min) - 1
@@ -173,9 +182,9 @@ LEAST_LENGTH = 1e-4
 
 @full_precision
 def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
-    """Average C candidates in `count` blocks, weighted by the softmax of the gates of a block.
+    """Average C candidates in `count` equal blocks, weighted by the softmax of each block's gates.
 
-    candidates: (..., C, X). gates: (..., C). Returns (..., count, X).
+    candidates: X channels each, (..., C, X). gates: (..., C). Returns (..., count, X).
     """
     # Gates compete only within their block, so that blocks stay independent.
     weights = gates.unflatten(-1, (count, -1)).softmax(-1)
@@ -183,15 +192,18 @@ def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
 
 
 def growth(candidates: int, count: int) -> float:
-    """Return what log scales gain so that `candidates` merged into `count` keep total volume."""
+    """Return the number to add to log scales of merged Gaussians to keep the total volume.
+
+    candidates: number before merging. count: number after merging.
+    """
     return math.log(candidates / count) / 3
 
 
 def stages(level: float) -> list[tuple[int, float]]:
     """Return the numbers of Gaussians per token that are rendered at a level, with their shares.
 
-    A whole level s gives 2^s with share 1. A level between two whole ones gives the numbers of
-    both, with shares that add up to 1.
+    A whole level s gives one number, 2^s, with share 1. A fractional level gives the numbers of
+    both adjacent whole levels, with shares that add up to 1.
     """
     low = math.floor(level)
     share = level - low

@@ -41,9 +41,9 @@ class Frustum(Loss):
         weight: float = Field(default=0.01, ge=0)
         """Weight of the loss in the objective."""
         softness: float = Field(default=0.05, gt=0)
-        """Distance from the border of a frustum at which the loss starts to act, world units."""
+        """Width of the smooth transition of the loss at the border of a frustum, in world units."""
         near: float = Field(default=0.05, ge=0)
-        """Depth (camera-frame z) of the near plane of a frustum, world units."""
+        """Depth (camera-frame z) of the near plane of a frustum, in world units."""
 
     config: Config
 
@@ -88,11 +88,12 @@ class Regularisers(Loss):
 def beyond_frusta(points: Tensor, cameras: Cameras, softness: float, near: float) -> Tensor:
     """Return smooth distances (B, P) >= 0 of points (B, P, 3) from the frusta of all views.
 
-    They are in world units, and small if a point is in any frustum. A frustum has five planes: four
-    for the borders of the image, and the near plane at depth `near`. Its distance x is the sum over
-    its planes of t softplus(y / t), with y the distance beyond the plane and t = `softness`. The
-    result is the soft minimum over frusta, -t log mean exp(-x / t). It has a gradient everywhere,
-    even behind a camera, and never divides by a depth.
+    P: number of points. Distances are in world units, and small if a point is in any frustum. A
+    frustum has five planes: four for the borders of the image, and the near plane at depth `near`.
+    The distance x of a point from a frustum is the sum over the planes of t softplus(y / t), with y
+    the point's distance beyond a plane and t = `softness`. The result is the soft minimum over
+    frusta, -t log mean exp(-x / t). It has a gradient everywhere, even behind a camera, and never
+    divides by a depth.
     """
     x, y, z = to_camera(points, cameras).unbind(-1)
     fx, fy, cx, cy = cameras.intrinsics[..., None, :].unbind(-1)
@@ -113,9 +114,10 @@ FIX = "raise views.inputs, or choose `objective: {type: qgs/one_pass}`"
 class TwoPasses(Objective):
     """Objective of two predictions from different input views, which should agree.
 
-    Both read the first and the last view. Of the views between, one prediction reads every second
-    view, and the other prediction reads the rest. Both get the recipe's losses. Two more losses
-    compare alpha and depth of both renderings from the target cameras.
+    Both predictions read the first and the last view. Of the views between, one prediction reads
+    every second view, and the other prediction reads the rest. The recipe's losses apply to both
+    predictions. Both are rendered from the target cameras, and two more losses compare alpha and
+    depth of these renderings.
     """
 
     name = "two_passes"
@@ -125,15 +127,17 @@ class TwoPasses(Objective):
         """Options, with GlobalSplat's defaults."""
 
         alpha_weight: float = Field(default=1e-3, ge=0)
-        """Weight of the difference between the alphas of both renderings."""
+        """Weight of the loss `alpha_consistency`, the mean difference between alphas of the
+        renderings of both predictions."""
         depth_weight: float = Field(default=1e-2, ge=0)
-        """Weight of the difference between the depths of both renderings, in world units."""
+        """Weight of the loss `depth_consistency`, the mean difference in world units between depths
+        of the renderings of both predictions."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Report fewer input views than two different passes need."""
+        """Report fewer than three input views, with which both passes would be the same."""
         if context.inputs is not None and context.inputs < LEAST_VIEWS:
             reason = (
                 f"it needs at least {LEAST_VIEWS} input views, got {context.inputs}: both passes "
@@ -142,7 +146,7 @@ class TwoPasses(Objective):
             yield Problem("", reason, FIX)
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """Return the mean outcome of both passes, plus the losses of their disagreement.
+        """Return the mean outcome of both passes, plus two losses that compare their renderings.
 
         These losses are `alpha_consistency` and `depth_consistency`.
         """
@@ -166,17 +170,18 @@ class TwoPasses(Objective):
 def subset(count: int, part: int) -> list[int]:
     """Return indices of the first view, the last one, and every second view between them.
 
-    count: number of views. part: 0 begins with the view after the first, 1 with the next one.
+    count: number of views. part: 0 takes the second view, the fourth and so on, 1 the third, the
+    fifth and so on.
     """
     return [0, *range(1 + part, count - 1, 2), count - 1]
 
 
 @full_precision
 def disagreement(one: Tensor, other: Tensor) -> Tensor:
-    """Return the mean of |one - other|, 0-d, with gradients as if each side saw the other fixed.
+    """Return the mean of |one - other|, 0-d, with the symmetric stop-gradient of the paper.
 
     It is the mean of two equal terms. In the first, `other` gets no gradient; in the second, `one`
-    gets none. This is the symmetric stop-gradient of the paper.
+    gets no gradient.
     """
     # If neither side were held fixed, both would drift to the blurred mean.
     held = (one - other.detach()).abs().mean(), (other - one.detach()).abs().mean()

@@ -32,7 +32,7 @@ TEXTURE_FIELD: Fields = {TEXTURE: FieldSpec(("D",))}
 
 
 class SlotQueries(LearnedQueries):
-    """N learned tokens, of which the last `extra` are masked and decode no Gaussians.
+    """N learned tokens, of which the last `extra` tokens are masked and decode no Gaussians.
 
     The initial geometry of a token is computed from it by a LayerNorm and a linear layer, and its
     initial texture by another LayerNorm and another linear layer.
@@ -87,8 +87,9 @@ class Round(DecoderLayer):
     """Decoder layer: cross-attention, MLP and ViT blocks in each stream, then a mixer of both.
 
     The streams are geometry and texture of the tokens. The mixer is an MLP that reads and updates
-    both. `decoder.layer_scale` applies to cross-attention, MLP and mixer (GlobalSplat: 1e-3).
-    Masked tokens decode no Gaussians, but all tokens read them, as registers.
+    both streams. `decoder.layer_scale` applies to cross-attention, MLP and mixer (GlobalSplat:
+    1e-3). Masked tokens decode no Gaussians, but all tokens attend to them, so they serve as
+    registers.
     """
 
     name = "round"
@@ -121,11 +122,11 @@ class Round(DecoderLayer):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields of the encoder's features, with their width, and of the texture."""
+        """Return the fields that the layer reads: features of the encoder, texture of tokens."""
         return {"memory.features": FieldSpec((config.memory_width or "D",)), **TEXTURE_FIELD}
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Return tokens with updated geometry and texture, and the memory unchanged."""
+        """Return tokens with updated geometry and texture, and the encoder's memory unchanged."""
         geometry_BND = self.geometry(state.features, memory.features)
         texture_BND = self.texture(state[TEXTURE], memory.features)
         # Only in the mixer do the streams see each other.
@@ -164,7 +165,7 @@ class Stream(nn.Module):
         )
 
     def forward(self, x_BND: Tensor, memory_BMC: Tensor) -> Tensor:
-        """Return the updated stream (B, N, D) from the stream and the memory (B, M, C)."""
+        """Return the stream (B, N, D), updated by all layers. memory_BMC: encoder's features."""
         keys, values = keys_and_values(self.memory_norm(memory_BMC), self.kv_proj, self.k_norm)
         x_BND = x_BND + self.cross_scale(self.cross_attention(x_BND, keys, values))
         x_BND = x_BND + self.mlp_scale(self.mlp(self.norm(x_BND)))

@@ -60,8 +60,8 @@ class Block(nn.Module):
 class Transformer(PatchEncoder):
     """Encoder with self-attention over the patches of all views together (GS-LRM).
 
-    Its memory has features, rays and the grid of patches. It has no keys and values, because GS-LRM
-    has no decoder.
+    The memory that it returns has features, rays and the grid of patches, but no keys and values,
+    because GS-LRM has no decoder.
     """
 
     name = "transformer"
@@ -120,7 +120,7 @@ class PixelQueries(Queries):
     writes = PATCH_FIELD
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """Return the features (B, M, D) of the tokens and `gslrm.patch` (B, M, 4, 3)."""
+        """Return queries: features (B, M, D) of the tokens, and rays `gslrm.patch` (B, M, 4, 3)."""
         assert memory.grid is not None
         _, rows, columns = memory.grid
         fields = {PATCH: pixel_rays(views.cameras, rows, columns)}
@@ -163,12 +163,14 @@ class AlongRays(Centers):
 
     class Config(ComponentConfig):
         near: float = Field(default=0.0, ge=0)
-        """Least distance from the camera, world units. 0 is the camera's centre."""
+        """Least distance of a Gaussian's mean from the camera, in world units. 0 is the camera's
+        centre."""
         far: float = Field(default=500.0, gt=0)
-        """Largest distance from the camera, world units (500 for scenes in the paper)."""
+        """Largest distance of a Gaussian's mean from the camera, in world units (paper: 500 for
+        scenes)."""
         measure: Literal["distance", "depth"] = "distance"
-        """Measure `near`, `far` and t along the ray ("distance", paper), or along the camera's axis
-        ("depth", the repository gs-lrm-unofficial)."""
+        """Direction in which `near`, `far` and t are measured. `distance`: along the ray (paper).
+        `depth`: along the camera's axis (repository gs-lrm-unofficial)."""
 
     config: Config
 
@@ -225,7 +227,7 @@ class PixelHead(Head):
         nn.init.normal_(self.linear.weight, std=config.init_std)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return whether a parameter has weight decay: here the linear layer has it (paper)."""
+        """Return whether a parameter has weight decay: True only for the linear layer (paper)."""
         return parameter.ndim != 1
 
     def forward(self, state: QueryState) -> GaussianAttributes:
