@@ -65,7 +65,7 @@ class Case:
     dims: model sizes with which the component is built.
     image_size: (H, W) of the views in pixels; None takes the first valid of a few small sizes.
     state_dict: expected shapes of all saved weights, by name, so that published weights stay
-        loadable; None expects nothing.
+        loadable; None allows any names and shapes.
     Raises TypeError unless `config` holds the options of a complete component.
     """
 
@@ -141,7 +141,10 @@ class Case:
         raise CannotCheck(f"runs only on {' or '.join(devices)}, which this machine does not have")
 
     def problems(self, size: tuple[int, int] | None = None) -> list[contracts.Problem]:
-        """Return the problems that the component reports for its options and images of `size`."""
+        """Return the problems that the component reports for its options and images of `size`.
+
+        size: (H, W); None if the size of images is not known.
+        """
         context = contracts.RecipeContext(self.dims, size)
         return list(self.component.problems(self.config, context))
 
@@ -186,7 +189,7 @@ class Case:
         return module
 
     def with_at_most(self, **sizes: int) -> "Case":
-        """Return a case whose options are at most `sizes`; unchanged if they would be invalid."""
+        """Reduce options to at most `sizes`; return this case if the new one would be invalid."""
         given = dict(self.config)
         lower = {name: size for name, size in sizes.items() if (given.get(name) or 0) > size}
         smaller = self.with_config(self.config.model_copy(update=lower))
@@ -206,7 +209,7 @@ DEVICES = ("cpu", "cuda", "mps")
 
 
 def component_fault(component: type[Component]) -> str:
-    """Return why recipes cannot use `component`, as a phrase with a verb; "" if they can."""
+    """Return why recipes cannot use `component`, such as "has no `name`"; "" if they can."""
     name = getattr(component, "name", None)
     if not isinstance(name, str):
         return "has no `name`"

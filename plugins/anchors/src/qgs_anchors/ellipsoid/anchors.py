@@ -31,8 +31,8 @@ class EllipsoidQueries(LearnedQueries):
         std: float = Field(default=0.01, ge=0)
         """Standard deviation of the initial features, which are normally distributed."""
         init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
-        """Initial radii of each anchor along the world's axes, world units, before `radius_min`
-        changes them."""
+        """Initial radii of each anchor along the axes of the world frame, world units. Then
+        `radius_min` bounds them, or is added to them, as `radius_bound` says."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
@@ -52,7 +52,6 @@ class EllipsoidQueries(LearnedQueries):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the fields of anchor centres, rotations and raw radii."""
         return {**CENTER_FIELD, **shape_fields(config)}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:

@@ -15,8 +15,9 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
     """Attention `locus/ray_biased` with an ellipsoid instead of a ball around the anchor's centre.
 
     The distance from the centre to a ray is measured in radii of the ellipsoid: along each axis, in
-    the radius of that axis. Options mean the same as in `locus/ray_biased`; `sigma_sq_min` bounds
-    (sigma0 r)^2 on each axis. With `bandwidth: fixed` the ellipsoid has no effect.
+    the radius of that axis. Options mean the same as in `locus/ray_biased`; `sigma_sq_min` is the
+    lower bound of (sigma0 r)^2 for the radius r of each axis. With `bandwidth: fixed` the ellipsoid
+    has no effect.
     """
 
     name = "ray_biased"
@@ -27,7 +28,7 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
         return shape_fields(config) if config.bandwidth == "radius" else {}
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
-        """Return the bias gamma b from the anchors in `state` and the patch rays in `memory`."""
+        """Return the bias of attention logits, from anchors in `state` and rays in `memory`."""
         config = self.config
         sigma_sq_BN3 = self.sigma_sq(state)
         # With one bandwidth for all anchors, the bias is that of LocusGS, whose kernels are faster.

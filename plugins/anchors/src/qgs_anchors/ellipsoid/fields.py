@@ -1,6 +1,6 @@
 """State fields of an ellipsoidal anchor besides its centre: a rotation and three raw radii.
 
-Rotations are quaternions w x y z.
+Rotations are quaternions w x y z. Raw radii are any numbers; `support_radius` maps them to radii.
 """
 
 import torch
@@ -23,13 +23,16 @@ ROTATION_FIELD: Fields = {
 
 
 def radii_field(options: RadiusOptions) -> Fields:
-    """Return the field of raw radii (B, N, 3) along the anchor's axes, with LocusGS's encoding."""
+    """Return the state field of raw radii (B, N, 3), one for each axis of the anchor.
+
+    As in LocusGS, its `encoding` names the options `radius_bound` and `radius_min`.
+    """
     (scalar,) = radius_field(options).values()
     return {RAW_RADII: FieldSpec((3,), encoding=scalar.encoding)}
 
 
 def shape_fields(options: RadiusOptions) -> Fields:
-    """Return the fields of rotations and raw radii."""
+    """Return the state fields of anchor rotations (B, N, 4) and raw radii (B, N, 3)."""
     return {**ROTATION_FIELD, **radii_field(options)}
 
 

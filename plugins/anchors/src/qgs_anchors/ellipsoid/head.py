@@ -15,9 +15,10 @@ from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape
 class EllipsoidHead(GaussianHead):
     """Head `qgs/gaussian_head` with rotations and scales relative to the anchor's ellipsoid.
 
-    A Gaussian's rotation is followed by the anchor's rotation. Its scale along an axis is
-    multiplied by the radius of the ellipsoid in that direction. This radius is 1 / |u / r|, with u
-    the unit vector of the axis in the anchor's frame, and r the three radii.
+    A Gaussian is rotated by the head's rotation, then by the anchor's. The head's scale along an
+    axis of the Gaussian is multiplied by the ellipsoid's radius in the direction of this axis. This
+    radius is 1 / |u / r|, with u the unit vector of the axis in the anchor's frame, and r the three
+    radii.
     """
 
     name = "gaussian_head"
@@ -29,7 +30,6 @@ class EllipsoidHead(GaussianHead):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields of the anchors' rotations and raw radii."""
         return shape_fields(config)
 
     def forward(self, state: QueryState) -> GaussianAttributes:
@@ -46,8 +46,8 @@ class EllipsoidHead(GaussianHead):
 def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
     """Return the radii (B, N, K, 3) of ellipsoids in the directions of their Gaussians' axes.
 
-    radii: those along the ellipsoid's axes. quats: rotation from Gaussian to anchor. In direction u
-    of the anchor's frame an ellipsoid with radii r has the radius 1 / |u / r|.
+    radii: radii along the axes of each ellipsoid. quats: rotations from Gaussian to anchor. In
+    direction u of the anchor's frame an ellipsoid with radii r has the radius 1 / |u / r|.
     """
     return 1 / (quat_to_matrix(quats_BNK4) / radii_BN3[:, :, None, :, None]).norm(dim=-2)
 
@@ -55,14 +55,14 @@ def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
 class AxisScaledCenters(RadiusScaledCenters):
     """Gaussian means at mu + R diag(r) posact(offset), for ellipsoidal anchors.
 
-    An anchor has the centre mu, the rotation R and the radii r. posact(t) is sign(t) (exp|t| - 1).
+    An anchor has the centre mu, the rotation R and the radii r. `offset` is an output of the head,
+    and posact(t) is sign(t) (exp|t| - 1).
     """
 
     name = "axis_scaled"
 
     @classmethod
     def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
-        """Return the fields of anchor centres, rotations and raw radii."""
         return {**CENTER_FIELD, **shape_fields(config)}
 
     @full_precision

@@ -1,10 +1,11 @@
-"""Attention bias between ellipsoidal anchors and image rays: b = -1/2 min |W (x - mu)|^2.
+"""Attention bias between ellipsoidal anchors and image rays: b = -1/2 min |W (p - mu)|^2.
 
-The minimum is over the points x of a ray; mu is the anchor's centre. W = diag(1 / sigma) R' maps
-the ellipsoid with semi-axes sigma_i = sigma0 r_i to a unit ball, with R' the transposed rotation of
-the anchor and r_i its radii. W maps the direction d of a Plücker ray (m, d) to W d. It maps the
-ray's moment around the centre to cof(W) (m - mu x d), with cof(W) the cofactor matrix, because
-W a x W b = cof(W) (a x b). So the minimum is |cof(W) (m - mu x d)|^2 / |W d|^2.
+The minimum is over the points p of a ray; mu is the anchor's centre. W = diag(1 / sigma) R' maps
+the ellipsoid with semi-axes sigma_i = sigma0 r_i to a unit ball. R' is the transposed rotation of
+the anchor, r_i are its radii, and sigma0 is an option. A Plücker ray has the direction d and the
+moment m. W maps d to W d. It maps the ray's moment around the centre to cof(W) (m - mu x d), with
+cof(W) the cofactor matrix and x the cross product, because W a x W b = cof(W) (a x b). So the
+minimum is |cof(W) (m - mu x d)|^2 / |W d|^2.
 """
 
 from typing import Self
@@ -25,7 +26,8 @@ UPWARD = (0.0, 0.0, 1.0)
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
     """Return moments, directions and unit directions of rays (B, M, 6) as rows (B, 9, M).
 
-    direction_eps: least length |d| of a direction by which its moment and direction are divided.
+    Moment and direction of a ray are first divided by the length of its direction, or by
+    `direction_eps` if the length is less.
     """
     m_BM3, d_BM3 = normalised_rays(rays_BM6, direction_eps)
     return torch.cat([m_BM3, d_BM3, unit(d_BM3, UPWARD)], -1).mT.contiguous()
@@ -34,9 +36,9 @@ def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
 class EllipsoidBias(AttentionBias):
     """Bias gamma * max(b, bias_min) between ellipsoidal anchors and image rays.
 
-    Each query has the anchor's centre mu, the rows of cof(W) and of W, gamma / 2 and
-    gamma * bias_min. Each token has moment m, direction d and unit direction d / |d| of its ray.
-    The docstring of this module defines b, W and cof(W).
+    The numbers of a query are the anchor's centre mu, the rows of cof(W), the rows of W, gamma / 2
+    and gamma * bias_min. The numbers of a token are moment m, direction d and unit direction
+    d / |d| of its ray. The docstring of this module defines b, W and cof(W).
     """
 
     @classmethod
@@ -52,9 +54,9 @@ class EllipsoidBias(AttentionBias):
     ) -> Self:
         """Make the bias of a layer.
 
-        center: anchor centres, world. rotation: anchor to world. sigma_sq: squared bandwidths along
-        the anchor's axes. tokens: result of `ray_tokens`. bias_min: lower bound of b. gamma:
-        positive weight, 0-d.
+        center: anchor centres, world frame. rotation: rotation matrices, anchor to world. sigma_sq:
+        squared bandwidths along the anchor's axes. tokens: result of `ray_tokens`. bias_min: lower
+        bound of b. gamma: positive weight, 0-d.
         """
         sigma_BN3 = sigma_sq_BN3.sqrt()
         ball_BN9 = (rotation_BN33 / sigma_BN3[..., None, :]).mT.flatten(2)

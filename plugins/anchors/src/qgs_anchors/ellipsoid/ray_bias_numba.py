@@ -1,9 +1,9 @@
 """Numba kernels of `EllipsoidBias`, which pass once over all rays for each query.
 
-Each query is a row: the anchor's centre mu, the matrices cof(W) and W by rows, factor = gamma / 2
-and lower = gamma * bias_min. W is defined in `qgs_anchors.ellipsoid.ray_bias`. Tokens are nine
-rows: moments m, directions d and unit directions d / |d| of rays. In the code, a matrix is a tuple
-of its nine entries.
+A query is a row of numbers: the anchor's centre mu, the rows of cof(W), the rows of W,
+factor = gamma / 2 and lower = gamma * bias_min. `qgs_anchors.ellipsoid.ray_bias` defines W. A token
+is a column of nine numbers: moment m, direction d and unit direction d / |d| of its ray. In the
+code, a matrix is a tuple of its nine entries.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ def _nine(row, first):
 def _moment(mu, t, j):
     """Return m - mu x d, the moment of ray j around the point mu.
 
-    t: rows of all tokens, with moments m and directions d of rays.
+    t: columns of all tokens, which start with the moment m and the direction d of a ray.
     """
     return (
         t[0, j] - mu[1] * t[5, j] + mu[2] * t[4, j],
@@ -79,7 +79,10 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Write gradients of the numbers of queries to `out`; `gradient` is the one of the bias."""
+    """Write the gradient of the loss with respect to each query's 23 numbers to `out`, (n, 23).
+
+    gradient: gradient of the loss with respect to the bias, (n, M).
+    """
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]

@@ -8,7 +8,7 @@ from qgs_anchors.ellipsoid.fields import ROTATION, ROTATION_FIELD, radii_field, 
 
 
 class EllipsoidRefinement(AnchorRefinement):
-    """Update of anchors as in `locus/refine`, with three radii and a rotation.
+    """Update of anchors as in `locus/refine`, but with three radii, and with a rotation.
 
     An MLP of the query's features gives the vector by which `turned` rotates the anchor.
     """
@@ -34,7 +34,6 @@ class EllipsoidRefinement(AnchorRefinement):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields that are refined."""
         return {**super().fields_read(config), **(ROTATION_FIELD if config.rotation else {})}
 
     def forward(self, state: QueryState) -> QueryState:

@@ -23,16 +23,16 @@ the footprint has no cells. All queries of a set of photos have the same shape."
 
 
 def color_field(count: int) -> Fields:
-    """Return the field of the colours (B, N, K, 3) of K = `count` cells of each footprint."""
+    """Return the state field of mean colours (B, N, K, 3) of each footprint's K = `count` cells."""
     return {COLORS: FieldSpec((count, 3), encoding=f"mean RGB of {count} cells of the footprint")}
 
 
 @full_precision
 def in_world(steps_BNx3: Tensor, frame_BN33: Tensor) -> Tensor:
-    """Turn steps from the axes of each query's photo to the world.
+    """Convert steps from the axes of the camera of each query's photo to the world frame.
 
-    steps: (B, N, 3) or (B, N, K, 3), along right, down and ahead in the photo. frame: these axes in
-    the world, as rows.
+    steps: (B, N, 3) or (B, N, K, 3), along the axes right, down and ahead. frame: these axes in the
+    world frame, as rows (B, N, 3, 3).
     """
     if steps_BNx3.ndim == frame_BN33.ndim:
         return steps_BNx3 @ frame_BN33

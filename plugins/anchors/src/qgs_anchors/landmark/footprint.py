@@ -1,4 +1,4 @@
-"""`landmark/footprint`, `landmark/colored`: Gaussians that start with rays and colours of pixels.
+"""`landmark/footprint`, `landmark/colored`: Gaussians that start on rays and in colours of photos.
 
 `landmark/refine`: LocusGS's update of anchors, with steps in radii along the camera's axes.
 """
@@ -36,20 +36,19 @@ _OF_CHANNELS = ("linear.weight", "linear.bias")
 
 
 class FootprintCenters(RadiusScaledCenters):
-    """Gaussian means at mu + r (u, v, 0) + r posact(offset), along the axes of the anchor's camera.
+    """Gaussian means at mu + r (u, v, 0) + r posact(offset), along the axes of the photo's camera.
 
-    mu and r are centre and radius of the anchor. A footprint is the part of a photo that a query
-    stands for; each of its cells has a Gaussian. (u, v) is the centre of that cell relative to the
-    centre of the footprint, in units of a side: the root of the footprint's area. If the anchor's
-    radius is one side, an offset of 0 puts the Gaussian on the ray of its cell. posact(t) is
-    sign(t) (exp|t| - 1).
+    mu and r are centre and radius of the anchor. The anchor starts on a ray of a photo. The part of
+    the photo that its query stands for is the footprint, which has a cell for each Gaussian. (u, v)
+    is the centre of the cell relative to the centre of the footprint; the unit is the root of the
+    footprint's area. If r is this root, measured at the anchor's depth, an offset of 0 puts the
+    Gaussian on the ray of its cell. posact(t) is sign(t) (exp|t| - 1).
     """
 
     name = "footprint"
 
     @classmethod
     def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
-        """Return the fields of anchors, of the axes of their cameras, and of their footprints."""
         return {**super().fields_read(config), **FRAME_FIELD, **FOOTPRINT_FIELD}
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
@@ -68,8 +67,9 @@ class FootprintCenters(RadiusScaledCenters):
 class ColoredHead(GaussianHead):
     """Head `qgs/gaussian_head` with colours relative to the photo's, and scales in anchor radii.
 
-    Each Gaussian stands for a cell of a photo. Its colour is (tanh(raw + atanh(2 c - 1)) + 1) / 2,
-    with `raw` the head's output and c the mean colour of the cell. So a raw colour of 0 gives c.
+    Each Gaussian stands for a cell of its query's footprint, a part of a photo. Its colour is
+    (tanh(raw + atanh(2 c - 1)) + 1) / 2, with `raw` the head's output and c the mean colour of the
+    cell. So a raw colour of 0 gives c.
     """
 
     name = "colored"
@@ -85,15 +85,14 @@ class ColoredHead(GaussianHead):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields of cell colours and raw radii."""
         return {**color_field(config.gaussians_per_query), **radius_field(config)}
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Adapt the weights `learned` by a head with a different number of Gaussians per query.
 
-        Each Gaussian stands for a cell of a footprint, and takes the weights of the nearest cell
-        of the old head. The footprint is assumed to be a square, as with `count: null`. In a tile,
-        cells may be arranged differently.
+        Each Gaussian stands for a cell of a footprint. It takes the weights that the other head has
+        for the nearest cell. Cells are compared in a square footprint, which queries have with
+        `count: null`. Other footprints may have other rows of cells.
         """
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values
@@ -103,8 +102,8 @@ class ColoredHead(GaussianHead):
     def _of_cells(self, rows: Tensor) -> Tensor:
         """Turn rows (K' * 14, ...) of K' cells into rows (K * 14, ...) of this head's K cells.
 
-        If the number of rows is not a multiple of 14, the rows belong to another kind of head, and
-        are returned unchanged.
+        A Gaussian, one for each cell, has 14 output channels. If the number of rows is not a
+        multiple of 14, the rows belong to another kind of head, and are returned unchanged.
         """
         if len(rows) % sum(CHANNELS):
             return rows
@@ -126,22 +125,20 @@ class ColoredHead(GaussianHead):
 class FramedRefinement(AnchorRefinement):
     """Update of anchors as in `locus/refine`, with steps of centres along the camera's axes.
 
-    The unit of a step is the anchor's radius. An anchor that starts on a ray of a photo is wrong by
-    some radii, mostly in depth. Along the axes of the photo's camera, depth is the same direction
-    for all anchors.
+    The unit of a step is the anchor's radius. The error of an anchor that starts on a ray of a
+    photo is some radii, mostly in depth. Along the axes of the photo's camera, depth is the same
+    direction for all anchors.
     """
 
     name = "refine"
 
     @classmethod
     def fields_read(cls, config: AnchorRefinement.Config) -> Fields:
-        """Return the fields that are refined, and camera axes and radii if centres are refined."""
         framed = {**FRAME_FIELD, **radius_field(config)} if config.center else {}
         return {**super().fields_read(config), **framed}
 
     @classmethod
     def fields_written(cls, config: AnchorRefinement.Config) -> Fields:
-        """Return the fields that are refined."""
         return super().fields_read(config)
 
     def center_step(self, state: QueryState) -> Tensor:

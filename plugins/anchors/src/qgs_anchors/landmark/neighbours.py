@@ -21,10 +21,11 @@ EPS = 1e-6
 class NeighbourAttention(SelfAttention):
     """Self-attention of each query i to the queries j with the k nearest anchors, i included.
 
-    The weights are softmax_j(q_i k_j / sqrt(d) + MLP(p_ij)). They average the values v_j and the
-    relative positions p_ij, which are (mu_j - mu_i) / s_i, the length of this vector, and log s_i.
-    mu is an anchor's centre. The reach s_i is the distance from i to the farthest of the k anchors,
-    so the vectors do not depend on how dense the anchors are.
+    The weights are softmax_j(q_i k_j / sqrt(d) + MLP(p_ij)). The result averages the values v_j and
+    the relative positions p_ij. A relative position has five numbers: the vector
+    (mu_j - mu_i) / s_i, the length of this vector, and log s_i. mu is an anchor's centre. The reach
+    s_i is the distance from i to the farthest of the k anchors, so the vectors do not depend on how
+    dense the anchors are.
     """
 
     name = "neighbours"
@@ -64,7 +65,10 @@ class NeighbourAttention(SelfAttention):
         )
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        """Return the attention of `queries` to all queries: 0 for all but their neighbours."""
+        """Return the attention weights of the queries with indices `queries`.
+
+        The weights are for all queries: 0 for those that are no neighbours.
+        """
         index_BNk, _, bias_BhNk = self._near(state)
         q_BhNd, k_BhNd, _ = self.attention.project(self.norm(state.features))
         chosen = bias_BhNk[:, :, queries]
@@ -73,9 +77,10 @@ class NeighbourAttention(SelfAttention):
         return attention_weights(q_BhNd[:, :, queries], k_BhNd, hidden.scatter(-1, index, chosen))
 
     def _near(self, state: QueryState) -> tuple[Tensor, Tensor, Tensor]:
-        """Return neighbours (B, N, k), their relative positions (B, N, k, 5), and a bias.
+        """Return each query's neighbours (B, N, k), relative positions (B, N, k, 5) and a bias.
 
-        The bias (B, h, N, k) of attention logits is computed from the positions.
+        An MLP computes the bias of the attention logits (B, h, N, k) from the positions. The bias
+        is -inf for masked neighbours.
         """
         index_BNk, seen_BNk = nearest(state[CENTER], self.config.count, state.mask)
         place_BNkP = relative_places(state[CENTER], index_BNk, seen_BNk)
@@ -89,10 +94,11 @@ class NeighbourAttention(SelfAttention):
 @torch.no_grad()
 @full_precision
 def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Return indices (B, N, k) of the k nearest anchors of each anchor, and which are not masked.
+    """Return indices (B, N, k) of the k nearest anchors of each anchor, and a mask (B, N, k).
 
-    k is `count`, or the number of all anchors if that is less. The search is exact. Each anchor is
-    its own first neighbour, even if it is masked. Without a mask the second result is None.
+    The mask is True for neighbours that attention may read; without `mask` it is None. k is
+    `count`, or the number of all anchors if that is less. The search is exact. Each anchor is its
+    own first neighbour, which attention may always read.
     """
     scenes, anchors, _ = center_BN3.shape
     # One part if all distances fit: torch.compile makes a graph for each number of parts.
@@ -118,7 +124,7 @@ def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Ten
 def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | None) -> Tensor:
     """Return relative positions (B, N, k, 5) of neighbours, as `NeighbourAttention` defines them.
 
-    Where `seen` is False, the neighbour is masked, and its position counts as the anchor's own.
+    Where `seen` is False, the neighbour is masked: it counts as if it were at the anchor itself.
     """
     around_BNk3 = _taken(center_BN3[:, None], index_BNk)[:, 0]
     step_BNk3 = around_BNk3 - center_BN3[:, :, None]
@@ -131,7 +137,7 @@ def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | No
 
 
 def _taken(x_BhNd: Tensor, index_BNk: Tensor) -> Tensor:
-    """Return the rows of `x` that belong to the neighbours `index`, (B, h, N, k, d)."""
+    """Return the rows of `x` (B, h, N, d) at the neighbours `index` (B, N, k): (B, h, N, k, d)."""
     # Whole rows: `gather` copies single numbers (10 ms, not 3, for 512 anchors on a CPU).
     scenes, heads, anchors, _ = x_BhNd.shape
     first = torch.arange(scenes * heads, device=index_BNk.device).view(scenes, heads, 1, 1)

@@ -65,7 +65,7 @@ SAMPLES = 4
 
 
 class ObservedQueries(Queries):
-    """Queries for points of photos: each starts with the token at its point, on the ray through it.
+    """Queries for points of photos: each starts on the ray of its point with the image token there.
 
     The depth of the anchor along the camera's axis is z = near^w far^(1 - w), with w the sigmoid of
     an MLP of the token. With a sweep over D depths, w is the mean of D values from 0 to 1 with
@@ -77,7 +77,8 @@ class ObservedQueries(Queries):
     side, measured at the anchor's depth.
 
     A query may take S tokens from its footprint. It starts with their mean, plus a learned matrix
-    times the differences from the mean of all tokens but the first. Its w is the mean of S values.
+    times the differences of all tokens but the first from the mean. Its w is the mean of the w of
+    all S tokens.
     """
 
     name = "observed"
@@ -85,28 +86,29 @@ class ObservedQueries(Queries):
 
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
-        """N, the number of queries, which are spread evenly over the input photos. Each query has a
-        tile if equal tiles with nearly square cells fill every photo; otherwise queries form rows.
-        Null puts `per_token` queries at the centre of each token's patch."""
+        """N, the number of queries, which are spread evenly over the input photos. If N equal tiles
+        with nearly square cells fill the photos, each query has a tile; otherwise queries form
+        rows, and each has a square. Null puts `per_token` queries at the centre of each token's
+        patch."""
         tokens: int = Field(default=1, ge=1)
-        """S, the number of points in its footprint at which a query takes tokens and depths. It
-        has an effect only if `count` is a number."""
+        """S, the number of points in the footprint of a query at which the query takes tokens and
+        depths. It has an effect only if `count` is a number."""
         per_token: int = Field(default=1, ge=1)
-        """Number of queries for each token if `count` is null. Each of them adds its own learned
-        vector to the token."""
+        """Number of queries for each token if `count` is null. Each query adds a learned vector of
+        its own to the token."""
         near: float = Field(default=0.2, gt=0)
         """Least initial depth of an anchor, world units."""
         far: float = Field(default=3.0, gt=0, validate_default=True)
         """Largest initial depth of an anchor, world units."""
         sweep: int | None = Field(default=None, ge=2)
-        """D, the number of depths at which photos are compared to find that of an anchor. Null
+        """D, the number of depths at which photos are compared to find the depth of an anchor. Null
         predicts the depth from the token alone."""
         window: float = Field(default=1.5, gt=0)
         """Side of the squares of photos that a sweep compares. The unit is sqrt(A / S), with A the
         area of the query's footprint and S the option `tokens`."""
         radius: float = Field(default=1.0, gt=0)
-        """Initial radius of an anchor. The unit is the side of its footprint, measured at the
-        anchor's depth."""
+        """Initial radius of an anchor. The unit is the side of the query's footprint, measured at
+        the anchor's depth."""
         std: float = Field(default=0.3, ge=0)
         """Initial standard deviation of the learned vectors, which are added to tokens."""
         cells: int | None = Field(default=None, ge=1)
@@ -120,7 +122,7 @@ class ObservedQueries(Queries):
             near = info.data.get("near")
             if near is not None and far <= near:
                 raise OptionError(
-                    f"far must be more than near, {near:g}, got {far:g}",
+                    f"far must be more than near, got near {near:g} and far {far:g}",
                     "give the depths at which the scene begins and ends",
                 )
             return far
@@ -146,7 +148,6 @@ class ObservedQueries(Queries):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the fields of anchors, camera axes, footprints, and colours if there are cells."""
         colors = color_field(config.cells) if config.cells else {}
         anchor = {**CENTER_FIELD, **radius_field(config), **FRAME_FIELD}
         return {**anchor, **FOOTPRINT_FIELD, **colors}
@@ -187,7 +188,7 @@ class ObservedQueries(Queries):
     ) -> tuple[Tensor, Tensor]:
         """Return features (B, N, D) and nearness (B, N, 1): 0 at depth `far`, 1 at `near`.
 
-        With a sweep, both depend on the agreement of the photos at each depth.
+        With the option `sweep`, both depend on how well the photos agree at each depth.
         """
         if self.config.sweep is None:
             return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
@@ -200,7 +201,7 @@ class ObservedQueries(Queries):
         return x_BND, (share_BND * nearness_D).sum(-1, keepdim=True)
 
     def _joined(self, x_BXD: Tensor, nearness_BX1: Tensor) -> tuple[Tensor, Tensor]:
-        """Merge features and nearness of the S tokens of each query."""
+        """Merge features and nearness of the S tokens of each query into those of one token."""
         tokens = self.config.tokens
         if tokens == 1:
             return x_BXD, nearness_BX1
@@ -275,7 +276,7 @@ class ObservedQueries(Queries):
 
 
 def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the points (N * K, 2) at K steps from each of N points, and their views (N * K,)."""
+    """Add K steps to each of N points; return the points (N * K, 2) and their views (N * K,)."""
     place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
     return view_N.repeat_interleave(len(step_K2)), place_X2
 

@@ -37,7 +37,8 @@ def patches(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Put `each` points at the centre of every patch of a grid (V, rows, columns).
 
-    Returns the views, points and shares that `spread` returns.
+    The three results mean the same as those of `spread`: the photo of each point, the points, and
+    the size of the part of a photo that belongs to a point.
     """
     photos, rows, columns = grid
     place_N2 = patch_centres(rows, columns, device).repeat(photos, 1).repeat_interleave(each, 0)
@@ -50,9 +51,9 @@ def spread(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Spread N = `count` points evenly over photos of size (H, W).
 
-    Returns the photo (N,) of each point, from 0, 1, 2 in turn; the points (N, 2); and width and
-    height (2,) of the part of a photo that belongs to a point. The last two are shares of the
-    photo's width and height.
+    Returns the index of each point's photo (N,), which goes through all photos in turn; the points
+    (N, 2); and width and height (2,) of the part of a photo that belongs to a point. Points, width
+    and height are shares of the photo's width and height.
 
     The parts are equal tiles if tiles of about `aspect` (height over width in pixels) fill every
     photo. The points are then the centres of the tiles. Otherwise the points are in rows, some of
@@ -82,7 +83,7 @@ def spread(
 
 
 def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tensor:
-    """Return width and height (2,) of a square with side `side_of`, as shares of the photo's."""
+    """Return the sides (2,) of a square from `side_of`, as shares of a photo's width and height."""
     return side_of(count, views, size) / constant([size[1], size[0]], like)
 
 
@@ -97,10 +98,10 @@ def rows_in_square(count: int) -> int:
 
 
 def rows_in_tile(count: int) -> int:
-    """Return the rows of the most nearly square grid with exactly `count` cells.
+    """Return the number of rows of the most nearly square grid with exactly `count` cells.
 
-    It has at most twice as many columns as rows. If there is no such grid, the result is that of
-    `rows_in_square`.
+    The grid has at most twice as many columns as rows. If there is no such grid, the result is that
+    of `rows_in_square`.
     """
     few = range(math.isqrt(count), 0, -1)
     grids = (rows for rows in few if count % rows == 0 and count <= 2 * rows**2)
@@ -150,9 +151,9 @@ def sampled(
 
 
 def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
-    """Sample maps bilinearly at X points of each of N photos, as (B, C, N, X).
+    """Sample the maps of photos bilinearly at N groups of X points, as (B, C, N, X).
 
-    maps: one map for each photo. view: index of the photo for each of the N. place: points (B, N,
+    maps: one map for each photo. view: index (N,) of the photo of each group. place: points (B, N,
     X, 2), x and y from 0 to 1. Points outside a map get the values at its nearest edge.
     """
     _, photos, _, height, width = maps_BVCHW.shape

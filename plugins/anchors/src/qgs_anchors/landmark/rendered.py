@@ -32,9 +32,10 @@ class RenderedFeedback(Feedback):
     """Feedback that adds rendering errors to keys and values, and a learned vector to queries.
 
     In each token's patch, the errors of the rendered photo are averaged into `cells` x `cells`
-    numbers per channel. A 3 x 3 convolution over tokens, GELU and a linear layer turn them into
-    keys and values, which are added to the encoder's. The tokens keep their rays, so a query that
-    prefers rays near its anchor reads the errors where its Gaussians are rendered.
+    numbers per channel. A 3 x 3 convolution over tokens, GELU and a linear layer turn these numbers
+    into keys and values, which are added to the keys and values of the encoder. The tokens keep
+    their rays, so a query that prefers rays near its anchor reads the errors where its Gaussians
+    are rendered.
     """
 
     name = "rendered"
@@ -44,8 +45,8 @@ class RenderedFeedback(Feedback):
         rounds: int = Field(default=2, ge=1, le=16)
         """Number of rounds in evaluation, and the largest number of rounds in a training step."""
         least: int = Field(default=1, ge=1)
-        """Smallest number of rounds in a training step. Each step draws its number of rounds from
-        `least` to `rounds`."""
+        """Smallest number of rounds in a training step. Each step takes a random number of rounds
+        from `least` to `rounds`."""
         layers: int = Field(default=2, ge=1)
         """Number of decoder layers, counted from the last, that a round repeats."""
         shrink: int = Field(default=2, ge=1)
@@ -66,7 +67,7 @@ class RenderedFeedback(Feedback):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report too many `layers`, `least` above `rounds`, and sizes not divided by `shrink`."""
+        """Report too large `layers` or `least`, and image sizes that `shrink` does not divide."""
         depth = context.dims.depth
         size = context.image_size
         if config.layers > depth:
@@ -80,9 +81,10 @@ class RenderedFeedback(Feedback):
             yield Problem("shrink", reason, "choose a number that divides both sides")
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the weights `learned` by a checkpoint.
+        """Return weights for this feedback, made from the weights `learned` of another model.
 
-        If the checkpoint has no feedback, return weights with which errors have no effect at first.
+        `learned` is returned unchanged if it holds any weights. Otherwise errors of the rendering
+        have no effect at first.
         """
         # Only a checkpoint of a model with rounds has these names.
         if learned:
@@ -91,7 +93,7 @@ class RenderedFeedback(Feedback):
         return own | {k: torch.zeros_like(own[k]) for k in own if k.startswith("kv_proj.")}
 
     def drawn(self) -> int:
-        """Draw a number of rounds, uniformly from `least` to `rounds`."""
+        """Return a random number of rounds, uniformly from `least` to `rounds`."""
         return int(torch.randint(self.config.least, self.config.rounds + 1, ()))
 
     def compared(self, views: Views) -> Views:

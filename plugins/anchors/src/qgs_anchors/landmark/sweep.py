@@ -1,4 +1,4 @@
-"""Sweep over depths: comparison of the area around a point of a photo with the other photos."""
+"""Sweep over depths: comparison of small windows of a photo with the other photos at each depth."""
 
 import torch
 from torch import Tensor
@@ -18,13 +18,13 @@ LEAST_DEPTH = 1e-3
 def mismatch(
     views: Views, view_N: Tensor, place_BN2: Tensor, depth_D: Tensor, side: float, points: int
 ) -> tuple[Tensor, Tensor]:
-    """Compare windows of photos with the other photos, at D depths.
+    """Compare windows around points of photos with the other photos, at D depths.
 
     A window is a square of `side` pixels around one of N points, with points x points samples.
-    Returns differences and bools, each (B, N, D). A difference is the mean of |RGB - RGB of the
-    other photo| over the samples, and over the photos that see at least half of the window at that
-    depth. If no photo does, the difference is 0 and the bool False. Cameras and photos get
-    gradients.
+    Returns two tensors (B, N, D): differences and bools. A difference is the mean of |RGB - RGB of
+    the other photo| over the samples, and over the photos that see at least half of the window at
+    that depth. If no photo does, the difference is 0 and the bool False; otherwise the bool is
+    True. Cameras and photos get gradients.
     """
     height, width = views.cameras.size
     place_BN2 = place_BN2.to(views.images)
