@@ -1,4 +1,4 @@
-"""Text descriptions of models: their sizes, and a line for each slot."""
+"""Text descriptions of models: their sizes, and the component in each slot."""
 
 from typing import Any
 
@@ -8,9 +8,11 @@ from qgs.contracts import LAYER_SLOTS, SUBLAYER_SLOTS
 
 
 def parameter_counts(model: Any) -> dict[str, int]:
-    """Count the parameters of each component, summed over decoder layers by slot.
+    """Count the parameters of each component of a model.
 
-    The entry `decoder.layer` counts the parameters of decoder layers outside of their sublayers.
+    Parameters of all decoder layers are summed, with an entry for each kind of sublayer, such as
+    `decoder.self_attention`. The entry `decoder.layer` counts what layers have outside of
+    sublayers.
     """
     sublayers: dict[str, int] = {}
     for slot in SUBLAYER_SLOTS:
@@ -34,7 +36,7 @@ def _count(module: nn.Module) -> int:
 
 
 def model_text(model: Any) -> str:
-    """Describe a model: its sizes, then component and number of parameters for each slot."""
+    """Describe a model: a line of sizes, then for each slot its component and parameter count."""
     rows = slot_rows(model)
     wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [f"  {slot:<{wide[0]}}  {kind:<{wide[1]}}  {n:>{wide[2]}}" for slot, kind, n in rows]
@@ -42,7 +44,7 @@ def model_text(model: Any) -> str:
 
 
 def heading(model: Any) -> str:
-    """Return a line with class, numbers of parameters, decoder layers and queries, and device."""
+    """Return one line: the model's class, device, and numbers of parameters, layers and queries."""
     tree = (model.recipe or {}).get("model", {})
     options = {**tree.get("queries", {}), **tree.get("head", {})}
     parts = [f"{_count(model):,} parameters", f"{len(model.decoder)} decoder layers"]
@@ -53,9 +55,10 @@ def heading(model: Any) -> str:
 
 
 def slot_rows(model: Any) -> list[tuple[str, str, str]]:
-    """Return rows of a table: slot, types of its components, number of parameters.
+    """Return the rows of a table: a slot, the types of its components, their number of parameters.
 
-    For a model without a recipe, types are class names; they are empty for slots of decoder layers.
+    A model built without a recipe has no types. Its rows show class names, and for slots of decoder
+    layers nothing.
     """
     counts = {name: f"{count:,}" for name, count in parameter_counts(model).items()}
     counts |= {"supervision": "", "renderer": ""}
@@ -64,7 +67,7 @@ def slot_rows(model: Any) -> list[tuple[str, str, str]]:
 
 
 def _types(model: Any, slot: str) -> list[str]:
-    """Return the types of the components in a slot; for a slot of layers, one type per layer."""
+    """Return the types of the components in `slot`; for a slot of layers, one type per layer."""
     if model.recipe is None:
         return [type(getattr(model, slot)).__name__] if hasattr(model, slot) else []
     tree = model.recipe["model"]

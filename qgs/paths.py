@@ -54,7 +54,7 @@ def open_file(path: Path | UPath) -> IO[bytes]:
         return io.BytesIO(read_file(path))
     # Reading a pipe or device may never end.
     if path.is_fifo() or path.is_char_device():
-        raise OSError(f"{path} is a pipe or a device")
+        raise OSError(f"{path} is a pipe or a device, not a regular file")
     return path.open("rb")
 
 
@@ -70,7 +70,7 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     except _DAMAGED as error:
         raise OSError(f"{path} is damaged: {error}") from error
     if len(content) > most:
-        raise OSError(f"{path} is larger than {decimal(most)}")
+        raise OSError(f"{path} is larger than {decimal(most)}, the limit for such files")
     return content
 
 

@@ -1,4 +1,4 @@
-"""Precision of a model's computation: autocast, and at least float32 for geometry."""
+"""Precision of a model's computation: autocast, and at least float32 for functions on geometry."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -19,8 +19,8 @@ Precision: TypeAlias = Literal["float32", "bf16"]
 def autocast(precision: Precision, device: str) -> torch.autocast:
     """Return the context in which a model computes in `precision`.
 
-    Functions on geometry stay in float32 by `full_precision`. bfloat16 has the same exponents as
-    float32, so gradients need no scaling.
+    Functions decorated with `full_precision`, such as those on geometry, stay in float32. bfloat16
+    has the same exponents as float32, so gradients need no scaling.
     """
     return torch.autocast(device, torch.bfloat16, enabled=precision == "bf16")
 
@@ -31,11 +31,11 @@ def at_least_float32(x: Tensor) -> Tensor:
 
 
 def full_precision(function: F) -> F:
-    """Run `function` outside autocast, with half-precision tensor arguments raised to float32.
+    """Decorate `function` to run outside autocast, with half-precision arguments cast to float32.
 
-    Tensors inside containers, mappings, lists and tuples are raised too. Arguments without a
-    half-precision tensor are passed on unchanged. A raised ImageMemory is a copy whose cache (see
-    `once`) is empty. float64 stays float64, so that gradient checks work.
+    Tensors inside containers, mappings, lists and tuples are cast too. Arguments without a
+    half-precision tensor are passed on unchanged. An ImageMemory that is cast becomes a copy with
+    an empty cache (see `once`). float64 stays float64, so that gradient checks work.
     """
 
     @wraps(function)

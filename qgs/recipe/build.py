@@ -1,4 +1,4 @@
-"""Construction of a model from chosen components, and learning-rate factors."""
+"""Construction of a recipe's model, and the learning-rate factors of its parameters."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 
 def build_model(recipe: Recipe, device: torch.device | str | None) -> QueryGaussianModel:
-    """Build the model of a checked recipe; the device "meta" allocates no memory.
+    """Build the model of a checked recipe; on the device "meta", no memory is allocated.
 
-    Parameters are drawn on the CPU from the recipe's seed, for every device. The global random
-    state does not change.
+    Initial parameters are sampled on the CPU from the recipe's seed, whatever `device` is. The
+    global random state does not change.
     """
     on_meta = device is not None and torch.device(device).type == "meta"
     with (
@@ -97,11 +97,11 @@ def _assemble(recipe: Recipe) -> QueryGaussianModel:
 
 
 class OnMeta(TorchFunctionMode):
-    """Mode that makes the meta device faster for constructors of components.
+    """Mode that speeds up constructors of components on torch's meta device.
 
-    `linspace` returns numbers, because DINO's constructor reads them. No weights are drawn.
-    `randn` and arithmetic on float32 tensors compute shapes only; otherwise torch would import its
-    compiler, which takes 1 to 3 s.
+    `linspace` returns real numbers, because DINO's constructor reads them. Initialisers of weights
+    do nothing. `randn` and arithmetic on float32 tensors compute only shapes; otherwise torch would
+    import its compiler, which takes 1 to 3 s.
     """
 
     arithmetic = frozenset({Tensor.add, Tensor.sub, Tensor.mul, Tensor.__rpow__})
@@ -133,11 +133,11 @@ class OnMeta(TorchFunctionMode):
 
 
 def build(chosen: Chosen, *arguments: Any) -> Any:
-    """Build a component. arguments: the constructor's arguments after the Config.
+    """Build a component. arguments: what its constructor takes after the Config.
 
-    Raises RecipeError that names the plugin's distribution if a plugin's constructor fails. Errors
-    that a user can mend pass unchanged: missing packages or data, training too short for the
-    optimiser.
+    If the constructor of a plugin's component fails, raises RecipeError that names the plugin's
+    distribution. Errors that a user can mend are not converted: missing packages or data, and
+    training too short for the optimiser.
     """
     component: Any = chosen.component
     try:
@@ -161,7 +161,7 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 def load_pretrained(*parts: nn.Module) -> None:
     """Call `load_pretrained` of every component in `parts`, except on the meta device.
 
-    Raises MissingExtraError that names the component which needs a missing package.
+    Raises MissingExtraError that names the component if a package it needs is missing.
     """
     for component in nn.ModuleList(parts).modules():
         if isinstance(component, Component) and not any(x.is_meta for x in component.parameters()):
@@ -173,11 +173,13 @@ def load_pretrained(*parts: nn.Module) -> None:
 
 
 def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
-    """Return the learning-rate factor of every parameter of `module`, by name (default 1).
+    """Return the learning-rate factor of every parameter of `module`, by parameter name.
 
-    module: a model, or a module that holds the model and the losses. A shared parameter has its
-    first name. Raises RecipeError for a pattern in `optimizer.parts` that matches no parameter. For
-    a model alone, patterns for `losses` are not checked.
+    The factor is 1 unless a pattern in `optimizer.parts` matches the parameter. A parameter that
+    several modules share appears once, under its first name.
+    module: a model, or a module that holds a model and its losses.
+    Raises RecipeError for a pattern that matches no parameter. Patterns for `losses` are not
+    checked if `module` is a model.
     """
     config = optimizer.config
     model = next(m for m in module.modules() if isinstance(m, QueryGaussianModel))
@@ -201,7 +203,7 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
 
 
 def _paths(name: str, model: QueryGaussianModel) -> list[KeyPath]:
-    """Return all paths by which `optimizer.parts` may name the parameter `name` of `model`."""
+    """Return all paths by which patterns in `optimizer.parts` may name the parameter `name`."""
     path = tuple(name.split("."))
     if path[0] == "decoder":
         return [path, ("decoder", "layers", *path[1:]), ("decoder", *path[2:])]

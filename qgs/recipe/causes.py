@@ -1,7 +1,8 @@
 """Search for the line that caused a problem of a recipe.
 
-A file or an override may replace a component or an option on which other lines of the recipe
-rely. The problem is then reported at the replacing line, since the other lines were correct before.
+A file or an override may replace a component or an option on which other lines of the recipe rely.
+The problem is then reported at the line that replaces it, since the other lines were correct
+before.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +23,7 @@ def at_their_causes(
 ) -> Iterator[RecipeProblem]:
     """Yield the problems `found` in the recipe `written`, moved to the lines that caused them.
 
-    Problems with the same cause become one problem.
+    Problems with the same cause become one problem. plugins: plugins passed as objects.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     left = found
@@ -55,11 +56,12 @@ def at_their_causes(
 def _blames(
     found: Sequence[RecipeProblem], before: Draft, written: MapNode, plugins: Sequence[Plugin]
 ) -> dict[RecipeProblem, RecipeProblem]:
-    """Map problems to a problem at the line of `written.over` that caused them.
+    """Map each problem in `found` to a new problem, at the line that caused it.
 
-    The options of `written.over`, the last file or override, are applied one by one. An option
-    causes the problems that first appear after it. found: problems that the recipe has only with
-    `written.over`. before: draft of `written.under`, the recipe without `written.over`.
+    `written` consists of `written.under` and of `written.over`, the last file or override. The
+    options of `written.over` are applied one by one. An option causes the problems that first
+    appear after it.
+    found: problems that are absent without `written.over`. before: draft of `written.under`.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     base: Any = written.under
@@ -79,7 +81,7 @@ def _blames(
 
 
 def _options(over: MapNode, above: KeyPath = ()) -> Iterator[tuple[KeyPath, Any, Origin]]:
-    """Yield path, value and origin of each option of `over`.
+    """Yield path, value and origin (file and line) of each option in the mapping `over`.
 
     Options such as `type`, which decide which other options are valid, come first.
     """
@@ -101,7 +103,10 @@ def _told(draft: Draft) -> set[RecipeProblem]:
 
 
 def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
-    """Return a problem at the line that replaced a component; None if no component was replaced."""
+    """Return a problem at the line that replaced a component; None if no component was replaced.
+
+    before, after: drafts of the recipe without and with that line.
+    """
     for path, new in after.parts.items():
         old = before.parts.get(path, new)
         if new.type != old.type:
@@ -113,7 +118,10 @@ def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
 
 
 def _changing(path: KeyPath, value: Any, origin: Origin, before: Draft) -> RecipeProblem | None:
-    """Return a problem at the line that changed the option `path`; None if it is a `type`."""
+    """Return a problem at the line that changed the option `path`; None if `path` ends in "type".
+
+    before: draft of the recipe without the change.
+    """
     if path[-1] == "type":
         return None
     taken, place, old = find(before.tree, path)

@@ -28,7 +28,7 @@ from qgs.recipe.yaml_text import KeyPath, find, inline
 
 
 def check(draft: Draft, problems: Problems) -> Parts:
-    """Check a draft; return its components without sublayers that no layer uses.
+    """Check a draft of a recipe; return its components, except sublayers that no layer uses.
 
     Raises RecipeError with all problems.
     """
@@ -54,7 +54,10 @@ def _context(draft: Draft) -> RecipeContext:
 
 
 def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
-    """Report problems of a component's options; return False if methods of the component raise."""
+    """Report problems of a component's options; return whether the component's methods ran.
+
+    False means that one of these methods raised an error.
+    """
     component = chosen.component
     config = chosen.config
     called = "fields_read"
@@ -84,10 +87,10 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
 
 
 def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
-    """Return the components of a draft without those in slots that no decoder layer uses.
+    """Return the components of a draft without sublayers that their decoder layer does not use.
 
-    Reports each such component that the recipe names. The decoder's template may have components
-    that only some layers use.
+    A component that is left out is reported if the recipe names it for this layer, or if it names
+    it for all layers and no layer uses it.
     """
     kept = dict(draft.parts)
     layers: dict[KeyPath, Any] = {}
@@ -118,7 +121,7 @@ def _report_idle(idle: Chosen, reason: str, problems: Problems) -> None:
 
 
 def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, str]]:
-    """Yield path, reason and fix of settings that contradict the components."""
+    """Yield path, reason and fix for each setting that contradicts the components."""
     settings = draft.settings
     encoder: Any = parts["model", "encoder"]
     # Tuning fits features, so the encoder must recompute keys and values from them.
@@ -158,7 +161,7 @@ _FLOW = ("encoder", "queries", *LAYER_SLOTS, *AFTER_LAYERS, "losses", "objective
 
 
 def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems) -> None:
-    """Report fields that are read before they are written, or as another type than written."""
+    """Report fields that a component reads before they are written, or reads as the wrong type."""
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     for turns, decodes in _execution_order(parts, depth):
         # The next layer does not see fields that are decoded from this one.
@@ -184,7 +187,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
 
 
 def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], bool]]:
-    """Yield groups of components in the order of a training step.
+    """Yield groups of components in the order of a training step, each group with a flag.
 
     The flag is True for the components that decode a layer and compute its losses.
     """
@@ -224,7 +227,7 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
 
 
 def _offered(component: type[Component], config: ComponentConfig | None) -> Fields:
-    """Return the fields that `component` writes and does not read; none if its code fails."""
+    """Return the fields that `component` writes and does not read; no fields if its code fails."""
     with suppress(Exception):
         assert config is not None
         given = component.fields_read(config)
@@ -239,7 +242,7 @@ def keys_are_read(parts: Parts) -> bool:
 
 
 def idle_fields(parts: Parts) -> Iterator[str]:
-    """Yield a warning for each learnable field of the queries that only refinements read."""
+    """Yield a warning for each learnable field of the queries that nothing but refinements read."""
     read = set[str]()
     for path, part in parts.items():
         # A refinement reads the fields that it updates; that alone does not use them.
@@ -255,7 +258,7 @@ def idle_fields(parts: Parts) -> Iterator[str]:
 
 
 def unfinished(parts: Parts, steps: int) -> Iterator[str]:
-    """Yield a warning for each schedule that still changes after `steps`, the end of training."""
+    """Yield a warning for each schedule that still changes after `steps`, where training ends."""
     # Once for the template of a decoder, not for each layer.
     for part in {part.source: part for part in parts.values()}.values():
         for option, schedule in part.schedules.items():

@@ -1,4 +1,4 @@
-"""Decoding of a recipe's node into the class of a component and its Config."""
+"""Decoding of what a recipe writes for a component into the component's class and Config."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 
 @dataclass(frozen=True)
 class Chosen(Place):
-    """A component at a place of a recipe: its `type`, class, options, and the plugin that has it.
+    """A component that a recipe chooses: its `type`, class, options, and the plugin that offers it.
 
     schedules: schedules of the options that change during training, by option.
-    config: the options, with the first values of schedules.
+    config: the options at step 0.
     later: the options at each later step at which a schedule may have an extreme value.
     """
 
@@ -44,7 +44,7 @@ class Chosen(Place):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Options as a recipe writes them, schedules as mappings."""
+        """Options in the form of a recipe, where a schedule is a mapping."""
         written = {name: s.model_dump(mode="json") for name, s in self.schedules.items()}
         return self.config.model_dump(mode="json") | written
 
@@ -59,7 +59,7 @@ class Chosen(Place):
 
     @property
     def chosen_at(self) -> str:
-        """File and line that set `type`; "default of the slot" if no line does."""
+        """File and line that set `type`; "default of the slot" if no line sets it."""
         return str(self.node.origins.get("type", "default of the slot"))
 
 
@@ -68,7 +68,7 @@ Parts: TypeAlias = Mapping[KeyPath, Chosen]
 
 
 def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen | None:
-    """Return the component at `place`; add a problem and return None if it is invalid."""
+    """Return the component at `place`; if it is invalid, add a problem and return None."""
     node = place.node
     if not isinstance(node, MapNode):
         reason = f"a component must be a mapping, got {brief(node)}"
@@ -97,7 +97,10 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
 def report_failure(
     place: Place, called: str, error: Exception, installed: InstalledPlugin, problems: Problems
 ) -> None:
-    """Report that code of a plugin raised `error`. called: name of that code, for the message."""
+    """Add the problem that a plugin's code raised `error`.
+
+    called: name of this code in the message.
+    """
     release = installed.released_as
     origin = f"the plugin `{installed.plugin.name}`{f' of {release}' if release else ''}"
     reason = f"{origin} fails: {called} raises {type(error).__name__}: {error}"
@@ -110,7 +113,8 @@ def _decode_options(
 ) -> tuple[list[ComponentConfig], dict[str, Schedule]] | None:
     """Return the options at step 0 and at each corner of a schedule, and the schedules by option.
 
-    Returns None, with problems, for invalid options.
+    A corner is a step at which a schedule may have an extreme value. For invalid options, adds
+    problems and returns None.
     """
     schedules: dict[str, Schedule] = {}
     steps = {0}
@@ -144,7 +148,10 @@ def _decode_options(
 
 
 def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str, str] | None:
-    """Return reason and fix for an unknown `type` in `slot`; None if already reported."""
+    """Return reason and fix for an unknown `type` in `slot`.
+
+    Returns None if the type may belong to an unusable plugin, which is already reported.
+    """
     known = registry.components(slot)
     choice = f"choose {', '.join(sorted(known))}"
     if not isinstance(name, str):
@@ -168,7 +175,7 @@ def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str,
 def decode_config(
     config: type[ConfigT], node: MapNode, path: KeyPath, problems: Problems
 ) -> ConfigT | None:
-    """Decode the options in `node` at `path`; add problems and return None if any is invalid."""
+    """Decode the options in `node` at `path`; if any is invalid, add problems and return None."""
     options, faults = validated(config, node)
     for fault in faults:
         report(fault, config, node, path, problems)
@@ -215,7 +222,7 @@ def report(
 
 
 def options_in(annotation: Any, above: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield dotted path and declaration of every option in the type `annotation`, nested or not."""
+    """Yield dotted path and declaration of every option in the type `annotation`, at any depth."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for name, field in annotation.model_fields.items():
             yield above + name, field

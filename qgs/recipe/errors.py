@@ -26,7 +26,7 @@ class RecipeProblem(Problem):
     option: dotted path of the option, "" for the whole recipe.
     file: the file as the user named it, "--set #n" for the n-th override, "<mapping>" for a Python
         mapping.
-    line: 1-based, 0 if there is none.
+    line: 1-based; 0 if the line is unknown.
     cause: the exception that a plugin's code raised; None for other mistakes.
     """
 
@@ -46,7 +46,7 @@ class RecipeProblem(Problem):
 class RecipeError(ValueError):
     """Error for an invalid recipe. `problems` holds all problems, sorted by file and line.
 
-    what: the kind of file, for the message.
+    what: what the message calls the file, such as "recipe".
     """
 
     def __init__(self, problems: Iterable[RecipeProblem], what: str = "recipe") -> None:
@@ -60,7 +60,8 @@ class RecipeError(ValueError):
 class Problems:
     """Collector of a recipe's problems, so that one error can report all of them.
 
-    what: the kind of file, for the message. found: the problems, in the order of discovery.
+    what: what the message calls the file, such as "recipe". found: the problems in the order in
+        which they were added.
     """
 
     def __init__(self, what: str = "recipe") -> None:
@@ -68,7 +69,7 @@ class Problems:
         self.found: list[RecipeProblem] = []
 
     def stop(self, origin: Origin, path: str | Iterable[str], reason: str, fix: str) -> NoReturn:
-        """Add a mistake after which checks cannot go on; raise RecipeError with all problems."""
+        """Add a mistake that prevents further checks, then raise RecipeError with all problems."""
         # Checks of the rest would mislead.
         self.add(origin, path, reason, fix)
         raise RecipeError(self.found, self.what)
@@ -86,7 +87,7 @@ class Problems:
         self.found.append(RecipeProblem(option, reason, fix, origin.file, origin.line, cause))
 
     def raise_any(self) -> None:
-        """Raise RecipeError if there are problems, with exceptions of plugins as its cause."""
+        """Raise RecipeError if there are problems. Exceptions of plugins become its `__cause__`."""
         if self.found:
             error = RecipeError(self.found, self.what)
             causes = [problem.cause for problem in error.problems if problem.cause]

@@ -1,4 +1,4 @@
-"""Reading of recipe files, the files that they extend, and `--set` overrides."""
+"""Reading of recipe files, of the files that they extend, and of `--set` overrides."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -30,9 +30,10 @@ _Trees: TypeAlias = dict[Path, MapNode | None]
 def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     """Merge the mapping `over` into `base`, both at `path` of a recipe. Values of `over` win.
 
-    A component of another `type`, or a mapping of another `kind` or `schedule`, replaces the whole
-    mapping in `base`. The list `plugins` gets the items of both; any other list is replaced. `null`
-    is a value for an option, restores the default of a component or section, and removes a swap.
+    If `over` has another `type`, `kind` or `schedule` than `base`, it replaces `base` as a whole.
+    Items of the list `plugins` are added to those of `base`; any other list is replaced. The value
+    `null` stays as the value of an option, restores the default of a component or section, and
+    removes a swap.
     """
     # Options of another component would be refused, or worse, mean something else.
     if _replaces(base, over, path):
@@ -57,7 +58,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
 
 
 def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
-    """Return whether the mapping `over` replaces `base` completely, both at `path`."""
+    """Return whether `over` replaces `base` as a whole. path: where both are in the recipe."""
     if path[:1] == ("swap",) and len(path) == 2:
         return True
     if "type" in over and type_at(base, path) not in (None, type_at(over, path)):
@@ -74,9 +75,9 @@ def recipe_folder() -> Path:
 
 
 def found_recipe(file: Path, name: str | Path) -> Path:
-    """Return `file` if it exists, else the recipe `name` that comes with qgs, else `file`.
+    """Return `file`, or the recipe `name` that comes with qgs if `file` does not exist.
 
-    name: for example tiny/locus.yaml or recipes/tiny/locus.yaml.
+    If neither exists, returns `file`. name: for example tiny/locus.yaml or recipes/tiny/locus.yaml.
     """
     # A wheel has no repository around it.
     home = recipe_folder()
@@ -103,9 +104,9 @@ def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> M
 
 
 def files_of(recipe: Path) -> list[Path]:
-    """Return paths of a recipe file and all files that it extends, without symbolic links.
+    """Return the real paths of a recipe file and of all files that it extends.
 
-    Raises RecipeError if a file cannot be read.
+    Symbolic links are followed. Raises RecipeError if a file cannot be read.
     """
     trees: _Trees = {}
     _read(recipe, trees, Problems())
@@ -113,7 +114,10 @@ def files_of(recipe: Path) -> list[Path]:
 
 
 def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = None) -> MapNode:
-    """Read `file` merged over its bases. trees: files read so far. at: line that extends `file`."""
+    """Read `file` and merge it over the files that it extends.
+
+    trees: recipes read so far, by file. at: line that extends `file`; None for the first file.
+    """
     # Two files may extend the same third one, by links as well.
     place = Path(os.path.realpath(file))
     if known := trees.get(place):
@@ -142,7 +146,7 @@ def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = Non
 
 
 def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) -> MapNode:
-    """Merge the recipe `node` over the files that it extends. The last file wins."""
+    """Merge the recipe `node` over the files that it extends, of which later ones win."""
     layers: list[MapNode] = []
     for name, origin in items_of(node.get("extends"), node.origin_of("extends")):
         if not isinstance(name, str):
@@ -161,7 +165,7 @@ def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) 
 
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:
-    """Apply overrides to a recipe in order. Messages call the nth override `--set #n`."""
+    """Apply overrides to a recipe in order. Messages call the n-th override `--set #n`."""
     for number, text in enumerate(overrides, start=1):
         # One by one: an override may set an option of a component that the one before chose.
         tree = merge(tree, _read_override(text, Origin(f"--set #{number}"), problems))

@@ -1,4 +1,4 @@
-"""Places of components in a recipe, after defaults, decoder layers and swaps are applied."""
+"""Where a recipe sets each component, after defaults, decoder layers and swaps are applied."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,11 +16,13 @@ DECODER: KeyPath = ("model", "decoder")
 
 @dataclass(frozen=True)
 class Place:
-    """Place of a component, such as `model.encoder`, and what a recipe writes there.
+    """Position of a component in a recipe, such as `model.encoder`, and what is written there.
 
     path: path of the component; a decoder layer has its number: `model.decoder.layers.0.layer`.
-    source: path at which the recipe sets the component: `path`, the decoder's template, or a swap.
+    source: path at which the recipe sets the component: `path`, a path of a swap, or
+        `model.decoder.SLOT`, which sets it for all layers.
     node: value at `source`; an empty mapping if the recipe writes nothing there.
+    origin: file and line of `node`.
     """
 
     path: KeyPath
@@ -37,14 +39,15 @@ class Place:
 
 
 def layer_place(index: int, slot: str) -> KeyPath:
-    """Return the path of a slot in a recipe. index: number of the decoder layer."""
+    """Return the path in a recipe of a slot of decoder layer `index`, counted from 0."""
     return (*DECODER, "layers", str(index), slot)
 
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
     """Return the places of all components, by path, in the order of a recipe's sections.
 
-    tree: the merged recipe. depth: number of decoder layers. Reports layers beyond it.
+    tree: the merged recipe. depth: number of decoder layers. Adds a problem for each layer in
+        `tree` whose number is not below `depth`.
     """
     # A layer with an index beyond the depth often comes from a deeper base recipe.
     layers = tree.child(*DECODER, "layers").without(*map(str, range(depth)))
@@ -66,7 +69,10 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
 
 
 def _place(tree: MapNode, path: KeyPath) -> Place:
-    """Return the place at `path`; a decoder layer's node is merged over the decoder's template."""
+    """Return the place at `path`.
+
+    The node of a single decoder layer is merged over the node that the recipe sets for all layers.
+    """
     *above, name = path
     parent = tree.child(*above)
     node = parent.get(name)
@@ -84,7 +90,7 @@ def _place(tree: MapNode, path: KeyPath) -> Place:
 def apply_swaps(
     swaps: MapNode, places: Mapping[KeyPath, Place], problems: Problems
 ) -> dict[KeyPath, Place]:
-    """Replace the components at places that match the patterns in a recipe's section `swap`.
+    """Return `places` with new components where a pattern of the recipe's section `swap` matches.
 
     swaps: maps each pattern to the new component, or to null to drop a swap of a base recipe.
     A pattern is the dotted path of a component, with or without `model.` in front. `*`, `?` and
@@ -119,7 +125,7 @@ def apply_swaps(
 
 
 def matches(pattern: str, path: KeyPath, *, below: bool = False) -> bool:
-    """Return whether `pattern` matches `path`, or with `below` the first keys of `path`."""
+    """Return whether `pattern` matches `path`. below: whether it may match the first keys alone."""
     # `model.` is optional, so `*.renderer` matches no place of the model.
     wanted = pattern.removeprefix("model.").split(".")
     shown = path[1:] if path[0] == "model" else path

@@ -1,4 +1,4 @@
-"""Resolution of a recipe, without tensors: read, merge, check and write out every default."""
+"""Recipes that are read, merged and checked, with every default written out; without tensors."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,12 +28,13 @@ from qgs.recipe.yaml_text import KeyPath, MapNode, inline, items_of
 class Recipe:
     """A recipe that has passed every check.
 
-    tree: plain mapping with all defaults written out; resolving it again gives the same tree.
+    tree: plain mapping with all defaults written out. `resolve` returns the same tree for this
+        tree.
     provenance: the origin of each value of `tree` by dotted path: `FILE:LINE`, `--set #n`, or a
         default.
-    parts: components by path; each decoder layer has its own, such as
+    parts: components by path. Each decoder layer has its own components, such as
         `model.decoder.layers.0.layer`.
-    releases: (distribution, version) of every plugin in use, by name of the plugin; also of `qgs`.
+    releases: (distribution, version) of `qgs` and of every plugin in use, by name of the plugin.
     """
 
     tree: Mapping[str, Any]
@@ -50,7 +51,7 @@ class Recipe:
 
     @property
     def data_config(self) -> contracts.SceneSourceConfig | None:
-        """Options of the data source; None without data, or if they are no SceneSourceConfig."""
+        """Options of the data source; None without a source or if they are no SceneSourceConfig."""
         config = self.parts["data",].config if ("data",) in self.parts else None
         return config if isinstance(config, contracts.SceneSourceConfig) else None
 
@@ -62,10 +63,10 @@ class Recipe:
     def build_model(
         self, device: torch.device | str | None = None, pretrained: bool = True
     ) -> QueryGaussianModel:
-        """Build the model with its initial parameters; on "meta" it takes no memory.
+        """Build the model with its initial parameters; on the device "meta" it takes no memory.
 
         pretrained: read pretrained weights, such as DINO's. Use False before loading a checkpoint.
-        Raises TooLargeError, before it allocates weights, if they do not fit into memory.
+        Raises TooLargeError, before memory is allocated, if the weights do not fit into memory.
         """
         if device is None or torch.device(device).type != "meta":
             # A width of 65,536 is valid, and would end in the kernel's out-of-memory killer.
@@ -105,7 +106,7 @@ class Recipe:
         return {at[1]: build(part) for at, part in self.parts.items() if at[0] == section}
 
     def build_objective(self) -> contracts.Objective:
-        """Build the objective of a training step."""
+        """Build the objective, which computes the losses of a training step."""
         return build(self.parts["objective",])
 
     def build_optimizer(self) -> contracts.Optimizer:
@@ -119,7 +120,7 @@ class Recipe:
         return rate_factors(module, self.parts["optimizer",])
 
     def build_view_sampler(self) -> contracts.ViewSampler:
-        """Build the sampler of input and target frames."""
+        """Build the sampler that chooses input and target frames of a scene."""
         return build(self.parts["view_sampler",])
 
     def build_data(self) -> contracts.SceneSource:
@@ -134,12 +135,13 @@ def resolve(
     overrides: Sequence[str] = (),
     plugins: Sequence[contracts.Plugin] = (),
 ) -> Recipe:
-    """Read, merge and check a recipe.
+    """Read, merge and check a recipe, and fill in its defaults.
 
     recipe: path of a YAML file, or the name of a recipe that comes with qgs (tiny/locus.yaml), or a
         mapping of the same form. `extends` in a mapping is relative to the working directory.
     overrides: changes such as "model.queries.count=128", applied in order.
-    plugins: plugins that the recipe may name without being installed, such as one under test.
+    plugins: plugins that the recipe may name although they are not installed, such as one under
+        test.
     Raises RecipeError with all problems found.
     """
     problems = Problems()
@@ -181,7 +183,10 @@ _Spelled: TypeAlias = Iterator[tuple[KeyPath, Any, Origin | str]]
 
 
 def spell_out(draft: Draft, parts: Parts) -> _Spelled:
-    """Yield all values of a draft, defaults included, and of its plugins only those in use."""
+    """Yield path, value and origin of each value of a draft, including defaults.
+
+    Of the draft's plugins, only those in use are listed.
+    """
     shown = _shown_parts(parts)
     top, model, decoder, *sections = SETTINGS
     encoder, queries, *others = shown
@@ -209,7 +214,10 @@ def spell_out(draft: Draft, parts: Parts) -> _Spelled:
 def _spelled(
     path: KeyPath, values: Mapping[str, Any], written: MapNode, default: Origin | str
 ) -> _Spelled:
-    """Yield `values` at `path`; values that are missing in `written` have the origin `default`."""
+    """Yield path, value and origin of each of `values`, which are options at `path`.
+
+    written: options that the recipe sets. Other options have the origin `default`.
+    """
     for name, value in values.items():
         origin = written.origins.get(name, default)
         if isinstance(value, dict) and value:
@@ -220,7 +228,7 @@ def _spelled(
 
 
 def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
-    """Return the path `plugins`, the names of plugins in `used`, and the lines that name them."""
+    """Return the path `plugins`, names of the plugins in `used`, and the lines that name them."""
     kept = [name for name in draft.registry.plugins if name != "qgs" and name in used]
     origin = draft.tree.origins.get("plugins", Origin(_DEFAULT))
     lines = [str(at) for name, at in items_of(draft.tree.get("plugins"), origin) if name in kept]
@@ -228,9 +236,10 @@ def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
 
 
 def _shown_parts(parts: Parts) -> dict[KeyPath, Chosen]:
-    """Return components in a recipe's short form: one decoder template, and layers that differ.
+    """Return components in the short form of a recipe, by path.
 
-    If all layers have the same component, that component becomes the template.
+    A component of the decoder stands for all layers; layers that differ from it follow. If all
+    layers have the same component, the decoder gets that component.
     """
     shown = {path: part for path, part in parts.items() if "layers" not in path}
     layers = {path: part for path, part in parts.items() if "layers" in path}
@@ -257,9 +266,10 @@ def flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 def differing_options(
     a: Mapping[str, Any], b: Mapping[str, Any]
 ) -> dict[str, tuple[str | None, str | None]]:
-    """Return the options that differ between two recipes: dotted path to both values as YAML.
+    """Return the options that differ between the recipes `a` and `b`.
 
-    None stands for an option that a recipe does not have.
+    Maps the dotted path of each option to its two values as YAML. None stands for an option that a
+    recipe does not have.
     """
     ours = {key: inline(value) for key, value in flat(a).items()}
     theirs = {key: inline(value) for key, value in flat(b).items()}
@@ -275,8 +285,8 @@ _NO_EFFECT_ONCE_TRAINED = re.compile(
 def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
     """Return the `differing_options` that change the predictions of a trained model.
 
-    Options of initial values, supervision and renderer do not. "none" stands for an option that a
-    recipe does not have.
+    Options of initial values, supervision and renderer are left out, since a trained model predicts
+    the same without them. "none" stands for an option that a recipe does not have.
     """
     return {
         path: (ours or "none", theirs or "none")
@@ -286,7 +296,7 @@ def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[st
 
 
 def annotated(recipe: Recipe) -> str:
-    """Write the complete recipe as YAML with comments that name file and line of each value."""
+    """Write the complete recipe as YAML with comments that give file and line of each value."""
 
     def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():

@@ -27,7 +27,7 @@ class PluginError(OptionError):
 
 @dataclass(frozen=True)
 class InstalledPlugin:
-    """A plugin, and the distribution that installed it ("" if it is not installed).
+    """A plugin, and the distribution that installed it ("" if none did).
 
     folder: folder of the module that defines the Plugin.
     """
@@ -100,7 +100,7 @@ def available_plugins() -> dict[str, list[EntryPoint]]:
 
 
 def load_registry(names: Iterable[str]) -> Registry:
-    """Load the built-in components and those of the plugins `names`; raise PluginError."""
+    """Load the built-in components and the plugins `names`; raise PluginError if one fails."""
     return Registry({"qgs": BUILTIN, **{name: load_plugin(name) for name in names}})
 
 
@@ -109,7 +109,8 @@ def load_plugins(
 ) -> Registry:
     """Load the plugins `names`; add a problem for each plugin that cannot be used.
 
-    tree: the merged recipe, which gives problems their lines. given: plugins passed as objects.
+    tree: the merged recipe, in which the problems get their lines. given: Plugin objects, which are
+        used in place of installed plugins of their names.
     """
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
     plugins = {"qgs": BUILTIN}
@@ -171,7 +172,10 @@ def _release(entry: EntryPoint) -> str:
 
 
 def _plugin_fault(plugin: object, name: str) -> str:
-    """Return what is wrong with the plugin of the entry point `name`, as a predicate, or ""."""
+    """Return what is wrong with `plugin`, to follow its name in a message; "" if nothing is wrong.
+
+    name: the plugin's entry point.
+    """
     if not isinstance(plugin, Plugin):
         return f"is not a qgs.Plugin: its entry point leads to an object of type {type(plugin)}"
     if plugin.contract_version != CONTRACT_VERSION:
@@ -187,7 +191,7 @@ def _plugin_fault(plugin: object, name: str) -> str:
 
 
 def default_config(component: type[Component]) -> ComponentConfig | None:
-    """Return default options; None if an option has no default or a plugin's validator fails."""
+    """Return a component's default options; None if one has no default or validation fails."""
     try:
         return component.Config()
     except (Exception, SystemExit):

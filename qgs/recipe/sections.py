@@ -1,4 +1,4 @@
-"""Sections of a recipe, and drafts: recipes whose components are not yet checked together."""
+"""Sections of a recipe, and drafts: recipes before the check that their components fit together."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -46,12 +46,13 @@ class ModelSettings(ComponentConfig):
 
 
 class DecoderSettings(ComponentConfig):
-    """Settings of the decoder besides the components of its layers."""
+    """Settings of the decoder, apart from the components of its layers."""
 
     depth: int = Field(default=12, ge=0, le=256)
     """Number of layers (L in the papers). With 0, the head decodes the initial queries."""
     layer_scale: float = Field(default=5e-5, gt=0)
-    """Initial LayerScale, the learned factor on each sublayer's output (TokenGS release)."""
+    """Initial value of LayerScale, the learned factor on each sublayer's output. The default is
+    from the TokenGS release."""
 
 
 class RecipeSettings(ComponentConfig):
@@ -62,10 +63,10 @@ class RecipeSettings(ComponentConfig):
     seed: int = Field(default=0, ge=0, lt=2**63)
     """Seed of the model's initial parameters and of training (default 0)."""
     init_from: str | None = None
-    """Checkpoint with the weights from which training starts. Its queries are resized to the number
-    in this recipe (LocusGS release, finetuning). null starts from initial parameters."""
+    """Path of the checkpoint with whose weights training starts. The number of its queries is
+    changed to that of this recipe, as in the LocusGS release. null: initial parameters."""
     plugins: tuple[str, ...] | None = ()
-    """Plugins whose components the recipe may use. Default and null: only the built-in ones."""
+    """Plugins whose components the recipe may use besides the built-in ones; null means none."""
 
 
 SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
@@ -92,7 +93,10 @@ def _parts(*slots: str) -> dict[str, Any]:
 
 
 def _section(settings: type[ComponentConfig], **places: Any) -> Any:
-    """Return a pydantic field for a section of `settings`, with the components `places` if any."""
+    """Return a pydantic field for a section with the options of `settings` and with `places`.
+
+    places: fields of the section for components, by name.
+    """
     kind: Any = settings
     if places:
         named = settings.__name__
@@ -127,7 +131,7 @@ Layout: Any = create_model(
 
 
 def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
-    """Return `tree` without invalid values and null sections, and the Layout of that.
+    """Return `tree` without invalid values and null sections, and this tree decoded as a Layout.
 
     Adds a problem for each invalid value.
     """
@@ -178,7 +182,7 @@ class Draft:
 def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) -> Draft:
     """Choose the components of a merged recipe; raise RecipeError with all problems.
 
-    plugins: plugins that the recipe may name without being installed.
+    plugins: plugins that the recipe may name although they are not installed.
     """
     # `losses: {}` means no losses, a recipe without `losses` gets the defaults.
     sound, settings = decode_settings(written, problems)

@@ -1,4 +1,4 @@
-"""Slots of a recipe and their default components."""
+"""Slots of a recipe, which are kinds of component, and the default component of each slot."""
 
 import inspect
 from collections.abc import Mapping
@@ -13,11 +13,12 @@ from qgs.recipe.yaml_text import KeyPath, MapNode
 class Slot:
     """One kind of component that a recipe chooses, such as the encoder.
 
-    default: `type` of the component if the recipe names none; None if it must name one.
+    default: `type` of the component if the recipe names none; None if the recipe must name one.
     The remaining fields matter only for slots that are top-level sections.
     named: True if the section maps names to components; False if the section is one component.
     defaults: types of the components, by name, in a recipe without the section.
-    defaults_stay: True if a recipe's components are added to `defaults`; `NAME: null` drops one.
+    defaults_stay: True if a recipe's components are added to `defaults`, of which `NAME: null`
+        drops one; False if they replace `defaults`.
     """
 
     contract: type[contracts.Component]
@@ -75,7 +76,7 @@ SECTIONS = {
 
 
 def slot_at(path: KeyPath) -> Slot | None:
-    """Return the slot at `path` of a recipe; None if no component belongs there."""
+    """Return the slot at `path` of a recipe; None if `path` is not that of a component."""
     # A section's slot is the first key, the slot of a part of the model the last.
     return next((SLOTS[key] for key in (*path[:1], *path[-1:]) if key in SLOTS), None)
 
@@ -86,9 +87,9 @@ def summary_of(described: object) -> str:
 
 
 def type_at(node: Any, path: KeyPath) -> Any:
-    """Return the `type` that `node` at `path` of a recipe sets, or else the slot's default type.
+    """Return the `type` that the value `node` at `path` of a recipe sets, else the slot's default.
 
-    `type: null`, or a null `node`, means the default.
+    `type: null`, or a null `node`, means the default. Without a slot at `path`, the result is None.
     """
     if isinstance(node, MapNode) and node.get("type") is not None:
         return node["type"]

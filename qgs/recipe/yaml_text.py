@@ -1,4 +1,4 @@
-"""YAML 1.2 text of recipes, and the nodes read from it, which know the line of each key."""
+"""YAML 1.2 text of recipes, and nodes: its values, which know the line of each key."""
 
 import json
 import os
@@ -52,12 +52,12 @@ class MapNode(dict[str, Any]):
             self.put(key, value, written)
 
     def put(self, key: str, value: Any, origin: Origin) -> None:
-        """Set `key` to `value`, written at `origin`."""
+        """Set `key` to `value`; `origin` is the file and line of the key."""
         self[key] = value
         self.origins[key] = origin
 
     def entries(self) -> list[tuple[str, Any, Origin]]:
-        """Return the key, value and origin of each entry."""
+        """Return key, value and origin (file and line) of each entry."""
         return [(key, value, self.origins[key]) for key, value in self.items()]
 
     def without(self, *names: str) -> "MapNode":
@@ -65,7 +65,7 @@ class MapNode(dict[str, Any]):
         return MapNode(self.origin, (entry for entry in self.entries() if entry[0] not in names))
 
     def child(self, *path: str) -> "MapNode":
-        """Return the mapping at `path`; an empty one if no mapping is there."""
+        """Return the mapping at `path`; an empty mapping if `path` leads to no mapping."""
         found = self
         for key in path:
             empty = MapNode(found.origin_of(key))
@@ -74,12 +74,15 @@ class MapNode(dict[str, Any]):
         return found
 
     def origin_of(self, key: str) -> Origin:
-        """Return the origin of `key` if it exists, else of the mapping."""
+        """Return file and line of `key`; of the mapping if it has no such key."""
         return self.origins.get(key, self.origin)
 
 
 class ListNode(list[Any]):
-    """A list. origins: file and line of each item, by index."""
+    """A list that knows where its items were written.
+
+    origins: file and line of each item, by index.
+    """
 
     def __init__(self, items: Iterable[tuple[Any, Origin]]) -> None:
         entries = [*items]
@@ -91,9 +94,9 @@ Node: TypeAlias = MapNode | ListNode | str | int | float | None
 
 
 def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:
-    """Return the items of a list, with file and line of each.
+    """Return the items of `value`, with file and line of each item.
 
-    A single value, written at `origin`, counts as a list of one item; null as an empty list.
+    A single value, written at `origin`, counts as a list of one item; null counts as an empty list.
     """
     if isinstance(value, ListNode):
         return [*zip(value, value.origins.values(), strict=True)]
@@ -101,7 +104,7 @@ def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:
 
 
 def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
-    """Convert plain Python values to nodes, all written at `origin`.
+    """Convert a plain Python mapping to nodes, all with the file and line `origin`.
 
     Raises ValueError or TypeError for values that YAML cannot hold.
     """
@@ -120,7 +123,7 @@ def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
 def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Origin, Node]:
     """Follow `path` into `tree`, skipping keys that `tree` does not have.
 
-    Returns the keys that were found, file and line of the last one, and its value.
+    Returns the keys that were found, file and line of the last one, and the value that it leads to.
     """
     taken = list[str | int]()
     origin = tree.origin
@@ -137,24 +140,24 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
 
 
 def brief(value: Any) -> str:
-    """Return a node's value for messages: JSON of at most 200 characters."""
+    """Return the value of a node as text for messages: JSON of at most 200 characters."""
     return f"`{json.dumps(value):.200}`"
 
 
 class Yaml12Loader(yaml.SafeLoader):
-    """Loader that tags unquoted scalars by YAML 1.2; `_scalar` converts them."""
+    """YAML loader that types unquoted values by the rules of YAML 1.2; `_scalar` converts them."""
 
     yaml_implicit_resolvers = _RESOLVERS
 
 
 class Yaml12Dumper(yaml.SafeDumper):
-    """Dumper that quotes exactly the strings that Yaml12Loader would not read as strings."""
+    """YAML dumper that quotes exactly the strings that Yaml12Loader would not read as strings."""
 
     yaml_implicit_resolvers = _RESOLVERS
 
     # Anchors would be hard to read in a resolved recipe.
     def ignore_aliases(self, data: Any) -> bool:
-        """Return True, so that repeated values are written in full."""
+        """Return True, so that a repeated value is written in full each time."""
         return True
 
 
@@ -171,7 +174,7 @@ def inline(value: Any) -> str:
 
 
 def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
-    """Read YAML `text` of `file`; raise RecipeError if it is invalid or no mapping."""
+    """Read YAML `text` of `file`; raise RecipeError if it is invalid or not a mapping."""
     node = load_text(text, file, problems)
     if isinstance(node, MapNode):
         return node
@@ -184,8 +187,8 @@ def load_text(
 ) -> Node:
     """Read YAML `text` of `file`; raise RecipeError if it is invalid.
 
-    line: line to store for all nodes; None stores their lines in `text`. path: path of the value
-    in the recipe, for messages.
+    line: line number to store for all nodes; None stores the line of each node in `text`.
+    path: path of the value in the recipe, for messages.
     """
 
     def origin(mark: yaml.Mark | None) -> Origin:
@@ -239,7 +242,7 @@ def _fault(reason: str, node: yaml.Node) -> yaml.YAMLError:
 
 
 def _scalar(kind: str, text: str) -> Any:
-    """Return the value of a scalar; raise ValueError if `text` is not of that kind."""
+    """Return the value of a YAML scalar; raise ValueError if `text` is not valid for its `kind`."""
     if kind == "null":
         return None
     if kind == "bool":
