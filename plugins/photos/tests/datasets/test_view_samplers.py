@@ -237,13 +237,15 @@ def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn():
     scene = Arc(40, held_out=(3,))
     scene.times = torch.arange(40).double()
     assert SAMPLER.windows(scene, VIEWS) == []
-    must_refuse(r"moves: .* qgs/span", SAMPLER.draw, scene, VIEWS, seeded(), 0)
+    must_refuse(r"moves, .* qgs/span", SAMPLER.draw, scene, VIEWS, seeded(), 0)
 
 
 def test_too_few_photos_are_refused():
-    must_refuse("'line2' has 2 photos, but needs 3", SAMPLER.draw, Line(2), VIEWS, seeded(), 0)
     must_refuse(
-        "has 1 photos beside 1 held-out ones, but needs 2",
+        "'line2' has 2 photos, but a sample needs 3", SAMPLER.draw, Line(2), VIEWS, seeded(), 0
+    )
+    must_refuse(
+        "has 1 photos beside 1 held-out ones, but a sample needs 2",
         SAMPLER.windows,
         Line(2, held_out=(1,)),
         VIEWS,

@@ -15,13 +15,16 @@ app = typer.Typer(help="Render a camera path through Gaussians as a video.")
 def video(
     source: Annotated[
         Path,
-        typer.Argument(help="Folder that qgs reconstruct or qgs scene wrote, or a PLY file."),
+        typer.Argument(
+            help="Gaussians to show: a folder that qgs reconstruct or qgs scene wrote, or a PLY "
+            "file."
+        ),
     ],
     photos: Annotated[
         str | None,
         typer.Argument(
-            help="Photos of the scene, whose cameras the path follows. Needed for a PLY file and a "
-            "folder of qgs scene."
+            help="Photos of the scene; the camera path follows their cameras. Needed if SOURCE is "
+            "a PLY file or a folder that qgs scene wrote."
         ),
     ] = None,
     out: Annotated[
@@ -30,16 +33,17 @@ def video(
     path: Annotated[
         str,
         typer.Option(
-            help="Camera path: orbit, spiral, walk, or a file in the world of the photos, either a "
-            "camera path of nerfstudio's viewer or a transforms file."
+            help="Camera path: orbit, spiral, walk, or a file. A file is a camera path saved by "
+            "nerfstudio's viewer or a transforms file; its poses have the same world coordinates "
+            "as the poses of the photos."
         ),
     ] = "orbit",
     size: Annotated[
         str | None,
         typer.Option(
             metavar="HxW",
-            help="Height and width of the video. Default: those of the photos, enlarged to at "
-            "least 480 pixels.",
+            help="Height and width of the video in pixels. Default: those of the photos, enlarged "
+            "if their shorter side has fewer than 480 pixels.",
         ),
     ] = None,
     seconds: Annotated[
@@ -49,7 +53,10 @@ def video(
     fov: Annotated[
         float | None,
         typer.Option(
-            min=1, max=170, help="Vertical angle of view in degrees. Default: that of the photos."
+            min=1,
+            max=170,
+            help="Vertical angle of view in degrees. Default: that of the photos, or of a "
+            "path's file.",
         ),
     ] = None,
     scene: SceneName = None,

@@ -1,6 +1,7 @@
-"""Read `cameras.json` as demos of feed-forward projects have it: poses, intrinsics, photos.
+"""Read `cameras.json`, a list of cameras and photos as demos of feed-forward projects write it.
 
-Names of values decide what they mean; an ambiguous name is refused.
+Projects name the values differently. The name of a value decides its convention; an ambiguous
+name is an error.
 """
 
 import math
@@ -47,17 +48,18 @@ _FORM = '{"frames": [{"image": "0.png", "c2w": 4 x 4, "K": 3 x 3}, ...]}'
 class CamerasJson(PhotoReader):
     """Reader of `cameras.json`.
 
-    The file is a list of cameras, has such a list under `frames`, `cameras` or `views`, or has a
-    list for each value. Values that all cameras share may stand at the top level.
+    The file is a list of cameras, has such a list under `frames`, `cameras` or `views`, or maps
+    each kind of value to a list with one entry for each camera. Values that all cameras share may
+    stand at the top level.
 
-    - Pose: `c2w` or a synonym, OpenCV camera-to-world (3 or 4, 4); `w2c`, its inverse;
+    - Pose: `c2w` or a synonym, OpenCV camera-to-world (3, 4) or (4, 4); `w2c`, world-to-camera;
       `transform_matrix`, camera-to-world with OpenGL axes, as nerfstudio writes it; or `position`
       (3,) and `rotation` (3, 3), camera-to-world, as 3DGS writes them.
     - Intrinsics: `K` or a synonym, (3, 3); or fx, fy, cx, cy, as a list or under these names. Their
       unit is pixels of an image of `w` by `h`, by default the size of the image file. If no value
       is above 3, they are fractions of width and height.
-    - Photo: a file name under one of `_NAMES`. Without names, the photos beside the file or in
-      images/, in the order of their names.
+    - Photo: a file name under `image` or another name in `_NAMES`. If no camera names a photo,
+      the photos beside the file or in images/ belong to the cameras in the order of file names.
     """
 
     listing = "cameras.json"
@@ -111,9 +113,10 @@ class CamerasJson(PhotoReader):
 
 
 def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
-    """Return the values of each camera; shared values come from the top level.
+    """Return the values of each camera in the contents `data` of a file.
 
-    Raises ValueError if the numbers of poses and intrinsics differ.
+    Every camera gets the values at the top level too. Raises ValueError if the numbers of poses and
+    intrinsics differ.
     """
     top = data if isinstance(data, Mapping) else {}
     given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)
@@ -133,8 +136,8 @@ def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
         matrices = matrices if isinstance(matrices, list) else []
         if (count := len(matrices)) != len(poses):
             raise ValueError(
-                f"{file} has {len(poses)} matrices {pose}, but {count} of {matrix or 'K'}: write "
-                f"{_FORM}"
+                f"{file} lists {len(poses)} poses ({pose}), but {count} intrinsics "
+                f"({matrix or 'K'}): list both for every camera, or write {_FORM}"
             )
         rows = zip(poses, matrices, names, strict=True)
         given = [{pose: one, matrix: K, "image": name or None} for one, K, name in rows]
@@ -147,10 +150,10 @@ def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
 
 
 class _Camera:
-    """A camera of the file.
+    """A camera in `cameras.json`.
 
-    values: its entry. path: its photo as listed. find: function that returns where listed photos
-    are; called only if no size is listed.
+    values: the camera's entry in the file. path: the camera's photo as listed. find: function that
+    returns the existing file of each listed photo; called only if the entry has no image size.
     """
 
     def __init__(
@@ -223,14 +226,14 @@ class _Camera:
         return matrix
 
     def _photo_size(self) -> Size | None:
-        """Return (H, W) as listed, or else that of the image file; None if it cannot be read."""
+        """Return (H, W) as listed, or else of the image file; None if the image is unreadable."""
         if self.size is None:
             with suppress(ValueError):
                 self.size = read_image(self.find().get(self.path, self.path), image_size)
         return self.size
 
     def frame(self, folder: UPath) -> PhotoFrame:
-        """Return the photo and its camera. folder: the scene's, to which the name is relative."""
+        """Return the photo with its camera; its name is relative to the scene's `folder`."""
         name = "" if self.path == folder else "/".join(inside(folder, self.path))
         if not name:
             self._wrong("no image is named")

@@ -1,10 +1,10 @@
 """Read and check chunk files in RealEstate10K's format, and list the scenes of a folder.
 
-pixelSplat published RealEstate10K and ACID in this format, DepthSplat published DL3DV in it.
-PATH/{train,test}/index.json maps the key of a scene to a file such as 000000.torch. The file is a
-list with a mapping for each scene of V frames:
+pixelSplat published RealEstate10K and ACID in this format, DepthSplat published DL3DV in it. In
+the folder of a data set, train/index.json and test/index.json map the key of a scene to a chunk
+file such as 000000.torch. A chunk file is a list with a mapping for each scene of V frames:
 
-- `key`: name of the scene. `url`: of its video. `timestamps`: (V,).
+- `key`: name of the scene. `url`: address of its video. `timestamps`: times in it, (V,).
 - `cameras`: (V, 18) float32. A row is fx, fy, cx, cy divided by the image's width and height, two
   unused numbers, and the rows of the 3 x 4 OpenCV world-to-camera matrix.
 - `images`: a list of V uint8 tensors with the bytes of JPEG or PNG files.
@@ -54,7 +54,10 @@ _DIVIDED_TWICE = 0.02
 
 @dataclass(frozen=True)
 class Record:
-    """A scene as a chunk holds it, see the top of this file. where: file and scene for messages."""
+    """A scene as stored in a chunk file, with the values that this module's docstring explains.
+
+    where: names of the file and the scene, for error messages.
+    """
 
     where: str
     key: str
@@ -70,7 +73,7 @@ class Record:
         return len(self.images)
 
     def place(self, frame: int) -> str:
-        """Return chunk, scene, frame number and name of a frame as text for messages."""
+        """Return text for messages: chunk and scene of a frame, and the frame's number and name."""
         return f"{self.where}, frame {frame} ({self.names[frame]})"
 
     @cached_property
@@ -82,7 +85,7 @@ class Record:
 
     @cached_property
     def image_sizes(self) -> list[Size]:
-        """(H, W) of every image, as the chunk lists it; without a list, that of the first image."""
+        """(H, W) of every image, as the chunk lists it, or else that of the first image for all."""
         if self.sizes is not None:
             return [(int(height), int(width)) for height, width in self.sizes.tolist()]
         return [self.stored_size(0)] * len(self)
@@ -98,13 +101,16 @@ class Record:
             ) from error
 
     def intrinsics(self, frame: int, size: Size) -> Intrinsics:
-        """Return fx, fy, cx, cy in pixels of an image of `size` (H, W)."""
+        """Return fx, fy, cx, cy of a frame, in pixels of an image of `size` (H, W)."""
         fx, fy, cx, cy = self.cameras[frame, :4].double().tolist()
         return fx * size[1], fy * size[0], cx * size[1], cy * size[0]
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """Return the scene in the entry `data` of the chunk `file`. Raises ValueError if malformed."""
+    """Return the scene stored in the entry `data` of the chunk `file`.
+
+    Raises ValueError if the entry is malformed.
+    """
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
             f"{file} holds {a_type(data)}, expected a mapping with 'key', 'cameras' and 'images': "
@@ -161,7 +167,7 @@ def a_type(value: object) -> str:
 def _is_plain(data: Tensor) -> bool:
     """Return whether a tensor is dense, on the CPU, and stores every number.
 
-    A tensor that was expanded stores fewer, and would fill the memory when it is copied.
+    A tensor made by `expand` stores fewer numbers than it has; a copy of it could fill the memory.
     """
     strided = data.layout == torch.strided and data.device.type == "cpu"
     if not strided or data.is_quantized or data.is_nested:
@@ -237,7 +243,7 @@ def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
-    """Yield a problem if a frame's intrinsics look like pixels or as if divided twice."""
+    """Yield a problem if a frame's intrinsics were not divided by the image's size exactly once."""
     values = record.cameras[frame, :4].tolist()
     focal = max(values[:2])
     divided_twice = 0 < focal < _DIVIDED_TWICE
@@ -251,10 +257,10 @@ def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def load_chunk(path: UPath) -> list[Any]:
-    """Load the entries of a chunk, one for each scene.
+    """Load a chunk file: a list with one entry for each scene.
 
-    A local file is memory-mapped if it has torch's zip format. Python objects are refused. Raises
-    FileNotFoundError, and ValueError for a file that is damaged or is not a list.
+    A local file is memory-mapped if it has torch's zip format. Raises FileNotFoundError if the file
+    does not exist, and ValueError if it is damaged, is not a list, or holds Python objects.
     """
     if not path.is_file():
         raise FileNotFoundError(
@@ -284,7 +290,7 @@ def load_chunk(path: UPath) -> list[Any]:
 
 
 class Chunk:
-    """An open chunk file. entries: the stored mappings by key of the scene."""
+    """An open chunk file. entries: what the file stores of each scene, by the scene's key."""
 
     def __init__(self, path: UPath) -> None:
         self.path = path
@@ -304,8 +310,9 @@ class Chunk:
         """Return the scene `key`. Raises ValueError if it is invalid or not in this chunk."""
         if key not in self.entries:
             raise ValueError(
-                f"{self.path} does not hold the scene {key!r}, but index.json says so: remove "
-                "index.json, then scenes are listed from the chunks, or pack the data set again"
+                f"{self.path} does not hold the scene {key!r}, although index.json says that it "
+                "does: pack the data set again, or remove index.json; without index.json, scenes "
+                "are listed from the chunks"
             )
         if key not in self._parsed:
             self._parsed[key] = parse_record(str(self.path), self.entries[key])
@@ -320,7 +327,7 @@ def has_chunks(folder: UPath) -> bool:
 
 
 def stays_inside(name: str) -> bool:
-    """Return whether a relative path, with / or \\, leads to a file inside its folder."""
+    """Return whether a path, with / or \\, stays in the folder to which it is relative."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
     return bool(parts) and parts[0] != "/" and ".." not in parts and ":" not in parts[0]
 
@@ -328,28 +335,31 @@ def stays_inside(name: str) -> bool:
 def read_chunk_index(path: UPath) -> dict[str, str]:
     """Read an index.json, which maps the key of a scene to the name of its chunk.
 
-    Raises ValueError for another structure and for a chunk outside the folder.
+    Raises ValueError if the file has another structure, or names a chunk outside its folder.
     """
     index = read_json(path, "copy it again, or remove it, then scenes are listed from the chunks")
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
-        raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
+        raise ValueError(
+            f"{path} must map each scene's key to the name of its chunk file: correct the index, "
+            "or remove it; without an index, scenes are listed from the chunks"
+        )
     inside = {name for name in set(index.values()) if stays_inside(name)}
     for key, name in index.items():
         if name not in inside:
             raise ValueError(
-                f"{path} names for the scene {name_shown(key)} the chunk {name_shown(name)!r} "
-                "outside the folder of the index: correct the index, or remove it, then scenes are "
-                "listed from the chunks"
+                f"{path} names, for the scene {name_shown(key)}, the chunk {name_shown(name)!r} "
+                "outside the folder of the index: correct the index, or remove it; without an "
+                "index, scenes are listed from the chunks"
             )
     return index
 
 
 def list_scenes(folder: UPath) -> dict[str, UPath]:
-    """Return the chunk file of each scene of a folder by key, in the order of index.json.
+    """Return the chunk file of each scene in a folder by the scene's key, in index.json's order.
 
-    Without index.json all chunks are opened. Scenes whose chunk does not exist are left out with a
-    warning. Raises FileNotFoundError if no scene is left, ValueError for an index or a chunk that
-    cannot be read.
+    Without index.json all chunks are opened to find their scenes. Scenes whose chunk does not exist
+    are left out with a warning. Raises FileNotFoundError if no scene is left, ValueError for an
+    index or a chunk that cannot be read.
     """
     if not (folder / INDEX).is_file():
         return _scanned(folder)

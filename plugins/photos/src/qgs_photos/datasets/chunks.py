@@ -42,14 +42,15 @@ class ChunksConfig(SceneSource.Config):
     """Options of `datasets/chunks`."""
 
     path: str
-    """Folder or fsspec URL with train/ and test/. A relative folder starts at the working
-    directory. Every process and worker reads whole chunks from a URL: to train, copy them to a
-    local disk."""
+    """Folder or fsspec URL that holds train/ and test/. A relative path starts at the working
+    directory. From a URL, every process and every data-loader worker reads whole chunks: copy the
+    data set to a local disk for training."""
     holdout: int = Field(default=0, ge=0)
-    """Hold out every Nth frame of a scene for evaluation, from frame N // 2 on. 0: the frames
-    that the chunk lists as held out, if `qgs data pack` wrote it; otherwise none."""
+    """A number N above 0 holds out every Nth frame of a scene for evaluation, from frame N // 2
+    on. 0 holds out the frames that the chunk lists as held out. Only chunks of `qgs data pack`
+    can have such a list; without it, 0 holds out none."""
     max_scenes: int = Field(default=0, ge=0)
-    """Number of scenes to use from each split, the first in its order. 0 uses all."""
+    """Use only this number of scenes from each split, the first of its list. 0 uses all."""
     min_frames: int = Field(default=0, ge=0)
     """Leave out scenes with fewer frames than this number. To count frames, every chunk is opened
     at the start. 0 keeps all scenes and opens none."""
@@ -58,7 +59,10 @@ class ChunksConfig(SceneSource.Config):
 
 
 class ChunkScene(Scene):
-    """A scene of a chunk, read from its file on first use, in the world of its stored poses."""
+    """Scene that is read from its chunk file on first use.
+
+    The world frame of the cameras is that of the poses in the file.
+    """
 
     def __init__(
         self, name: str, file: UPath, config: ChunksConfig, chunks: BoundedCache[Chunk]
@@ -105,7 +109,7 @@ class ChunkScene(Scene):
         return Cameras(torch.linalg.inv(record.w2c), intrinsics, target)
 
     def frame_name(self, frame: int) -> str:
-        """Return the name of a frame in the chunk; chunks without names give its time stamp."""
+        """Return the name of a frame in the chunk, or its time stamp if the chunk has no names."""
         return self._record.names[frame]
 
     def stored_size(self, frame: int) -> Size:
@@ -152,9 +156,9 @@ class ChunkScene(Scene):
         height, width = record.image_sizes[frame]
         if abs(image.width * height / (image.height * width) - 1) > _SAME_ASPECT:
             raise ValueError(
-                f"{record.place(frame)} has {image.width} x {image.height} pixels, but images of "
-                f"its scene have {width} x {height}, another aspect ratio: chunks of mixed sizes "
-                "need the entry 'sizes', which `qgs data pack` writes"
+                f"{record.place(frame)} has {image.width} x {image.height} pixels, another aspect "
+                f"ratio than the {width} x {height} of its scene: pack the data set again with "
+                "`qgs data pack`, which writes the entry 'sizes' that chunks of mixed sizes need"
             )
         return CropResize((image.height, image.width), self._config.image_size).image(image)
 
@@ -167,11 +171,12 @@ class ChunkScene(Scene):
 
 
 class ChunksSource(LazySource):
-    """Scenes of chunks in PATH/train and PATH/test, or chunks in PATH itself, all for training.
+    """Source of the scenes in the chunk files of a folder.
 
-    A data set without test chunks is evaluated on the held-out frames of its training scenes, if
-    they have any. Scenes whose chunk is named by index.json but does not exist are left out; a
-    warning counts and names them.
+    The folder holds chunks in train/ and test/, or chunks of its own, all of which are for
+    training. A data set without test chunks is evaluated on the held-out frames of its training
+    scenes, if they have any. Scenes whose chunk is named by index.json but does not exist are left
+    out; a warning counts and names them.
     """
 
     name = "chunks"
@@ -220,9 +225,10 @@ class ChunksSource(LazySource):
 def first_scenes(
     places: Mapping[str, UPath], limit: int, opener: Callable[[str, UPath], Scene]
 ) -> LazyScenes:
-    """Return the first `limit` scenes of `places`; 0 returns all.
+    """Return the first `limit` scenes of `places`; a limit of 0 returns all.
 
-    places: folder or file by scene name. opener: opens the scene of a name and a place.
+    places: folder or file of each scene by name. opener: function that opens a scene; it takes the
+    scene's name and its folder or file.
     """
     return LazyScenes(dict(islice(places.items(), limit or None)), opener)
 
@@ -248,7 +254,7 @@ def _folders(path: UPath) -> dict[Split, UPath]:
 def _long_enough(
     folder: UPath, config: ChunksConfig, opener: Callable[[str, UPath], ChunkScene]
 ) -> dict[str, UPath]:
-    """Return the scenes of a folder with at least `min_frames` frames; warn of the others."""
+    """Return a folder's scenes with at least `min_frames` frames; warn of the shorter scenes."""
     files = list_scenes(folder)
     if not config.min_frames:
         return files

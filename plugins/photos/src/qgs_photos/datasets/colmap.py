@@ -1,7 +1,7 @@
 """Read COLMAP's sparse models, text or binary, that lie beside a folder of photos.
 
-Unlike pycolmap, this reader skips the points, which are most of a model, and reads from any file
-system. The formats are described at colmap.github.io/format.html.
+Unlike pycolmap, this reader skips the points, which make up most of a model, and it reads from
+any file system. The formats are described at colmap.github.io/format.html.
 """
 
 import io
@@ -50,7 +50,8 @@ _BYTES_OF_A_POINT = 24  # x, y and the point's number
 class Colmap(PhotoReader):
     """Reader of the posed images of a COLMAP model, sorted by name.
 
-    Folders are searched in the order of `_PLACES`; in each, a binary model comes before a text one.
+    Models are searched in the folders of `_PLACES`, in this order. In a folder with both kinds, the
+    binary model is read and not the text model.
     """
 
     listing = "sparse/0/{cameras,images}.{bin,txt}"
@@ -89,7 +90,10 @@ class Colmap(PhotoReader):
 
 
 def _read(model: UPath, suffix: str) -> Listing:
-    """Read the model's photos by name. Raises ValueError."""
+    """Read the posed photos of a model, sorted by name.
+
+    model: folder of the model. suffix: that of its files. Raises ValueError if they are unreadable.
+    """
     read_cameras, read_images = _READ[suffix]
     try:
         listed = [*read_cameras(model)]
@@ -113,7 +117,11 @@ def _read(model: UPath, suffix: str) -> Listing:
 
 
 def _project(model: UPath) -> UPath:
-    """Return the folder whose photos a model is of: that of its `sparse`, or its own."""
+    """Return the folder to whose photos a model belongs.
+
+    It is the folder around sparse/ or colmap/sparse/; the model's own folder if the model lies in
+    no sparse/ or has photos beside it.
+    """
     places = (model, model.parent)
     sparse = next((place for place in places if place.absolute().name == "sparse"), None)
     if sparse is None or image_files(model):
@@ -126,7 +134,7 @@ def _has_photos(folder: UPath) -> bool:
 
 
 def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
-    """Yield the models in `folder` and the suffix of their files."""
+    """Yield the folder of each COLMAP model in `folder`, and the suffix of the model's files."""
     for pattern in (*_PLACES, "*") if folder.name == "sparse" else _PLACES:
         places = [folder]
         for part in pattern.split("/"):
@@ -161,19 +169,21 @@ def _text_images(model: UPath) -> Iterator[Image]:
     for line in posed:
         number, *fields = line.split(maxsplit=9)
         if len(fields) != 9 or not number.isdecimal() or not fields[7].isdecimal():
-            raise ValueError(f"images.txt has {line[:60]!r} expected 9 numbers and a name")
+            raise ValueError(
+                f"images.txt has the line {line[:60]!r}, expected 9 numbers and a file name"
+            )
         yield fields[8], [*map(_number, fields[:7])], int(fields[7])
 
 
 def _is_points(line: str) -> bool:
-    """Return whether a line of images.txt has x, y and number of each point, and no name."""
+    """Return whether a line of images.txt lists points (x, y, number) and is not a pose."""
     words = line.split()
     # the first points and the last: there are thousands
     return len(words) % 3 == 0 and not np.isnan([*map(_number, words[:12] + words[-1:])]).any()
 
 
 def _number(word: str) -> float:
-    """Return a number as text; NaN for what is none, such as -nan(ind) of Windows."""
+    """Return the number that `word` spells; NaN if it is none, such as -nan(ind) on Windows."""
     # Python reads 1_000
     with suppress(ValueError):
         return float(word.replace("_", "?"))
@@ -181,7 +191,7 @@ def _number(word: str) -> float:
 
 
 def _lines(file: UPath) -> Iterator[str]:
-    """Yield the lines of a file that have content but no comment."""
+    """Yield the lines of a file that are neither blank nor a comment, without outer spaces."""
     with io.TextIOWrapper(open_file(file), encoding="utf-8-sig") as lines:
         for line in lines:
             if (line := line.strip()) and not line.startswith("#"):
@@ -218,16 +228,19 @@ _READ = {"txt": (_text_cameras, _text_images), "bin": (_binary_cameras, _binary_
 def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
     content = file.read(struct.calcsize(format))
     if len(content) < struct.calcsize(format):
-        raise ValueError("a file is cut off")
+        raise ValueError("a file ends inside a record: it is cut off")
     return struct.unpack(format, content)
 
 
 def _camera(model: str, width: float, height: float, values: Sequence[float]) -> dict[str, Any]:
-    """Return the fields of a `PhotoFrame` that the camera took."""
+    """Return the fields of `PhotoFrame` that a camera decides: size, intrinsics, lens, problems.
+
+    model: COLMAP's name of the camera model. width, height: in pixels. values: its parameters.
+    """
     size, problems = listed_size(height, width)
     try:
         if not np.isfinite(values).all():
-            raise ValueError("it has numbers that are none")
+            raise ValueError("a parameter of the camera is not a finite number")
         named = dict(zip(parameters(model), values, strict=True))
         # simple models have one focal length for both axes
         focal = [named.pop(key) for key in FOCAL if key in named]
@@ -240,7 +253,7 @@ def _camera(model: str, width: float, height: float, values: Sequence[float]) ->
 
 
 def _faulty(reason: str) -> dict[str, Any]:
-    """Return the fields of a photo that no camera is known of."""
+    """Return fields of `PhotoFrame` for a photo without a valid camera; `reason` says why."""
     fix = "export the model again, or undistort the photos with `colmap image_undistorter`"
     return {"intrinsics": (math.nan,) * 4, "problems": (FrameProblem(reason, fix),)}
 
@@ -248,8 +261,8 @@ def _faulty(reason: str) -> dict[str, Any]:
 def _c2w(*cam_from_world: float) -> np.ndarray:
     """Return OpenCV camera-to-world (4, 4) from COLMAP's quaternion and translation.
 
-    COLMAP's pose maps the world to the camera. Raises ValueError unless the quaternion has length 1
-    within 0.1.
+    COLMAP's pose maps the world to the camera. All NaN if the quaternion's length differs from 1 by
+    more than 0.1.
     """
     quaternion, translation = torch.tensor(cam_from_world, dtype=torch.float64).split([4, 3])
     # not a rotation: NaN is told with the frame

@@ -32,26 +32,27 @@ class Dl3dvConfig(SceneSource.Config):
     """Folder or fsspec URL of the data set, of a part of it, or of one scene. A relative folder
     starts at the working directory."""
     images: str | None = None
-    """Folder of photos inside each scene, such as images_4. null: the one with the largest
-    photos."""
+    """Folder of photos inside each scene, such as images_4. null takes the folder with the
+    largest photos."""
     test_scenes: str | None = None
     """File that names the test scenes: an evaluation index, a JSON list, or text with a name on
-    each line. Training uses all other scenes. null: training uses all scenes."""
+    each line. Training uses all other scenes. null names no test scenes: training uses all
+    scenes."""
     holdout: int = Field(default=0, ge=0)
-    """Hold out every Nth frame of a scene for evaluation, from frame N // 2 on. 0 holds out
-    none."""
+    """A number N above 0 holds out every Nth frame of a scene for evaluation, from frame N // 2
+    on. 0 holds out none."""
     max_scenes: int = Field(default=0, ge=0)
-    """Number of scenes to use from each split, the first by name. 0 uses all."""
+    """Use only this number of scenes from each split, the first of its list. 0 uses all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1] behind transparent pixels."""
 
 
 class Dl3dvSource(LazySource):
-    """Scenes of DL3DV, read from folders or from archives without unpacking them.
+    """Source of DL3DV's scenes, read from folders, or from archives without unpacking them.
 
-    Without `test_scenes`, all scenes are for training; with `holdout`, held-out frames of the same
-    scenes are for evaluation. Intrinsics from transforms.json are scaled to the size of the photos.
-    Images and test scenes that do not exist are left out; a warning counts and names them.
+    Without `test_scenes`, all scenes are for training; if `holdout` is set, the held-out frames of
+    these scenes are for evaluation. Intrinsics from transforms.json are scaled to the size of the
+    photos. Images and test scenes that do not exist are left out; a warning counts and names them.
     """
 
     name = "dl3dv"
@@ -100,9 +101,10 @@ def _opened(name: str, place: UPath, **options: Any) -> PhotoScene:
 
 
 def find_scenes(path: UPath) -> dict[str, UPath]:
-    """Return the folder or archive of each scene at or below `path`, by name.
+    """Return the folder or archive of each scene at or below `path`, by the scene's name.
 
-    If a scene has both, the folder is returned. Raises FileNotFoundError if there is no scene.
+    If a scene has a folder and an archive, the folder is returned. Raises FileNotFoundError if
+    there is no scene.
     """
     if not path.exists():
         raise FileNotFoundError(
@@ -177,11 +179,12 @@ def read_scene_list(file: UPath) -> list[str]:
         names = read_json(file, "correct it")
         if not isinstance(names, dict | list) or not all(isinstance(name, str) for name in names):
             raise ValueError(
-                f"{file} must be a mapping whose keys are scenes, or a list of scenes, in JSON"
+                f"{file} must hold names of scenes in JSON: write a list of names, or a mapping "
+                "whose keys are the names"
             )
     else:
         lines = read_file(file).decode("utf-8-sig").splitlines()
         names = [name for line in lines if (name := line.partition("#")[0].strip())]
     if not names:
-        raise ValueError(f"the list of scenes {file} names no scene: write one on each line")
+        raise ValueError(f"the list of scenes {file} names no scene: write one name on each line")
     return list(dict.fromkeys(names))

@@ -17,8 +17,8 @@ class EncodedFrame:
 
     name: file name. data: bytes of the image file. c2w: camera-to-world (4, 4), float64, OpenCV
     axes. intrinsics: fx, fy, cx, cy in pixels. size: (H, W) of the photo. lens: distortion; None
-    for a pinhole camera. mask: (H, W) uint8; None without. background: RGB in [0, 1] behind
-    transparent pixels.
+    for a pinhole camera. mask: (H, W) uint8; None for a photo without a mask. background: RGB in
+    [0, 1] behind transparent pixels.
     """
 
     name: str
@@ -32,9 +32,10 @@ class EncodedFrame:
 
 
 def encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
-    """Return a photo as an encoded file, encoded again only if EXIF turns it.
+    """Return a photo as an encoded file, with its camera.
 
-    Raises ValueError for a file that cannot be read.
+    The bytes are those of the photo's file, encoded again only if its EXIF data rotate it. Raises
+    ValueError for a file that cannot be read.
     """
     photo = scene.photos[frame]
     size = scene.stored_size(frame)

@@ -26,10 +26,11 @@ _ROWS = 64
 
 @dataclass(frozen=True)
 class BendingLens(Lens):
-    """Any of COLMAP's lenses that bend rays, by pycolmap; OpenCV's are among them.
+    """Lens with the distortion of any of COLMAP's camera models, computed by pycolmap.
 
-    parameters: as COLMAP orders them, with focal lengths of 1 and the principal point at 0. turns:
-    clockwise quarters from its camera to this one.
+    model: COLMAP's name of the camera model; OpenCV's models are among them. parameters: in
+    COLMAP's order, with focal lengths of 1 and the principal point at 0. turns: number of clockwise
+    quarter turns from the camera that has these parameters to the camera of this lens.
     """
 
     model: str
@@ -37,7 +38,7 @@ class BendingLens(Lens):
     turns: int = 0
 
     def distorted(self, points: Tensor) -> Tensor:
-        """Return where the lens puts points (..., 2) of the plane z = 1 on its own."""
+        """Distort points (..., 2) of the plane z = 1, before focal lengths are applied."""
         camera = _pycolmap().Camera(model=self.model, width=1, height=1, params=self.parameters)
         # a quarter clockwise makes (-y, x) of (x, y)
         plane = torch.view_as_complex(points.double().contiguous()).numpy() * (-1j) ** self.turns
@@ -47,7 +48,7 @@ class BendingLens(Lens):
         return torch.view_as_real(torch.from_numpy(turned)).to(points)
 
     def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) lie before where the function turns back."""
+        """Return whether points (..., 2) of the plane z = 1 are nearer the middle than `_reach`."""
         return points.norm(dim=-1) < _reach(self)
 
     def turned(self) -> Self:
@@ -85,15 +86,19 @@ class BendingLens(Lens):
 
 
 def bending(model: str, coefficients: Mapping[str, float]) -> BendingLens | None:
-    """Return the lens of a camera model of COLMAP; None where it is a pinhole.
+    """Return the lens of COLMAP's camera model `model`; None if the camera is a pinhole.
 
-    coefficients: by COLMAP's names; others are 0. Raises ValueError for an unknown model.
+    coefficients: distortion coefficients by COLMAP's names; those not given are 0. Raises
+    ValueError for a panorama or an unknown model.
     """
     names = parameters(model)
     if model in PINHOLE and not any(coefficients.values()):
         return None
     if "cx" not in names:
-        raise ValueError(f"the camera model {model} is no lens, but a panorama")
+        raise ValueError(
+            f"the camera model {model} is a panorama, which has no lens: use perspective or "
+            "fisheye photos"
+        )
     ideal = dict.fromkeys(FOCAL, 1.0) | dict(coefficients)
     return BendingLens(model, tuple(ideal.get(name, 0.0) for name in names))
 
@@ -103,7 +108,7 @@ def parameters(model: str) -> list[str]:
     try:
         return _pycolmap().Camera(model=model).params_info.split(", ")
     except RuntimeError as error:
-        raise ValueError(f"the camera model {model} is not known") from error
+        raise ValueError(f"the camera model {model} is not one of COLMAP's") from error
 
 
 def model_name(number: int) -> str:
@@ -124,9 +129,10 @@ def _pycolmap() -> Any:
 
 @lru_cache(maxsize=4096)
 def _reach(lens: BendingLens) -> float:
-    """Return the distance from the middle up to which `lens` shows what is farther out farther out.
+    """Return the radius, in the plane z = 1, up to which distorted radii of `lens` increase.
 
-    Behind it, it shows the same again, mirrored. inf for none up to 84 degrees.
+    Points beyond this radius would appear a second time, mirrored. inf if distorted radii increase
+    up to 84 degrees from the axis.
     """
     radii = torch.linspace(0, 10, 20_001).double()
     rising = lens.distorted(torch.stack([radii, torch.zeros_like(radii)], -1))[:, 0].diff() > 0
@@ -136,9 +142,10 @@ def _reach(lens: BendingLens) -> float:
 def _in_photo(
     directions: Tensor, intrinsics: Intrinsics, lens: BendingLens, size: Size
 ) -> tuple[Tensor, Tensor]:
-    """Return the places of directions (..., 2) in the photo, and whether the photo shows them.
+    """Return where directions (..., 2) appear in the photo, and whether the photo shows them.
 
-    directions: undistorted, in the plane z = 1. Places (..., 2) go from -1 to 1 across the photo.
+    directions: undistorted points of the plane z = 1. Results: coordinates (..., 2) from -1 to 1
+    across the photo, and booleans (...).
     """
     focal, centre = torch.tensor(intrinsics).to(directions).split(2)
     # From the pinhole's pixel to the photo's: the distortion is given in this direction.

@@ -35,12 +35,12 @@ _JUDGED = 4
 
 
 class Bounded(ViewSampler):
-    """Inputs at both ends of a gap and targets between them; the gap widens over `warm_up_steps`.
+    """Sampler of inputs at both ends of a random gap in a video, and of targets between them.
 
-    This is pixelSplat's sampler `bounded` for two inputs; further inputs are drawn between the
-    ends. pixelSplat also limits the largest gap to the least gap on paths that do not close; here
-    only the number of frames limits it. Targets may repeat. `views.gap` is used only for windows
-    around held-out frames.
+    The gap widens over `warm_up_steps`. For two inputs this is pixelSplat's sampler `bounded`;
+    further inputs are sampled between the ends. On camera paths that are no closed loop, pixelSplat
+    replaces the largest gap by the least gap; here only the number of frames limits the gap.
+    Targets may repeat. `views.gap` is used only for evaluation windows around held-out frames.
     """
 
     name = "bounded"
@@ -50,8 +50,8 @@ class Bounded(ViewSampler):
         min_gap: int = Field(default=45, ge=1)
         """Least number of frames from the first input to the last, after the warm-up."""
         max_gap: int = Field(default=192, ge=1)
-        """Largest number of frames from the first input to the last, after the warm-up. Shorter
-        scenes use what they have."""
+        """Largest number of frames from the first input to the last, after the warm-up. In shorter
+        scenes the number of frames is the limit."""
         margin: int = Field(default=0, ge=0)
         """Least distance in frames of a target from the first and the last input. 0: an input may
         be a target."""
@@ -88,9 +88,10 @@ class Bounded(ViewSampler):
     def span(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int, parts: int = 1
     ) -> list[Frames]:
-        """Draw a gap, and return its moments from first to last, each with its frames.
+        """Return the moments of a random gap from first to last, each as the frames of one time.
 
-        parts: divisor of the gap's bounds. Raises ValueError for a scene with too few frames.
+        parts: number by which the bounds of the gap are divided. Raises ValueError for a scene with
+        too few frames.
         """
         refuse_too_many(views.inputs + views.targets, scene)
         options = self.options(step)
@@ -101,8 +102,9 @@ class Bounded(ViewSampler):
         low = max(min(low, high), 2 * options.margin, views.inputs - 1)
         if high < low:
             raise ValueError(
-                f"scene {scene.name!r} has {len(usable)} frames for inputs, but this gap needs "
-                f"{low + 1}: lower min_gap or margin, or remove the scene"
+                f"scene {scene.name!r} has {len(usable)} frames for inputs, but the inputs and the "
+                f"margin need {low + 1} in one gap: lower views.inputs or margin, raise max_gap, "
+                "or remove the scene"
             )
         gap = int(rng.integers(low, high + 1))
         first = int(rng.integers(0, len(usable) - gap))
@@ -111,9 +113,9 @@ class Bounded(ViewSampler):
     def seen(
         self, scene: Scene, span: Sequence[Frames], rng: np.random.Generator, step: int
     ) -> list[int]:
-        """Return the frames from which targets are drawn: the moments of `span` without the margin.
+        """Return the frames from which targets are sampled: those in `span` without its margins.
 
-        In a scene that moves, they are the frames of one random moment.
+        In a scene that moves, only the frames of one random moment of these are returned.
         """
         margin = self.options(step).margin
         inside = span[margin : len(span) - margin]
@@ -123,9 +125,9 @@ class Bounded(ViewSampler):
         return [frame for moment in inside for frame in moment]
 
     def gaps(self, step: int) -> tuple[int, int]:
-        """Return the least and the largest gap in frames after `step` steps.
+        """Return the least and the largest gap, in frames, after `step` training steps.
 
-        In the warm-up both change linearly.
+        During the warm-up both bounds change linearly.
         """
         options = self.options(step)
         share = min(step / options.warm_up_steps, 1.0) if options.warm_up_steps else 1.0
@@ -138,17 +140,17 @@ class Bounded(ViewSampler):
 
 
 class Farthest(Bounded):
-    """Inputs far from each other in a gap, and targets in it; the gap widens over `warm_up_steps`.
+    """Sampler of inputs that are far from each other in a random gap, and of targets in the gap.
 
-    This is DepthSplat's sampler `boundedv2` with `farthest_point`. Two inputs are the ends of the
-    gap; of more inputs, each is the one farthest from those chosen before. With n inputs, fewer
-    than `views.inputs`, the bounds of the gap are divided by `views.inputs` // n. Targets may be
-    inputs. They differ unless the gap has too few frames; then some repeat (DepthSplat returns
-    fewer targets).
+    The gap widens over `warm_up_steps`. This is DepthSplat's sampler `boundedv2` with
+    `farthest_point`. Two inputs are the ends of the gap; of more inputs, each is the one farthest
+    from those chosen before. With n inputs, fewer than `views.inputs`, the bounds of the gap are
+    divided by `views.inputs` // n. Targets may be inputs. Targets repeat only if the gap has too
+    few frames (DepthSplat returns fewer targets).
 
     In training, n goes from `fewest` to `views.inputs`, one more in each step, and starts again.
-    DepthSplat draws n at random. In both every n is equally frequent; here all samples of a step
-    have the same n and make one batch.
+    DepthSplat chooses n at random. Either way every n is equally frequent; here all samples of a
+    step have the same n, so that they can form one batch.
     """
 
     name = "farthest"
@@ -205,11 +207,11 @@ def farthest_points(points: Tensor, count: int) -> list[int]:
 class Overlapping(ViewSampler):
     """Sampler for photos in any order: overlapping inputs around a random photo.
 
-    The inputs are those that `qgs demo` would choose for the random photo. They are .06 to .25
-    scene depths apart, times a factor drawn log-uniformly between the bounds of `apart`. Targets
-    are the random photo and the photos nearest to it. In evaluation the factor is 1, and each
-    held-out photo is a target; a scene without held-out photos has four targets. Scenes that move
-    are evaluated in the order of time, with `views.gap`; training refuses them.
+    The inputs are those that `qgs demo` would choose for the random photo. Their distances are .06
+    to .25 of the scene's depth, times a random factor, log-uniform between the bounds of `apart`.
+    Targets are the random photo and the photos nearest to it. In evaluation the factor is 1, and
+    each held-out photo is a target; a scene without held-out photos has four targets. A scene that
+    moves can only be evaluated, on windows of `views.gap` in the order of time.
     """
 
     name = "overlapping"
@@ -217,7 +219,7 @@ class Overlapping(ViewSampler):
     class Config(ComponentConfig):
         apart: tuple[float, float] = (0.5, 2.0)
         """[least, largest] factor by which training multiplies distances and angles between
-        inputs. [1, 1]: always those of `qgs demo`."""
+        inputs. [1, 1] keeps those of `qgs demo`."""
 
         @field_validator("apart")
         @classmethod
@@ -242,7 +244,10 @@ class Overlapping(ViewSampler):
     ) -> tuple[Frames, Frames]:
         """See `ViewSampler`. Raises ValueError for a scene that moves."""
         if scene.times is not None:
-            raise ValueError(f"scene {scene.name!r} moves: set view_sampler.type to qgs/span")
+            raise ValueError(
+                f"scene {scene.name!r} moves, but this view sampler trains on static scenes: set "
+                "view_sampler.type to qgs/span"
+            )
         refuse_too_many(views.inputs + views.targets, scene)
         usable = _enough(scene, views.inputs + 1)
         factor = float(np.exp(rng.uniform(*np.log(self.config.apart))))
@@ -256,7 +261,10 @@ class Overlapping(ViewSampler):
         return tuple(sorted(inputs)), tuple(near[i % len(near)] for i in range(views.targets))
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
-        """Return one window for each target photo; none for a scene that moves."""
+        """Return inputs and target of each evaluation window, one window for each target photo.
+
+        A scene that moves has none.
+        """
         if scene.times is not None:
             return []
         # without held-out photos the target is one of those that inputs are chosen from
@@ -269,14 +277,17 @@ class Overlapping(ViewSampler):
         return found
 
     def _frusta(self, scene: Scene, factor: float = 1.0) -> Frusta:
-        """Return the frusta of a scene, to choose inputs `factor` times as far apart and turned."""
+        """Return the view frusta of a scene's cameras, from which inputs are chosen.
+
+        factor: multiplies the distances and the angles between inputs.
+        """
         if scene.name not in self._depths:
             self._depths[scene.name] = scene_depth(scene)
         return Frusta(scene, apart(Domain(), factor), self._depths[scene.name])
 
 
 def apart(domain: Domain, factor: float) -> Domain:
-    """Return a domain whose inputs are `factor` times as far apart and turned as in `domain`."""
+    """Return `domain` with the distances and the angles between inputs multiplied by `factor`."""
     low, high, turn = trained_ratios(domain)
     ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
     return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)
@@ -288,7 +299,7 @@ def _enough(scene: Scene, least: int) -> list[int]:
     if len(usable) < least:
         besides = f" beside {len(scene.held_out)} held-out ones" if scene.held_out else ""
         raise ValueError(
-            f"scene {scene.name!r} has {len(usable)} photos{besides}, but needs {least}: lower "
-            "views.inputs, hold out fewer photos, or add photos"
+            f"scene {scene.name!r} has {len(usable)} photos{besides}, but a sample needs {least}: "
+            "lower views.inputs, hold out fewer photos, or add photos"
         )
     return usable
