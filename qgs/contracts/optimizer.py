@@ -63,7 +63,7 @@ class Optimizer(Component):
     def check(self) -> None:
         """Raise ValueError if the options do not fit the training's budget of steps and seconds.
 
-        Training calls this method after the constructor.
+        Loading a recipe calls this method after the constructor.
         """
         return
 

@@ -39,10 +39,10 @@ Decoded = TypeVar("Decoded")
 
 @dataclass(frozen=True)
 class CropResize:
-    """Centre crop to the aspect ratio of a target size, then resize to it.
+    """Centre crop to the aspect ratio of a target size, then resize to the target size.
 
-    Sizes are (H, W) in pixels. zoom: factor by which the crop is smaller than the largest possible
-    crop.
+    source, target: sizes (H, W) in pixels.
+    zoom: factor, at least 1, by which the crop is smaller than the largest possible crop.
     """
 
     source: Size
@@ -51,7 +51,7 @@ class CropResize:
 
     @property
     def scale(self) -> float:
-        """Ratio of target pixels to source pixels, the same along both axes."""
+        """Number of target pixels per source pixel, the same along both axes."""
         return self.zoom * max(self.target[0] / self.source[0], self.target[1] / self.source[1])
 
     @property
@@ -76,12 +76,12 @@ class CropResize:
     def image(
         self, image: Image.Image, kernel: Image.Resampling = Image.Resampling.LANCZOS
     ) -> np.ndarray:
-        """Return `image` cropped and resized: (H, W, 3) uint8, or (H, W) for one channel."""
+        """Return `image` cropped and resized, as (H, W, 3) uint8, or (H, W) for one channel."""
         return np.array(image.resize((self.target[1], self.target[0]), kernel, box=self.box))
 
 
 def read_image(path: Path | UPath, decode: Callable[[IO[bytes]], Decoded]) -> Decoded:
-    """Return the result of `decode` for the file at `path`; raise ValueError if it fails."""
+    """Return the result of `decode` for the file at `path`; raise ValueError if `decode` fails."""
     try:
         with open_file(path) as file:
             return decode(file)
@@ -97,13 +97,13 @@ def read_image(path: Path | UPath, decode: Callable[[IO[bytes]], Decoded]) -> De
 
 
 def image_size(file: IO[bytes]) -> Size:
-    """Return (H, W) from the header of an image file; raises OSError if it is not an image."""
+    """Return (H, W) from the header of an image file; raise OSError if the file is no image."""
     with opened_image(file) as image:
         return image.height, image.width
 
 
 def orientation(image: Image.Image) -> int:
-    """Return the EXIF orientation of an image, 1 to 8; 1 means not turned."""
+    """Return the EXIF orientation of an image, 1 to 8; 1 means stored upright."""
     try:
         return image.getexif().get(_ORIENTATION, 1)
     # Pillow raises any kind of error for damaged EXIF, which is ignored.
@@ -112,14 +112,18 @@ def orientation(image: Image.Image) -> int:
 
 
 def decode_alpha(file: IO[bytes]) -> np.ndarray:
-    """Decode the alpha channel of a photo as (H, W) uint8; all 255 without one. Raises OSError."""
+    """Decode the alpha channel of a photo as (H, W) uint8.
+
+    All values are 255 for a photo without alpha channel. Raises OSError for an unreadable file.
+    """
     return np.array(eight_bits(_decoded(file)).convert("RGBA").getchannel("A"))
 
 
 def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
     """Decode a depth map, an image or .npy file, as (H, W) float32; 0 means unknown.
 
-    unit: depth in world units that the value 1 in the file means. Raises OSError and ValueError.
+    unit: depth in world units that the value 1 in the file means. Raises OSError or ValueError for
+        an unreadable file.
     """
     plain = file.read(len(_NPY)) == _NPY
     file.seek(0)
@@ -133,7 +137,7 @@ def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
 
 
 def load_array(file: IO[bytes]) -> np.ndarray:
-    """Read a .npy file; raise ValueError for Python objects and for arrays that are too large."""
+    """Read a .npy file; raise ValueError for Python objects and for arrays of too many bytes."""
     # NumPy allocates the size in the header, so a tiny damaged file could ask for all memory.
     if np.lib.format.read_magic(file) == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
@@ -141,7 +145,7 @@ def load_array(file: IO[bytes]) -> np.ndarray:
         shape, _, dtype = np.lib.format.read_array_header_2_0(file)
     size = math.prod(shape) * dtype.itemsize
     if size > LARGEST:
-        raise ValueError(f"the array has {decimal(size)}: scale it down")
+        raise ValueError(f"the array is too large, {decimal(size)}: scale it down")
     file.seek(0)
     return np.load(file, allow_pickle=False)
 
@@ -149,10 +153,10 @@ def load_array(file: IO[bytes]) -> np.ndarray:
 def decode_rgb(
     file: IO[bytes], background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> Image.Image:
-    """Decode an image as RGB, (H, W, 3) uint8; raise OSError if it cannot be read.
+    """Decode an image as RGB, (H, W, 3) uint8; raise OSError for an unreadable file.
 
-    background: colour in [0, 1] behind transparent pixels. The EXIF orientation is not applied;
-    `PhotoScene` does that.
+    background: RGB colour in [0, 1] behind transparent pixels. The EXIF orientation is not applied;
+        `PhotoScene` applies it.
     """
     image = eight_bits(_decoded(file))
     if image.has_transparency_data:
@@ -165,7 +169,7 @@ def decode_rgb(
 def eight_bits(image: Image.Image) -> Image.Image:
     """Convert `image` to 8 bits per channel.
 
-    Raises OSError for images whose value of white is unknown: float, 32-bit and LAB.
+    Raises OSError for pixel formats in which the value of white is unknown: float, 32-bit and LAB.
     """
     if image.mode.startswith("I;16"):
         numbers = np.array(image).astype(np.uint32)
@@ -177,9 +181,10 @@ def eight_bits(image: Image.Image) -> Image.Image:
 
 
 def decode_mask(file: IO[bytes]) -> np.ndarray:
-    """Decode a mask as (H, W) uint8, 255 for pixels to model. Files may have 1 in place of 255.
+    """Decode a mask as (H, W) uint8, 255 for pixels to reconstruct and 0 for others.
 
-    Raises OSError if the file is not an image, or has colours or transparency.
+    A file whose largest value is 1 is scaled to 255. Raises OSError if the file is not an image, or
+    has colours or transparency.
     """
     rgba = np.array(eight_bits(_decoded(file)).convert("RGBA"))
     grey = rgba[..., 0]
@@ -207,14 +212,16 @@ def _formats() -> tuple[str, ...]:
 
 @contextmanager
 def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
-    """Open an image file without decoding its pixels.
+    """Open an image file without decoding its pixels, as a context manager.
 
-    Errors of Pillow, also those in the block, become OSError.
+    Errors of Pillow become OSError, including those raised in the `with` block.
     """
     try:
         with Image.open(file, formats=_formats()) as image:
             if image.width * image.height > _MOST_PIXELS:
-                raise OSError(f"the image has {image.width} x {image.height} pixels: scale it down")
+                raise OSError(
+                    f"the image is too large, {image.width} x {image.height} pixels: scale it down"
+                )
             yield image
     except UnidentifiedImageError as error:
         raise OSError(
@@ -228,5 +235,5 @@ def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
 
 
 def to_tensor(images: np.ndarray) -> Tensor:
-    """Convert (F, H, W, 3) uint8 to (F, 3, H, W) float32 in [0, 1]."""
+    """Convert F images (F, H, W, 3) uint8 to (F, 3, H, W) float32 in [0, 1]."""
     return torch.from_numpy(images).permute(0, 3, 1, 2).float().div_(255).contiguous()

@@ -1,8 +1,8 @@
-"""Choice of input photos: they overlap, and are about as far apart as inputs in training.
+"""Choice of input photos that overlap and are about as far apart as the inputs of training.
 
-Distances between cameras are divided by the depth of the scene. The depth comes from the cameras
-alone, or from matching photos. Source of the matching: A Space-Sweep Approach to True Multi-Image
-Matching (Collins 1996), with planes parallel to each photo.
+Distances between cameras are divided by the depth of the scene, which comes from the cameras alone
+or from matching photos. Source of the matching: A Space-Sweep Approach to True Multi-Image Matching
+(Collins 1996), with planes parallel to each photo.
 """
 
 import math
@@ -55,13 +55,13 @@ _MARGIN = 0.03
 def ranked_windows(
     frusta: "Frusta", inputs: int, held_out: Sequence[int] | None = None
 ) -> list[tuple[float, Frames, int]]:
-    """Return (cost, input frames, target frame) of windows of a scene, the lowest cost first.
+    """Return windows of a scene as (cost, input frames, target frame), the lowest cost first.
 
-    Each target has one window. Targets are the held-out photos; without any, all photos. The
-    `inputs` input photos of a window are near the target, see most of it together, overlap, and are
-    as far apart as in training. The list is empty if all photos are inputs. The result is
-    deterministic and does not depend on the order of the frames. held_out: held-out frames, by
-    default the scene's. Raises ValueError if there are fewer photos than inputs.
+    Each target has one window. Targets are the held-out photos, or all photos if none is held out.
+    The `inputs` input photos of a window are near the target, together see most of its view,
+    overlap, and are as far apart as in training. The list is empty if all photos are inputs. The
+    result is deterministic and does not depend on the order of the frames. held_out: held-out
+    frames, by default the scene's. Raises ValueError if there are fewer photos than inputs.
     """
     scene = frusta.scene
     held = sorted(scene.held_out if held_out is None else held_out)
@@ -78,7 +78,11 @@ def ranked_windows(
 
 
 def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
-    """Return least and largest baseline / depth of training, and the largest angle in degrees."""
+    """Return limits for input cameras: least and largest baseline / depth, and largest angle.
+
+    The limits are those of training, or defaults if they are unknown. The angle is between viewing
+    directions, in degrees.
+    """
     ranges = trained_on.ranges
     least, most = ranges.get("baseline", (0.0, math.inf))
     if most > VARIED * least:
@@ -92,7 +96,8 @@ def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
 class Frusta:
     """Cameras of a scene, in units of the scene's depth, and the overlap of their views.
 
-    depth: scene depth in the scene's unit, by default `scene_depth`.
+    trained_on: the cameras of training. depth: depth of the scene in its unit, by default from
+        `scene_depth`.
     """
 
     def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:
@@ -110,7 +115,7 @@ class Frusta:
         self.far = self.apart / self.high + self.turns / max(self.most_turn, 1.0)
 
     def seen(self, frame: int, others: Sequence[int]) -> np.ndarray:
-        """Return which points at depth 1 in the view of `frame` are in view of `others`.
+        """Return which points in the view of `frame`, at depth 1, are in the views of `others`.
 
         The result is a bool array (points, others).
         """
@@ -128,10 +133,10 @@ class Frusta:
         return inside.all(-1).T.numpy()
 
     def window(self, target: int, usable: Sequence[int], inputs: int) -> tuple[float, Frames]:
-        """Choose `inputs` input frames among `usable` for a target; return their cost and frames.
+        """Choose `inputs` input frames among `usable` for a target; return (cost, frames).
 
-        The weights in the cost come from a regression of novel-view PSNR on 580 windows of three
-        scenes. A cost of 1 is about 2 dB.
+        The weights of the cost's terms come from a regression of novel-view PSNR on 580 windows of
+        three scenes. A cost of 1 is about 2 dB.
         """
         near = self._near(target, usable)
         seen = self.seen(target, near)
@@ -157,20 +162,26 @@ class Frusta:
         return float(cost[best]), self._filled(start, end, near, inputs)
 
     def _near(self, target: int, usable: Sequence[int]) -> list[int]:
-        """Return up to _NEAR frames around a target: the nearest; in a dense video, every nth."""
+        """Return up to _NEAR frames around a target.
+
+        They are the nearest frames or, in a dense video, frames at even steps.
+        """
         others = sorted((f for f in usable if f != target), key=lambda f: self.far[target, f])
         inside = [f for f in others if self.apart[target, f] <= 2 * self.high]
         return evenly(inside, _NEAR) if len(inside) > _NEAR else others[:_NEAR]
 
     def _beside(self, frame: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the distances (n,) of a camera from the segments between cameras a and b (n,)."""
+        """Return the distances (n,) of the camera of `frame` from n segments between cameras.
+
+        a, b: frames (n,) whose cameras are the ends of the segments.
+        """
         start = self.centres[frame] - self.centres[a]
         way = self.centres[b] - self.centres[a]
         along = (start * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-12)
         return np.linalg.norm(start - along.clip(0, 1)[:, None] * way, axis=-1)
 
     def _filled(self, first: int, last: int, near: Sequence[int], inputs: int) -> Frames:
-        """Return `first`, frames of `near` at even steps between both ends, and `last`."""
+        """Return `inputs` frames: `first`, frames of `near` at even steps, and `last`."""
         if inputs == 1:
             return (first,)
         chosen = [first]
@@ -183,8 +194,8 @@ class Frusta:
     def compared(self, window: Frames, target: int | None = None) -> Frames:
         """Return up to NOVEL frames to score: the target, and near frames in view of the inputs.
 
-        Frames are near to the target, or without a target to the inputs. Besides the target, only
-        held-out frames are chosen if the scene has any.
+        Frames are near if they are near the target or, without a target, the inputs. If the scene
+        has held-out frames, only these are chosen besides the target.
         """
         inputs = list(window)
         first = [] if target is None else [target]
@@ -201,16 +212,16 @@ class Frusta:
 
 
 def _excess(value: np.ndarray | float, limit: np.ndarray | float) -> np.ndarray:
-    """Return the natural logarithm of value / limit; 0 if the value is below its limit."""
+    """Return the natural logarithm of value / limit, or 0 where the value is below the limit."""
     return np.log(np.maximum(value / np.maximum(limit, 1e-9), 1))
 
 
 def scene_depth(scene: Scene) -> float:
     """Return the depth of the scene in front of its cameras, positive, in the scene's unit.
 
-    It is the first of these that exists: the depth of the point that all cameras look at
-    (`look_at_depth`), the median depth of a plane sweep over some photos, the largest distance
-    between cameras, 1. The result is deterministic.
+    The depth is the first of these that exists: depth of the point that all cameras look at
+    (`look_at_depth`), median depth of a plane sweep over some photos, largest distance between
+    cameras, 1. The result is deterministic.
     """
     c2w = scene.cameras.c2w.double()
     extent = float(largest_distance(c2w))
@@ -224,9 +235,10 @@ def scene_depth(scene: Scene) -> float:
 
 
 def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
-    """Return the depths (n,) of those pixels of a photo that match other photos best at one plane.
+    """Return the depths (n,) of those pixels of a photo that match other photos at one plane.
 
-    planes: depths to try. extent: largest distance between cameras. Both are in scene units.
+    planes: depths to try. extent: largest distance between cameras. Both are in scene units. Pixels
+        that match about equally well at many planes are left out.
     """
     others = _matched(scene, frame, extent)
     if not others:
@@ -254,7 +266,10 @@ def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
 
 
 def _matched(scene: Scene, frame: int, extent: float) -> list[int]:
-    """Return frames to match with `frame`: near it, similar direction, neither ahead nor behind."""
+    """Return frames to match with `frame`.
+
+    They are near it, look in a similar direction, and are neither ahead of it nor behind it.
+    """
     c2w = scene.cameras.c2w.double()
     axes = c2w[:, :3, 2]
     ways = c2w[:, :3, 3] - c2w[frame, :3, 3]

@@ -26,19 +26,22 @@ _SMALLEST = (
 def readers() -> dict[str, type[PhotoReader]]:
     """Return all photo readers by format name: `Nerfstudio`, then those of plug-ins.
 
-    If a folder has several listings, the first format in this order is read.
+    If a folder has listings in several formats, the first of these formats is read.
     """
     own = {"nerfstudio": Nerfstudio}
     return own | installed_readers() | own
 
 
 def formats_of(folder: UPath) -> list[str]:
-    """Return the formats in which `folder` lists cameras, in the order of `readers`."""
+    """Return names of the formats in which `folder` lists cameras, in the order of `readers`."""
     return [name for name, reader in readers().items() if reader.recognises(folder)]
 
 
 def with_cameras(path: UPath) -> UPath:
-    """Return `path`; for photos without cameras, a folder with cameras if a reader can make one."""
+    """Return a folder with photos and cameras for `path`, if a reader can make one; else `path`.
+
+    A folder that lists cameras, or has subfolders that do, is returned unchanged.
+    """
     if not is_local(path) or formats_of(path):
         return path
     # A folder of scenes may hold other pictures too.
@@ -51,13 +54,14 @@ def with_cameras(path: UPath) -> UPath:
 def read_listing(
     folder: UPath, format: str = "auto", images: str | None = None, outside: bool = False
 ) -> Listing:
-    """Read the photos that `folder` lists. format: "auto" reads the first format of `readers`.
+    """Read the photos and cameras that `folder` lists.
 
-    Files that are not where they are listed are searched, see `located`.
+    Files that are not where they are listed are searched for, see `located`.
 
-    images: folder with scaled copies of the photos to read, such as images_4. outside: allow files
-    outside of `folder`. Raises FileNotFoundError without a folder or listing, and ValueError for an
-    unreadable listing and for files outside of `folder` that are not allowed.
+    format: name of a format; "auto" takes the first of `readers` that fits. images: folder with
+        scaled copies of the photos to read, such as images_4. outside: allow files outside of
+        `folder`. Raises FileNotFoundError for a missing folder or listing, and ValueError for an
+        unreadable listing and for files outside of `folder` that are not allowed.
     """
     known = readers()
     listings = ", ".join(f"{reader.listing} ({name})" for name, reader in known.items())
@@ -100,10 +104,9 @@ def present_frames(
 ) -> tuple[list[PhotoFrame], list[str]]:
     """Return the frames of a folder's listing whose images exist, and paths of missing images.
 
-    Frames that the listing puts into no split are left out. A warning tells what is left out.
-    format, images: see `read_listing`. outside: allow files outside of `folder`. Raises
-    FileNotFoundError if fewer than two images exist or a mask is missing, and ValueError for poses
-    and intrinsics that cannot be right.
+    Frames that belong to no split of the listing are left out. Warnings count all that is left out.
+    format, images, outside: see `read_listing`. Raises FileNotFoundError if fewer than two images
+    exist or a mask is missing, and ValueError for impossible poses and intrinsics.
     """
     found = read_listing(folder, format, images, outside)
     frames = [frame for frame in found.frames if frame.split != "unused"]

@@ -1,4 +1,4 @@
-"""Files of a listing: where the listing says that they are, or in another folder or spelling."""
+"""Search for the files that a listing names: as listed, or in another folder or spelling."""
 
 import os
 import unicodedata
@@ -21,12 +21,14 @@ _Index: TypeAlias = Mapping[object, list[UPath]]
 
 
 def located(found: Listing, folder: UPath, images: str | None, outside: bool) -> Listing:
-    """Return `found` with its photos, masks and depth maps where they are in `folder`.
+    """Return `found` with the paths at which its photos, masks and depth maps exist.
 
-    A note counts files that are not where they are listed. Files that are not found stay as listed.
+    Files in another folder or spelling than listed are counted in a warning. Files that are not
+    found keep their listed paths.
 
-    images: the folder in `folder` that photos are read from. outside: files elsewhere are taken,
-    too. Raises ValueError where two files may be meant, and for a file outside of `folder`.
+    images: subfolder of `folder` from which photos are read. outside: allow files outside of
+        `folder`. Raises ValueError if two files fit a name, and for a file outside of `folder` that
+        is not allowed.
     """
     photos = [frame.path for frame in found.frames if frame.name]
     maps = [file for frame in found.frames for file in (frame.mask, frame.depth) if file]
@@ -66,11 +68,11 @@ def found_files(
     images: str | None = None,
     outside: bool = False,
 ) -> dict[UPath, UPath]:
-    """Return where listed photos and maps are, for those that are found.
+    """Return the existing path of each listed photo or map; leave out files that are not found.
 
-    A file that is not where it is listed is looked for in `folder` and in its folder of images,
-    without more and more of the folders that are listed before its name. images, outside: see
-    `located`. Raises ValueError where two files may be meant.
+    A file that is not where it is listed is searched for in `folder` and in its folder of images:
+    under its whole listed path, then without the first folder of this path, then without the first
+    two, and so on. images, outside: see `located`. Raises ValueError if two files fit a name.
     """
     indexed = cache(_index)
     photo_folder = image_folder(folder, images)
@@ -103,14 +105,17 @@ def found_files(
 def _resolved(
     place: UPath, parts: Sequence[str], indexed: Callable[[UPath], _Index]
 ) -> UPath | None:
-    """Return what lies below `place` under a path of such parts. Raises as `located`."""
+    """Return the file below `place` whose path fits `parts` in spelling; None if there is none.
+
+    Raises ValueError if two files fit.
+    """
     for part in parts:
         index = indexed(place)
         held = next((index[way] for way in _spellings(part) if way in index), [])
         if len(held) > 1:
             raise ValueError(
-                f"{name_shown(part)} may be any of {listed(held)}: correct its name in the "
-                "listing, or move the others away"
+                f"{name_shown(part)} may be any of {listed(held)}: correct the name in the "
+                "listing, or move all but one of these files away"
             )
         if not held:
             return None
@@ -119,7 +124,7 @@ def _resolved(
 
 
 def _index(folder: UPath) -> _Index:
-    """Return what is in `folder` by each of its `_spellings`."""
+    """Return the items in `folder` by each of the `_spellings` of their names."""
     index = defaultdict[object, list[UPath]](list)
     for item in sorted(listing(folder), key=str):
         for way in _spellings(item.name):
@@ -128,7 +133,7 @@ def _index(folder: UPath) -> _Index:
 
 
 def _spellings(name: str) -> enumerate[str]:
-    """Yield a name, then without letter case and form of Unicode, then without suffix, too."""
+    """Yield a numbered name, then in lower case and normal form of Unicode, then without suffix."""
     key = unicodedata.normalize("NFC", name).casefold()
     stem, dot, suffix = key.rpartition(".")
     known = dot + suffix in (*Image.registered_extensions(), ".npy", ".heic")
@@ -136,10 +141,10 @@ def _spellings(name: str) -> enumerate[str]:
 
 
 def inside(folder: UPath, path: UPath) -> Sequence[str]:
-    """Return the parts of `path` relative to `folder`."""
+    """Return the parts of the path from `folder` to `path`; ".." if `path` is outside."""
     return os.path.relpath(path.path, folder.path or ".").split(os.sep)
 
 
 def is_inside(folder: UPath, path: UPath) -> bool:
-    """Return whether `path` is below `folder`, by its name: links are not followed."""
+    """Return whether `path` is below `folder`, judged by the path alone: links are not followed."""
     return ".." not in inside(folder, path)

@@ -1,4 +1,4 @@
-"""Reader of nerfstudio's `transforms.json`, and of the same schema from Blender and DL3DV."""
+"""Reader of `transforms.json` from nerfstudio, and from Blender and DL3DV in the same schema."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -42,22 +42,22 @@ _OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 class Nerfstudio(PhotoReader):
-    """Format `transforms.json`, with masks, depth maps and splits.
+    """Photo reader for `transforms.json`, with masks, depth maps and splits.
 
-    If the listed folder `images` is missing, scaled copies such as images_4 are read.
+    If the folder `images` of a listing is missing, scaled copies such as images_4 are read.
     """
 
     listing = "transforms.json"
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """Read the frames in the order of the file; see `PhotoReader`."""
+        """Read the frames in the order of the file; raise the errors of `PhotoReader.read`."""
         file = folder / cls.listing
         return Listing(file, read_transforms(file))
 
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
-    """Read the frames of a transforms file, in its order, with their problems.
+    """Read the frames of a transforms.json, in its order; bad values become problems of a frame.
 
     Raises ValueError for a file without frames or with wrong splits.
     """
@@ -83,7 +83,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
     """Read an entry of 'frames'; values that cannot be read become problems of the frame.
 
     data: the whole file; its values apply to entries that lack them. size: (H, W) of the image if
-    neither entry nor `data` has 'h' and 'w'.
+        neither the entry nor `data` has 'h' and 'w'.
     """
     path = entry.get("file_path") if isinstance(entry, Mapping) else None
     if not isinstance(path, str) or not PurePosixPath(path).name or "://" in path:
@@ -115,7 +115,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
 
 
 def _flat(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return `values` with the entries of a matrix of intrinsics under their own names."""
+    """Return `values`, extended by the focal lengths and centre of an intrinsics matrix, if any."""
     matrix = numbers(next((values[key] for key in _MATRICES if key in values), None))
     if matrix.shape != (3, 3):
         return values
@@ -124,18 +124,20 @@ def _flat(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 class _Values(dict[str, Any]):
-    """Values of a frame, and problems of values that cannot be read."""
+    """Values of a frame in the file, and the problems found while reading them."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
         self.problems: list[FrameProblem] = []
 
     def problem(self, reason: str, fix: str) -> None:
-        """Add a problem."""
         self.problems.append(FrameProblem(reason, fix))
 
     def number(self, key: str) -> float | None:
-        """Return the finite number `key`; None if it is absent, null or invalid, a problem."""
+        """Return the finite number under `key`, or None.
+
+        None if the value is absent or null, and if it is invalid, which is added to `problems`.
+        """
         value = self.get(key)
         # Some programs write numbers as text.
         read = numbers([value])
@@ -147,7 +149,7 @@ class _Values(dict[str, Any]):
 
 
 def image_name(file_path: str) -> str:
-    """Return `file_path` with `/` as separator; add .png if it has no suffix, as in Blender."""
+    """Return `file_path` with `/` as separator; append .png if it has no suffix, as in Blender."""
     name = PurePosixPath(file_path.replace("\\", "/"))
     suffix = name.suffix.lower()
     known = suffix[1:].isalpha() or suffix in Image.registered_extensions()
@@ -186,9 +188,10 @@ def _intrinsics(values: _Values, size: Size | None) -> Intrinsics:
 
 
 def _focal(values: _Values, axis: str, side: int | None) -> float | None:
-    """Return the focal length of an axis in pixels: as listed, or from the angle of view.
+    """Return the focal length in pixels along an axis; None without a valid value.
 
-    axis: "x" or "y". side: width or height in pixels. None without a valid value.
+    The value is the listed focal length, or else comes from the listed angle of view. axis: "x" or
+    "y". side: width or height of the image in pixels.
     """
     angle = values.number(f"camera_angle_{axis}")
     given = values.number(f"fl_{axis}")
@@ -217,7 +220,8 @@ def _lens(values: _Values) -> Lens | None:
 def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[PhotoFrame]:
     """Return `frames` with the splits that nerfstudio's lists of file names give.
 
-    Frames in no list belong to the split without a list; if both have lists, they are unused.
+    Frames in no list belong to the split that has no list; if both splits have lists, these frames
+    are unused.
     """
     known = {frame.name for frame in frames}
 

@@ -46,7 +46,7 @@ _FOCAL = (0.1, 30.0)
 
 @dataclass(frozen=True)
 class FrameProblem:
-    """A mistake in the listing of a `PhotoFrame`: the reason and how to fix it."""
+    """A mistake in the listing of one frame: the reason and how to fix it."""
 
     reason: str
     fix: str
@@ -56,44 +56,49 @@ class FrameProblem:
 
 
 class Lens(ABC):
-    """Lens with distortion, made by `PhotoReader.lens`; hashable. Pinhole cameras have none."""
+    """Lens with distortion, made by `PhotoReader.lens`; hashable. Pinhole cameras have no lens."""
 
     @abstractmethod
     def undistorted(
         self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
     ) -> np.ndarray:
-        """Return a photo as a pinhole camera with the same intrinsics would have taken it.
+        """Return the photo that a pinhole camera with the same intrinsics would have taken.
 
-        pixels: the photo, (H, W) or (H, W, C); the result has its shape and dtype. intrinsics: fx,
-        fy, cx, cy in pixels of the photo. nearest: take the nearest pixel in place of an
-        interpolation. Pixels outside of the photo are 0.
+        pixels: the photo, (H, W) or (H, W, C); the result has its shape and dtype. Pixels outside
+            of the photo become 0. intrinsics: fx, fy, cx, cy in pixels of the photo. nearest: take
+            the nearest pixel instead of interpolating.
         """
 
     @abstractmethod
     def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
         """Return the smallest zoom of a centre crop without black edges in an undistorted photo.
 
-        intrinsics: in pixels of the photo. size: (H, W) of the photo. target: (H, W) whose aspect
-        ratio the crop has.
+        intrinsics: fx, fy, cx, cy in pixels of the photo. size: (H, W) of the photo. target: (H, W)
+            whose aspect ratio the crop has.
         """
 
     @abstractmethod
     def turned(self) -> Self:
-        """Return the lens of the same camera turned clockwise by 90 degrees."""
+        """Return the lens of this camera after a clockwise turn by 90 degrees."""
 
 
 @dataclass(frozen=True)
 class PhotoFrame:
-    """One photo as listed. Its values are not checked yet, see `refuse_problems`.
+    """One photo as listed. Its values are checked later, by `sound_frames`.
 
-    name: image file relative to the scene's folder. path: path of the image. mask: file of the
-    mask; the image itself if its alpha channel is the mask. depth: file of the depth map.
-    c2w: (4, 4) float64 OpenCV camera-to-world. intrinsics: fx, fy, cx, cy in pixels of an image of
-    `size` (H, W); without a listed size, in pixels of the file. lens: None for a pinhole camera.
-    split: as listed; None without splits. time: when the photo was taken, in the listing's unit;
-    None for static scenes. turns: number of clockwise quarter turns that bring the stored pixels
-    upright, see `qgs.data.photos.source.upright`. problems: values in the listing that cannot be
-    read; an unreadable pose or unreadable intrinsics are NaN.
+    name: image file relative to the scene's folder. path: path of the image.
+    mask: file of the mask; the image itself if its alpha channel is the mask. depth: file of the
+        depth map. Either is None if not listed.
+    c2w: (4, 4) float64 OpenCV camera-to-world.
+    intrinsics: fx, fy, cx, cy in pixels of an image of `size` (H, W); without a listed size, in
+        pixels of the file.
+    lens: lens with distortion; None for a pinhole camera.
+    split: the listed split; None without splits.
+    time: when the photo was taken, in the listing's unit; None for static scenes.
+    turns: number of clockwise quarter turns that bring the stored pixels upright, see
+        `qgs.data.photos.source.upright`.
+    problems: values in the listing that cannot be read; an unreadable pose or unreadable intrinsics
+        are NaN.
     """
 
     name: str
@@ -110,7 +115,7 @@ class PhotoFrame:
     problems: tuple[FrameProblem, ...] = ()
 
     def at_size(self, size: Size) -> Intrinsics:
-        """Return intrinsics in pixels of a scaled copy of the photo. size: (H, W) of the copy."""
+        """Return fx, fy, cx, cy in pixels of a scaled copy of the photo, of size (H, W)."""
         height, width = self.size or size
         x = size[1] / width
         y = size[0] / height
@@ -120,9 +125,11 @@ class PhotoFrame:
 
 @dataclass(frozen=True)
 class Listing:
-    """Photos of a folder. file: the file that lists them. frames: in the order of that file.
+    """Photos and cameras that a file lists for a folder.
 
-    folder: folder of the photos; None for the folder that was read. present: files that exist.
+    file: the file with the list. frames: in the order of this file.
+    folder: folder of the photos; None if it is the folder that was read.
+    present: listed files that exist.
     """
 
     file: UPath
@@ -132,9 +139,9 @@ class Listing:
 
 
 class PhotoReader(ABC):
-    """Base of readers of one format that lists photos and cameras.
+    """Base class of photo readers; each reads one format that lists photos and cameras.
 
-    An entry point in the group `GROUP` gives the format its name.
+    The name of the format is that of the reader's entry point in the group `GROUP`.
     """
 
     listing: ClassVar[str]
@@ -147,10 +154,10 @@ class PhotoReader(ABC):
 
     @classmethod
     def posed(cls, path: UPath) -> UPath | None:
-        """Compute cameras for a video or for photos without cameras; return a folder with both.
+        """Compute cameras for a video or for photos; return a folder of photos and cameras.
 
         An existing result is reused. Returns None if this reader cannot compute cameras. Commands
-        that open a user's photos call it; training never does.
+        that open a user's photos call this method; training never does.
         """
         return None
 
@@ -158,25 +165,27 @@ class PhotoReader(ABC):
     def lens(cls, model: str, coefficients: Mapping[str, float]) -> Lens | None:
         """Return the lens of a camera model; None if this reader does not know the model.
 
-        model: name in nerfstudio or COLMAP. coefficients: distortion coefficients that are not 0,
-        by name, such as k1.
+        model: name of the model in nerfstudio or COLMAP. coefficients: nonzero distortion
+            coefficients by name, such as k1.
         """
         return None
 
     @classmethod
     @abstractmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """Read the photos that `folder` lists. Neighbours in the list should be near in space.
+        """Read the photos and cameras that `folder` lists.
 
-        images: folder with scaled copies of the photos to read, such as images_4. Raises
-        FileNotFoundError if it does not exist, and ValueError for an unreadable listing.
+        Consecutive frames of the result should be near in space. images: folder with scaled copies
+        of the photos to read, such as images_4; None reads the listed photos. Raises
+        FileNotFoundError if this folder does not exist, and ValueError for an unreadable listing.
         """
 
 
 def installed_readers() -> dict[str, type[PhotoReader]]:
-    """Return the readers of installed plug-ins by format name; of equal names, the first.
+    """Return the readers of installed plug-ins by format name.
 
-    A reader that cannot be loaded is left out with a warning.
+    If two have the same name, the first counts. A reader that cannot be loaded is left out with a
+    warning.
     """
     found: dict[str, type[PhotoReader]] = {}
     for entry in installed(GROUP):
@@ -189,7 +198,7 @@ def installed_readers() -> dict[str, type[PhotoReader]]:
 
 
 def numbers(value: object) -> np.ndarray:
-    """Return nested lists as a float64 array; an empty array if they are no array of numbers."""
+    """Return nested lists of numbers as a float64 array; an empty array for any other value."""
     try:
         return np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -197,8 +206,9 @@ def numbers(value: object) -> np.ndarray:
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:
-    """Return the folder of photos: `wanted`, or else images, its largest copy, or `folder`.
+    """Return the folder of a scene's photos: `wanted`, or by default the first that exists.
 
+    The defaults are the subfolder images, its largest scaled copy such as images_2, and `folder`.
     Raises FileNotFoundError if `wanted` is given and does not exist.
     """
     if wanted is None:
@@ -215,7 +225,7 @@ def image_folder(folder: UPath, wanted: str | None) -> UPath:
 
 
 def mended(found: Listing) -> Listing:
-    """Divide uniform scales out of rotations, and mark poses far from all others as a problem.
+    """Divide uniform scales out of rotations; poses far from all others become problems.
 
     Metashape multiplies all rotations by one number.
     """
@@ -242,7 +252,7 @@ def mended(found: Listing) -> Listing:
 
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
-    """Yield a problem if a pose (4, 4) has NaN or huge values, is mirrored, sheared or scaled."""
+    """Yield a problem if a pose (4, 4) has NaN or huge values, or is not rigid."""
     # NaN is not at most anything.
     if not np.abs(c2w).max() <= _FARTHEST:
         reason = f"the pose has NaN or numbers larger than {_FARTHEST:.0e}"
@@ -262,9 +272,9 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
 
 
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
-    """Yield a problem if fx, fy, cx, cy are not finite, not positive, or not in pixels.
+    """Yield a problem if fx, fy, cx, cy are not finite, not in pixels, or fx or fy is not positive.
 
-    size: listed (H, W); None without one.
+    size: listed image size (H, W); None if none is listed.
     """
     fx, fy, cx, cy = intrinsics
     values = f"(fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g})"
@@ -289,7 +299,10 @@ def are_plausible(intrinsics: Intrinsics, size: Size) -> bool:
 
 
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
-    """Yield a problem if an image of `size` (H, W) is not a scaled copy of the size `listed`."""
+    """Yield a problem if an image of `size` (H, W) is no scaled copy of one of size `listed`.
+
+    None for `listed` is no problem.
+    """
     if listed is None or _alike(size, listed):
         return
     swapped = _alike(size, (listed[1], listed[0]))
@@ -309,7 +322,7 @@ def _alike(size: Size, other: Size) -> bool:
 
 
 def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FrameProblem, ...]]:
-    """Return a listed size (H, W) and no problem; None and a problem if the size is impossible."""
+    """Return a listed size as (H, W) and no problem, or None and a problem if it is impossible."""
     if all(1 <= side <= LARGEST_SIDE for side in (height, width)):
         return (round(height), round(width)), ()
     size = f"{str(width)[:12]} x {str(height)[:12]}"
@@ -318,9 +331,9 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
 
 
 def sound_frames(listing: object, frames: Sequence[PhotoFrame]) -> list[PhotoFrame]:
-    """Return the frames without problems; warn of the others and of implausible intrinsics.
+    """Return the frames without problems; warn of other frames and of implausible intrinsics.
 
-    listing: file that is named in messages. Raises ValueError if fewer than two have no problem.
+    listing: file to name in messages. Raises ValueError if fewer than two frames are left.
     """
     sound: list[PhotoFrame] = []
     faulty: list[str] = []

@@ -46,15 +46,15 @@ _QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
 class PhotosConfig(SceneSource.Config):
-    """Options of `qgs/photos`."""
+    """Options of the data source `qgs/photos`."""
 
     path: str
-    """Folder of one scene, folder of scenes, or folder with scenes in the folders train and test.
-    Absolute, relative to the working directory, or a URL of fsspec. For a video, or for photos
-    without cameras, run `qgs poses` first."""
+    """Folder of one scene, folder of scenes, or folder with the subfolders train and test, which
+    hold scenes. Absolute, relative to the working directory, or a URL of fsspec. For a video, or
+    for photos without cameras, run `qgs poses` first."""
     format: str = "auto"
     """Format of the camera listing: nerfstudio, or a format of a plug-in, such as colmap. auto uses
-    the first format that the folder has."""
+    the first format in which the folder lists cameras."""
     images: str | None = None
     """Folder with scaled copies of the photos to read, such as images_4. null reads the listed
     photos."""
@@ -62,8 +62,8 @@ class PhotosConfig(SceneSource.Config):
     """Allow listings to name files outside of the folder, by absolute paths or `..`. Links are
     always followed."""
     holdout: int = Field(default=8, ge=0)
-    """Hold out every nth frame for evaluation, starting at frame n // 2; in scenes of fewer frames,
-    the middle frame. 0 holds out no frame. Splits in the listing take precedence."""
+    """Number n: every nth frame, starting at frame n // 2, is held out for evaluation; in scenes of
+    fewer frames, the middle frame. 0 holds out no frame. Splits in the listing take precedence."""
     max_frames: int = Field(default=0, ge=0)
     """Number of frames to read from the start of a listing. 0 reads all frames."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -84,8 +84,7 @@ class PhotosConfig(SceneSource.Config):
 class PhotoScene(Scene):
     """Scene of listed photos, in the coordinates and the order of the listing.
 
-    cache: cache for decoded images, which several scenes share. Raises the errors of
-    `present_frames`.
+    cache: decoded images, shared by several scenes. Raises the errors of `present_frames`.
     """
 
     def __init__(
@@ -110,9 +109,9 @@ class PhotoScene(Scene):
 
     @cached_property
     def cameras(self) -> Cameras:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Cameras of all frames, float64, after crop and resize; see `Scene`.
+        """Cameras of all frames, in float64, for the photos after crop and resize.
 
-        One photo is opened for all photos of a folder with the same listed size. Raises ValueError
+        Of all photos in a folder with the same listed size, only one is opened. Raises ValueError
         if its size is not a scaled copy of the listed size.
         """
         sizes: dict[object, Size] = {}
@@ -127,18 +126,24 @@ class PhotoScene(Scene):
         return Cameras(c2w, torch.stack(intrinsics), self.config.image_size)
 
     def images(self, frames: Sequence[int]) -> Tensor:
-        """Read photos, see `Scene`. Raises ValueError for a file that cannot be decoded."""
+        """Read the photos of `frames`; raise ValueError for a file that cannot be decoded."""
         return to_tensor(self._stacked(self._image, frames))
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """Read masks, see `Scene`. If only some photos have masks, masks of other photos are 1."""
+        """Read the masks of `frames`; None if no photo of the scene has a mask.
+
+        If only some photos have masks, the masks of the other photos are 1 everywhere.
+        """
         if all(frame.mask is None for frame in self.photos):
             return None
         masks = self._stacked(self._mask, frames)
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
-        """Read depth maps, see `Scene`. A frame without one gets 0; None if all lack one."""
+        """Read the depth maps of `frames`; None if none of them has one.
+
+        A frame without a depth map gets 0 everywhere.
+        """
         if all(self.photos[i].depth is None for i in frames):
             return None
         return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
@@ -148,14 +153,14 @@ class PhotoScene(Scene):
         return self.photos[frame].name
 
     def stored_size(self, frame: int) -> Size:
-        """Return (H, W) of the image file in pixels, turned upright."""
+        """Return the size (H, W) in pixels of the image file, after turning the image upright."""
         photo = self.photos[frame]
         return _checked(read_image(photo.path, image_size), photo, photo.path)
 
     def _stacked(
         self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
     ) -> np.ndarray:
-        """Return cached results of `read` for each frame, stacked to (F, H, W, ...)."""
+        """Return the results of `read` for F frames, stacked to (F, H, W, ...), and cache them."""
 
         def cached(frame: int) -> np.ndarray:
             key = (self.name, read.__name__, frame)
@@ -188,7 +193,7 @@ class PhotoScene(Scene):
     def _delivered(
         self, image: Image.Image, frame: PhotoFrame, file: UPath, nearest: bool = False
     ) -> np.ndarray:
-        """Return an image decoded from `file`: upright, undistorted, cropped and resized."""
+        """Return `image`, decoded from `file`, turned upright, undistorted, cropped and resized."""
         # A mask or depth map follows the photo.
         if file != frame.path and frame.size is None:
             frame = replace(frame, size=read_image(frame.path, image_size))
@@ -202,7 +207,7 @@ class PhotoScene(Scene):
         return self._crop(frame, size).image(image, kernel)
 
     def _crop(self, frame: PhotoFrame, size: Size) -> CropResize:
-        """Return the crop without black edges of an undistorted photo of `size` (H, W)."""
+        """Return the crop of a photo of `size` (H, W) without black edges of undistortion."""
         target = self.config.image_size
         lens = frame.lens
         zoom = 1.0 if lens is None else lens.whole_zoom(frame.at_size(size), size, target)
@@ -210,14 +215,20 @@ class PhotoScene(Scene):
 
 
 def whole_mask(frame: PhotoFrame) -> Image.Image:
-    """Read the mask of a photo that has a mask, in stored size; raise ValueError if unreadable."""
+    """Read the mask of a photo without crop; raise ValueError for an unreadable file.
+
+    The photo must have a mask.
+    """
     assert frame.mask is not None
     decode = decode_alpha if frame.mask == frame.path else decode_mask
     return Image.fromarray(read_image(frame.mask, decode))
 
 
 def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
-    """Return upright (H, W) of a file of `size`; raise ValueError if the listed size differs."""
+    """Return `size`, the stored (H, W) of `file`, for the upright image.
+
+    Raises ValueError if the aspect ratio is not that of the size listed for `frame`.
+    """
     size = turned_size(size, frame)
     for problem in size_problems(size, frame.size):
         raise ValueError(f"{file}: {problem}")
@@ -225,11 +236,12 @@ def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
 
 
 class PhotosSource(LazySource):
-    """Data source of photos of one scene or many scenes.
+    """Data source for photos of one scene or many scenes.
 
-    Training and test split have the same scenes; held-out frames separate them. But if the folder
-    has scenes in the folders `train` and `test`, these are the splits. A single scene is opened
-    immediately; many scenes are opened on demand. Raises the errors of `present_frames`.
+    The training split and the test split have the same scenes; test views are held-out frames. But
+    if the folder has scenes in the subfolders `train` and `test`, these are the splits. A single
+    scene is opened immediately; many scenes are opened when needed. Raises the errors of
+    `present_frames`.
     """
 
     name = "photos"
@@ -264,13 +276,17 @@ class PhotosSource(LazySource):
     def recognises(cls, path: UPath) -> bool:
         """Return whether the folder `path` lists cameras.
 
-        A folder that no source recognises, such as a folder of scenes, is opened by `qgs/photos`.
+        A folder that no data source recognises, such as a folder of scenes, is opened by
+        `qgs/photos`.
         """
         return bool(formats_of(path))
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
-        """Return whether `path` is `root`, or a scene in `root` or in its folder `train`."""
+        """Return whether training on `root` reads `path`.
+
+        True if `path` is `root`, or a scene in `root` or in its subfolder `train`.
+        """
         inside = path in (root / path.name, root / "train" / path.name)
         return path == root or (inside and bool(formats_of(path)))
 
@@ -278,13 +294,13 @@ class PhotosSource(LazySource):
     def config_for(
         cls, path: str, image_size: tuple[int, int], trained: SceneSourceConfig | None
     ) -> SceneSourceConfig:
-        """Return options for data outside of training, see `SceneSource`; no frame is held out."""
+        """Return options for data outside of training, in which no frame is held out."""
         config = super().config_for(path, image_size, trained)
         return config.model_copy(update={"holdout": 0})
 
 
 def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
-    """Return the folders in `root` that hold a scene in `config.format`, by name."""
+    """Return by name the subfolders of `root` that hold a scene in `config.format`."""
     wanted: dict[str, UPath] = {}
     others: list[str] = []
     for folder in sorted(filter(UPath.is_dir, listing(root)), key=lambda item: item.name):
@@ -302,16 +318,16 @@ def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
 
 
 def folder_name(folder: UPath) -> str:
-    """Return the name of the scene in `folder`: the name of the folder."""
+    """Return the name of the scene in `folder`: the folder's name, or "photos" if it has none."""
     return folder.resolve().name or "photos"
 
 
 def upright(frame: PhotoFrame) -> PhotoFrame:
     """Return `frame` with camera and lens turned upright as the photo's EXIF orientation says.
 
-    If the listed size is that of the upright photo, the listed camera is upright already. If both
-    sizes are equal, as for squares and half turns, the listed camera belongs to the stored pixels
-    and is turned. Frames in an object store are not turned.
+    If only the upright photo has the listed size, the listed camera is upright already and is not
+    turned. If the stored photo has this size too, as for squares and half turns, the listed camera
+    belongs to the stored pixels and is turned. Frames in an object store are not turned.
     """
     # In an object store, each header would be a request.
     if not is_local(frame.path) or not frame.path.is_file():
@@ -347,14 +363,17 @@ def _swapped(size: Size) -> Size:
 
 
 def _quarters(size: Size, frame: PhotoFrame) -> int:
-    """Return clockwise quarter turns of a file of `size` (H, W); 0 if its size is upright."""
+    """Return by how many clockwise quarter turns a file of `size` (H, W) must be turned.
+
+    0 if the size is that of the upright photo.
+    """
     fits, fits_turned = (not any(size_problems(own, frame.size)) for own in (size, _swapped(size)))
     return 0 if frame.turns % 2 and fits and not fits_turned else frame.turns
 
 
 @lru_cache(maxsize=2**16)
 def _header(path: str, changed: int) -> tuple[Size, int]:
-    """Return stored (H, W) and quarter turns of an image file; (1, 1) and 0 for other files.
+    """Return the stored (H, W) and needed quarter turns of an image file; (1, 1) and 0 for others.
 
     changed: time of the last change, part of the key of the cache.
     """
@@ -366,7 +385,7 @@ def _header(path: str, changed: int) -> tuple[Size, int]:
 
 
 def _quarter(frame: PhotoFrame) -> PhotoFrame:
-    """Turn camera, size and lens of `frame` clockwise by 90 degrees."""
+    """Return `frame` with camera, size and lens turned clockwise by 90 degrees."""
     assert frame.size is not None
     height, width = frame.size
     fx, fy, cx, cy = frame.intrinsics
