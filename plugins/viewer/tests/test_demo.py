@@ -106,7 +106,7 @@ def test_two_photos_leave_nothing_to_compare_with(models, tmp_path):
     photos = noisy_photos(tmp_path / "two", 2)
     out = tmp_path / "demo"
     must_refuse(
-        "none is left to compare with", done, "demo", photos, "--model", models[0], "--out", out
+        "no photo is left to compare", done, "demo", photos, "--model", models[0], "--out", out
     )
     assert not out.exists()
 

@@ -1,1 +1,1 @@
-"""Viewer, reports and figures: reconstructions in the browser, report pages, figures for papers."""
+"""Plug-in for looking at results: viewer in the browser, report pages, figures for papers."""

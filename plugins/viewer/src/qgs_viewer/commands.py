@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class FigureName(StrEnum):
-    """Names of the figures, in the order of figures.md."""
+    """Names of the figures that `qgs figures` draws, in the order of its file figures.md."""
 
     NOVEL_VIEWS = auto()
     QUERIES = auto()
@@ -48,8 +48,8 @@ class FigureName(StrEnum):
 SourceName = Annotated[
     str,
     typer.Argument(
-        help="Run folder, checkpoint, shipped model (PLUGIN/NAME), .ply or .splat file, or "
-        "the folder that qgs reconstruct wrote."
+        help="What to show: a run folder, a checkpoint, a shipped model (PLUGIN/NAME), a .ply or "
+        ".splat file, or a folder that qgs reconstruct wrote."
     ),
 ]
 ModelPhotos = Annotated[
@@ -63,32 +63,38 @@ Query = Annotated[
     int | None,
     typer.Option(
         min=0,
-        help="Number of the query to show. Default: no query in the viewer, well visible queries "
-        "in figures.",
+        help="Number of the query to show, from 0. Default: the viewer shows all queries, figures "
+        "show a few well visible ones.",
     ),
 ]
 Page = Annotated[
     Path | None,
     typer.Option(
-        help="Write the scene to this new HTML file, in which it can be turned, and start no "
-        "server. The page cannot pick queries: choose one with --query."
+        help="Write a page with the scene, which can be turned, to this new HTML file and start no "
+        "server. A query cannot be picked in the page: choose it with --query."
     ),
 ]
 Host = Annotated[
     str,
-    typer.Option(help="Address to serve at. 0.0.0.0 lets other machines open the viewer."),
+    typer.Option(help="IP address to serve at. 0.0.0.0 lets other machines open the viewer."),
 ]
 Port = Annotated[
     int,
-    typer.Option(min=0, max=65535, help="Port to serve at. If it is taken, the next free one."),
+    typer.Option(
+        min=0,
+        max=65535,
+        help="Port to serve at. If this port is taken, the next free port is used.",
+    ),
 ]
 OpenBrowser = Annotated[
-    bool, typer.Option("--open/--no-open", help="Open the viewer in this machine's browser.")
+    bool,
+    typer.Option("--open/--no-open", help="Whether to open the viewer in this machine's browser."),
 ]
 Runs = Annotated[
     list[str],
     typer.Argument(
-        metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
+        metavar="RUN...",
+        help="Trained models: run folders, checkpoints, URLs of checkpoints, or shipped models.",
     ),
 ]
 Photos = Annotated[
@@ -109,24 +115,24 @@ PhotosOrRecipes = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="[PHOTOS]",
-        help="Folder of your own photos, or a video. Default: unseen rooms. With --train: recipe "
-        "files to compare.",
+        help="Folder of your own photos, or a video. Default: rooms not seen in training. With "
+        "--train, give the recipe files to compare here.",
     ),
 ]
 Models = Annotated[
     list[str] | None,
     typer.Option(
         "--model",
-        help="Trained model to compare, as qgs eval takes it. Repeatable. Default: three shipped "
-        "models.",
+        help="Trained model to compare: run folder, checkpoint, URL or shipped model. Repeatable. "
+        "Default: three shipped models.",
     ),
 ]
 Train = Annotated[
     bool,
     typer.Option(
         "--train",
-        help="Train recipes and compare the results, not shipped models. Default recipes: tiny "
-        "TokenGS and tiny LocusGS.",
+        help="Train recipes and compare the trained models, instead of shipped models. Default "
+        "recipes: tiny TokenGS and tiny LocusGS.",
     ),
 ]
 Seconds = Annotated[
@@ -136,10 +142,11 @@ Seconds = Annotated[
     ),
 ]
 Seed = Annotated[
-    int | None, typer.Option(min=0, help="With --train: random seed of all trainings. Default: 0.")
+    int | None,
+    typer.Option(min=0, help="With --train: random seed, the same for all trainings. Default: 0."),
 ]
 Only = Annotated[
-    list[FigureName] | None, typer.Option(help="Draw this figure only. Repeatable. Default: all.")
+    list[FigureName] | None, typer.Option(help="Figure to draw. Repeatable. Default: all figures.")
 ]
 
 view_app = typer.Typer(help="Show a reconstruction in the browser.")
@@ -168,10 +175,12 @@ def view(
 ) -> None:
     """Show a reconstruction in the browser: turn it, pick a query, see its anchor and attention.
 
-    A slider selects the decoder layer whose anchors are shown. Tick boxes change the input photos.
+    A slider selects the decoder layer whose anchors are shown. Tick boxes select the input photos.
     """
     if foreign := [text for text in overrides or () if not text.startswith("views.")]:
-        raise ValueError(f"--set changes only `views` here: leave out {listed(foreign)}")
+        raise ValueError(
+            f"--set changes only options of `views` in this command: leave out {listed(foreign)}"
+        )
     # a wrong word is refused before torch is loaded, which takes seconds
     pixels = parse_size(size)
 
@@ -256,22 +265,27 @@ def demo(
 ) -> None:
     """Compare trained models on unseen rooms or on your photos, and write report.html.
 
-    If your photos have no camera poses, or for a video, poses are computed first (qgs poses). With
+    Camera poses are computed first (qgs poses) for a video, and for photos without poses. With
     --train, two small recipes (TokenGS and LocusGS), or the recipes that you name, are trained from
-    the start and compared.
+    the start, and the trained models are compared.
     """
     if train and models:
         raise ValueError(
-            "--model names trained models, which --train does not use: leave out one of them"
+            "--model names trained models, which --train does not use: leave out --model or --train"
         )
     if not train and (seconds is not None or seed is not None):
-        raise ValueError("--seconds and --seed are for training: add --train")
+        raise ValueError(
+            "--seconds and --seed have an effect only with --train: add --train, or leave them out"
+        )
     if not train and len(given or ()) > 1:
-        raise ValueError(f"name only one folder of photos, got {', '.join(given or ())}")
+        raise ValueError(
+            f"give at most one folder of photos or video, got {', '.join(given or ())}"
+        )
     # an option without effect would look as if it had one
     if (size, scale) != (None, None) and (train or not given):
         raise ValueError(
-            "--size and --scale are for photos: name a folder of photos, or leave both out"
+            "--size and --scale have an effect only on your own photos: give a folder of photos, "
+            "without --train, or leave both options out"
         )
     from qgs_viewer.compare import RECIPES, compare_models, compare_trainings
 
@@ -295,7 +309,10 @@ def report(
 ) -> None:
     """Evaluate trained models, and write report.html with their results side by side."""
     if (size, scale) != (None, None) and photos is None:
-        raise ValueError("--size and --scale are for photos: give --photos, or leave both out")
+        raise ValueError(
+            "--size and --scale have an effect only on your own photos: give --photos, or leave "
+            "both options out"
+        )
     from qgs_viewer.compare import compare_models
 
     use_threads(threads)
@@ -336,7 +353,7 @@ def figures(
 
 
 def new_folder(out: Path | None, name: str) -> Path:
-    """Return `out`, or without it the first of the folders NAME, NAME-2, ... that does not exist.
+    """Return `out`; if it is None, the first of the folders NAME, NAME-2, ... that does not exist.
 
     Raises FileExistsError if `out` is a file or a folder that is not empty.
     """
@@ -344,5 +361,8 @@ def new_folder(out: Path | None, name: str) -> Path:
         names = (Path(f"{name}-{number}" if number > 1 else name) for number in count(1))
         return next(name for name in names if not name.exists())
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"{out} is not empty; choose another --out, or delete it yourself")
+        raise FileExistsError(
+            f"{out} is a file or a folder that is not empty; choose another --out, or delete it "
+            "yourself"
+        )
     return out

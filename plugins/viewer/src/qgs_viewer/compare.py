@@ -41,8 +41,9 @@ def compare_models(
 ) -> None:
     """Evaluate `models` (default: some that come with qgs), and write a report into `target`.
 
-    photos: folder or video; None takes unseen scenes of the models' data. size: that of the photos,
-    as --size takes it. scale: factor of camera positions; None searches for one.
+    photos: folder or video; None evaluates on unseen scenes of the models' data. size: of the
+    photos, in the form of the option --size. scale: factor by which camera positions are
+    multiplied; None searches for a factor.
     """
     pixels = parse_size(size)
     # models of 128 pixels need photos of that size at least
@@ -67,7 +68,8 @@ def compare_trainings(
 ) -> None:
     """Train each recipe for `seconds`, one after the other, and write a report into `target`.
 
-    Raises typer.Exit if a training fails, and typer.Abort if the user stops one.
+    The report compares the trained models. Raises typer.Exit if a training fails, and typer.Abort
+    if the user stops a training.
     """
     console = Console()
     resolved = resolve_fairly([Path(recipe) for recipe in recipes], seconds, seed)
@@ -92,7 +94,7 @@ def compare_trainings(
 
 @contextmanager
 def kept_warnings() -> Iterator[list[str]]:
-    """Collect the warnings that qgs logs inside the block; the terminal shows them as usual."""
+    """Collect the warnings that qgs logs inside the block; the terminal still shows them."""
     kept = list[str]()
     logger = logging.getLogger("qgs")
     # Python prints warnings itself only where no logger on the way has a handler

@@ -1,4 +1,4 @@
-"""Open several trained models and evaluate them on the same scenes under one protocol."""
+"""Open several trained models and evaluate all on the same scenes under one protocol."""
 
 import math
 import os
@@ -58,11 +58,12 @@ POOR = 1.0
 
 
 def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) -> list[Window]:
-    """Choose at most `count` windows, each with its input photos and the photos to compare with.
+    """Choose at most `count` windows: input photos, with the photos that renders are compared to.
 
-    The first is the best of `ranked_windows`; the others are good and far from those chosen before.
-    inputs: number of input photos in a window. trained_on: measurements of the training data, by
-    which windows are ranked. Raises ValueError for fewer photos than inputs.
+    The first window is the best of `ranked_windows`; the others are good and far from the windows
+    chosen before. inputs: number of input photos in a window. trained_on: measurements of the
+    cameras of the training data, by which windows are ranked. Raises ValueError if the scene has
+    fewer photos than `inputs`.
     """
     frusta = Frusta(scene, trained_on)
     ranked = ranked_windows(frusta, inputs)
@@ -75,7 +76,7 @@ def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) ->
 
 
 class PhotoWindows(Span):
-    """View sampler that chooses WINDOWS windows of each scene once, by `spread_windows`."""
+    """View sampler that chooses at most WINDOWS windows of each scene once, by `spread_windows`."""
 
     def __init__(self, trained_on: Domain) -> None:
         super().__init__(Span.Config())
@@ -83,9 +84,9 @@ class PhotoWindows(Span):
         self._known: dict[str, list[Window]] = {}
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
-        """Return the windows of a scene; none for a scene that moves.
+        """Return the windows of a scene; an empty list for a moving scene, whose photos have times.
 
-        Raises ValueError if every photo is an input and none is left to compare with.
+        Raises ValueError if all photos are inputs, so that no photo is left to compare with.
         """
         if scene.times is not None:
             # a moment of a moving scene has few views; the recipe's sampler knows which
@@ -94,8 +95,9 @@ class PhotoWindows(Span):
             windows = spread_windows(scene, views.inputs, self._trained_on, WINDOWS)
             if not any(compared for _, compared in windows):
                 raise ValueError(
-                    f"all {len(scene)} photos are inputs, none is left to compare with: add a "
-                    "photo between them, or view the reconstruction by qgs view MODEL PHOTOS"
+                    f"all {len(scene)} photos are inputs, so no photo is left to compare renders "
+                    "with: add a photo taken between them, or view the reconstruction without a "
+                    "comparison by `qgs view MODEL PHOTOS`"
                 )
             self._known[scene.name] = windows
         return self._known[scene.name]
@@ -104,8 +106,8 @@ class PhotoWindows(Span):
 class ScaleSearch:
     """Replace `scale: search` in settings of views by the scale found for each window.
 
-    A window is the input frames and the compared frames of a scene. found: the scale found for each
-    window, by scene name, inputs and compared frames; no window is searched twice.
+    A window is a scene with its input frames and its compared frames. found: the scale found for
+    each window, by (scene name, inputs, compared frames), so that no window is searched twice.
     """
 
     def __init__(self, model: QueryGaussianModel, views: ViewsConfig) -> None:
@@ -114,7 +116,10 @@ class ScaleSearch:
         self.found: dict[tuple[str, Frames, Frames], FoundScale] = {}
 
     def __call__(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
-        """Return the scale settings for a window of frames; search the scale if they say so."""
+        """Return the settings of views for a window, with a constant scale instead of a search.
+
+        Settings with another scale than `search` are returned unchanged.
+        """
         if self.views.scale != "search":
             return self.views
         key = (scene.name, tuple(inputs), tuple(compared))
@@ -127,10 +132,10 @@ class ScaleSearch:
 class Model:
     """A trained model in a comparison.
 
-    name: short and unique. file: its checkpoint. recipe: that of its training, but with the data of
-    the comparison. search: the network, and the scales found for it. step: number of training
-    steps; None if unknown. windows: how inputs are chosen from a user's photos; None for data of
-    the recipe.
+    name: short and unique. file: checkpoint of the model. recipe: recipe of the training, but with
+    the data of the comparison. search: the network, and the scales found for it. step: number of
+    training steps; None if unknown. windows: chooses inputs and compared photos from a user's
+    photos; None if the scenes are those of the recipe.
     """
 
     name: str
@@ -142,12 +147,12 @@ class Model:
 
     @property
     def network(self) -> QueryGaussianModel:
-        """The model as a module."""
+        """The network as a module."""
         return self.search.model
 
     @cached_property
     def evaluation(self) -> Evaluation:
-        """Scores on the test views of `recipe`. Afterwards the model is on the CPU."""
+        """Scores on the test views of `recipe`. The evaluation leaves the network on the CPU."""
         found = evaluate(
             self.network, self.recipe, self.step, views_of=self.search, sampler=self.windows
         )
@@ -167,15 +172,15 @@ class Model:
 
     @property
     def recipe_text(self) -> str:
-        """The recipe of the comparison as YAML."""
+        """The recipe of the training with the data of the comparison, as YAML."""
         return yaml.safe_dump(dict(self.recipe.tree), sort_keys=False, allow_unicode=True)
 
 
 def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Return short names of models or recipes, numbered where a path is repeated.
+    """Return short names of models or recipes; repeated paths are numbered.
 
-    Common folders and suffixes are left out: `a/x.yaml`, `b/x.yaml`, `b/x.yaml` give a/x, b/x,
-    b/x (2).
+    Common folders and suffixes are left out: `a/x.yaml`, `b/x.yaml` and `b/x.yaml` give the names
+    `a/x`, `b/x` and `b/x (2)`.
     """
     files = [os.path.abspath(path) for path in paths]
     shared = os.path.commonpath([os.path.dirname(file) for file in files])
@@ -186,7 +191,10 @@ def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
 
 
 def checkpoints(names: Sequence[str]) -> dict[str, Path]:
-    """Return the checkpoint file of each model, by its short name (see `checkpoint_path`)."""
+    """Return the checkpoint file of each model, by a short name of the model.
+
+    names: paths, URLs or shipped models, as `checkpoint_path` takes them.
+    """
     return dict(zip(numbered_names(names), map(checkpoint_path, names), strict=True))
 
 
@@ -199,7 +207,8 @@ def open_models(
 ) -> list[Model]:
     """Load models for a comparison on unseen scenes of their data, or on held-out `photos`.
 
-    The parameters and the errors are those of `recipes_alike`.
+    names: run folders, checkpoints, URLs or shipped models. The other arguments and the errors are
+    those of `recipes_alike`.
     """
     files = checkpoints(names)
     recipes = recipes_alike(files, photos, size, overrides)
@@ -218,9 +227,10 @@ def open_models(
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
-    """Return resolved recipes by short name, all with one time budget (seconds) and one seed.
+    """Return checked recipes by short name, all with one time budget (seconds) and one seed.
 
-    Raises ValueError if two recipes differ in more than model, losses and `OF_THE_METHOD`.
+    Raises ValueError if two recipes differ in anything but model, losses and the options in
+    OF_THE_METHOD.
     """
     # a number of steps that no time budget reaches
     overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
@@ -231,7 +241,10 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
 
 
 def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> None:
-    """Raise ValueError if two recipes differ in `sections`; `OF_THE_METHOD` may differ."""
+    """Raise ValueError if two recipes differ in one of `sections`.
+
+    The options in OF_THE_METHOD may differ.
+    """
 
     def compared(section: str, recipe: Recipe) -> dict[str, Any]:
         options = recipe.tree[section] or {}
@@ -244,7 +257,7 @@ def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> No
         if unequal:
             raise ValueError(
                 f"{name} and {first} differ in {', '.join(unequal)}, so their scores cannot be "
-                "compared; make these sections of the recipes equal, or report one model alone"
+                "compared; make these sections of the recipes equal, or report on one model alone"
             )
 
 
@@ -254,13 +267,14 @@ def recipes_alike(
     size: Size | None,
     overrides: Sequence[str] = (),
 ) -> dict[str, Recipe]:
-    """Return the recipes of checkpoints, by name; `photos`, if given, replaces their data.
+    """Return the recipes of checkpoints, by name, with `photos` as their data if they are given.
 
-    files: checkpoint by name. size: (H, W) of the photos in pixels; by default one that all models
-    take and that crops no photo. overrides: settings of `views` for photos, such as a scale.
+    files: checkpoint by name. photos: folder or video; None keeps the data of the recipes. size:
+    (H, W) of the photos in pixels; by default a size that all models take and that crops no photo.
+    overrides: settings of `views` for photos, such as a scale.
 
-    Raises ValueError if recipes differ in how they are evaluated, and what `CheckpointFile` and the
-    readers of photos raise.
+    Raises ValueError if recipes differ in how models are evaluated, and what `CheckpointFile` and
+    the readers of photos raise.
     """
     recipes = dict[str, Recipe]()
     for name, path in files.items():
@@ -276,7 +290,10 @@ def recipes_alike(
 
 
 def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dict[str, Any]:
-    """Return a section `data` that reads `photos` for all `recipes` and holds some photos out."""
+    """Return a recipe section `data` that reads `photos` in a size that all `recipes` take.
+
+    Some photos are held out as targets, unless `photos` are the training data of a recipe.
+    """
     sources = installed_sources()
     trained = [recipe.data_config for recipe in recipes]
     # as a model that was trained on them opens them: its held-out photos are no training data
@@ -301,10 +318,10 @@ def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dic
 def _on_photos(
     recipe: Recipe, photos: str, data: Mapping[str, Any], first: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the tree of `recipe` with photos as its data.
+    """Return the options of `recipe` as a nested dict, with photos as its data.
 
-    photos: their folder. data: section `data` that reads them. first: section `views` of the first
-    recipe, whose choice of views holds for all recipes.
+    photos: folder of the photos, or video. data: recipe section `data` that reads the photos.
+    first: section `views` of the first recipe, whose `gap` and `targets` hold for all recipes.
     """
     plugin = data["type"].split("/")[0]
     own = is_training_data(photos, recipe.data_config)

@@ -1,4 +1,4 @@
-"""Draw loss and PSNR over the steps of trainings."""
+"""Draw training loss and PSNR over the steps of trainings."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,9 +16,9 @@ Curves = Sequence[Mapping[str, Any]]
 
 
 def curves_figure(curves: Mapping[str, Curves]) -> Figure:
-    """Draw loss and PSNR over steps: the values as pale lines, their running means as strong ones.
+    """Draw loss and PSNR over steps: values as pale lines, their running means as strong lines.
 
-    curves: records by model name.
+    curves: records of each training, by name of the model.
     """
     with figure_style():
         figure = Figure(figsize=(7, 2.6), layout="constrained")
@@ -44,10 +44,10 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def curves_of(file: Path) -> Curves:
-    """Return the records of a training without skipped steps; empty if no history is stored.
+    """Return the records of a training without skipped steps; an empty list without a history.
 
-    file: checkpoint NAME.safetensors. Its history is NAME.history.jsonl, or else history.jsonl, in
-    the same folder.
+    file: checkpoint NAME.safetensors. The history is read from NAME.history.jsonl in the same
+    folder, or else from history.jsonl.
     """
     own = file.with_suffix(".history.jsonl")
     records = read_records(own if own.is_file() else file.with_name("history.jsonl"))

@@ -33,12 +33,12 @@ SOLID = 0.1
 
 @dataclass(frozen=True)
 class Choice:
-    """Choices of the user of the viewer.
+    """What the user of the viewer has chosen to show.
 
-    query: index of the picked query; None for all. by_query: colour Gaussians by their query.
+    query: index of the picked query; None for all. by_query: whether to colour Gaussians by query.
     layer: decoder layer whose anchors and attention are shown; 0 is before the first layer. others:
     how the Gaussians of queries that are not picked look. patches: number of lines from the picked
-    query to the patches that it attends to most. anchors, photos: whether they are shown.
+    query to the photo patches that it attends to most. anchors, photos: whether to show them.
     """
 
     query: int | None = None
@@ -60,15 +60,16 @@ def query_color(query: int) -> Color:
 
 
 def query_colors(scene: QueryScene) -> np.ndarray:
-    """Return the colours of all N queries, uint8 (N, 3)."""
+    """Return the colours of all N queries of `scene`, uint8 RGB (N, 3)."""
     colors = [query_color(query) for query in range(scene.queries)]
     return np.array(colors, np.uint8).reshape(-1, 3)
 
 
 def anchor_colors(scene: QueryScene, choice: Choice) -> np.ndarray:
-    """Return the colours of all anchors, uint8 (N, 3).
+    """Return the colours of the anchors of all N queries, uint8 RGB (N, 3).
 
-    If a query is picked, the anchors of all other queries are pale.
+    If a query is picked, the anchors of all other queries are pale, unless `choice.others` is
+    "shown".
     """
     colors = query_colors(scene)
     if choice.query is None or choice.others == "shown":
@@ -82,21 +83,21 @@ def anchor_colors(scene: QueryScene, choice: Choice) -> np.ndarray:
 def faded(
     colors: np.ndarray | Color, strength: float | np.ndarray, scene: QueryScene
 ) -> np.ndarray:
-    """Mix uint8 RGB colours with the background of `scene`.
+    """Mix uint8 RGB colours with the background colour of `scene`.
 
-    strength: share of the colours, from 0 (background) to 1.
+    strength: share of `colors` in the mixture, from 0 (only background) to 1 (only `colors`).
     """
     mixed = strength * np.array(colors) + (1 - strength) * 255 * np.array(scene.background)
     return mixed.round().astype(np.uint8)
 
 
 def ink(scene: QueryScene) -> Color:
-    """Return a colour for lines: light on a dark background, dark on a light one."""
+    """Return the RGB colour for lines over `scene`: light on a dark background, else dark."""
     return INK if np.mean(scene.background) > DARK else (235, 235, 235)
 
 
 def painted(scene: QueryScene, choice: Choice) -> Splats:
-    """Return the Gaussians of `scene`, coloured and faded as `choice` says."""
+    """Return the Gaussians of `scene` in the viewer's world, coloured and faded for `choice`."""
     found = scene.splats
     if not scene.queries:
         return found
@@ -118,10 +119,10 @@ def painted(scene: QueryScene, choice: Choice) -> Splats:
 
 
 class Drawing:
-    """Draw a scene with viser. Drawing a part again replaces it.
+    """Draw a scene with viser. A part that is drawn again replaces the old part.
 
-    photo_depth: distance from a camera to its photo. anchor_radius: radius of the dots of anchors.
-    Both are in units of the viewer's world.
+    photo_depth: distance from a camera at which its photo is drawn. anchor_radius: radius of the
+    dots that show anchors. Both are in units of the viewer's world.
     """
 
     def __init__(self, api: viser.SceneApi) -> None:
@@ -130,7 +131,7 @@ class Drawing:
         self._painted: tuple[Any, ...] = ()
 
     def put(self, scene: QueryScene, choice: Choice) -> None:
-        """Draw a scene in place of the one before."""
+        """Draw a whole scene in place of the scene drawn before."""
         unit = distance_to(scene)
         self.photo_depth = FRUSTUM * unit
         self.anchor_radius = 0.01 * unit
@@ -141,7 +142,7 @@ class Drawing:
         self.update(scene, choice)
 
     def update(self, scene: QueryScene, choice: Choice) -> None:
-        """Draw again what depends on the user's choice: all but the photos and the background."""
+        """Draw everything again but photos and background, which do not depend on `choice`."""
         self._draw_gaussians(scene, choice)
         if (views := self.api.get_handle_by_name("/views")) is not None:
             views.visible = choice.photos
@@ -213,7 +214,10 @@ class Drawing:
         )
 
     def _draw_support(self, scene: QueryScene, query: int, layer: int) -> None:
-        """Draw the support of a query, and the path of its anchor from layer 0 to `layer`."""
+        """Draw the support ellipsoid of a query, and the path of the query's anchor.
+
+        The path leads from layer 0 to `layer`. Nothing is drawn if queries have no anchors.
+        """
         supports = [scene.support(number) for number in range(layer + 1)]
         points = [found.centers[0, query] for found in supports if found is not None]
         found = supports[-1]
@@ -240,10 +244,11 @@ class Drawing:
             self._lines("/path", torch.stack([path[:-1], path[1:]], 1), ink(scene), 3.0)
 
     def _draw_reading(self, scene: QueryScene, query: int, choice: Choice) -> None:
-        """Draw lines from a query to the patches of photos that it attends to most in a layer.
+        """Draw lines from a query to the photo patches that it attends to most in a layer.
 
-        A line starts at the anchor before that layer. Its colour is stronger for more attention,
-        relative to the patch with the most. A square of half the patch's width marks its end.
+        Lines start at the query's anchor before the layer and end in a square of half the patch's
+        width. More attention gives a stronger colour, relative to the patch with the most
+        attention.
         """
         if not choice.layer or not choice.patches:
             return
@@ -267,18 +272,18 @@ class Drawing:
         )
 
     def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
-        """Draw line segments (n, 2, 3), each `width` pixels wide.
+        """Draw n line segments (n, 2, 3), each `width` pixels wide.
 
-        color: uint8 RGB, one for all segments, or (n, 2, 3) for each end.
+        color: uint8 RGB; one colour for all segments, or (n, 2, 3) with a colour for each end.
         """
         points = lines.float().cpu().numpy()
         self.api.add_line_segments(name, points, color, thickness=width, thickness_units="screen")
 
 
 def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
-    """Return the edges of V camera pyramids, as segments (V * 8, 2, 3).
+    """Return the edges of V camera pyramids, 8 for each camera, as segments (V * 8, 2, 3).
 
-    eyes: centres of the cameras, (V, 3). ends: corners of the photos, (V, 4, 3).
+    eyes: centres of the cameras, (V, 3). ends: corners of the photos in space, (V, 4, 3).
     """
     spokes = torch.stack([eyes[:, None].expand_as(ends), ends], 2)
     rims = torch.stack([ends, ends.roll(-1, 1)], 2)
@@ -286,9 +291,10 @@ def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
 
 
 def distance_to(scene: QueryScene) -> float:
-    """Return the median depth of opaque Gaussians in input cameras, in units of the viewer's world.
+    """Return the distance to the scene: the median depth of opaque Gaussians in input cameras.
 
-    Without cameras, return the median distance of the Gaussians from their median position.
+    Without cameras, it is the median distance of opaque Gaussians from their median position. The
+    unit is that of the viewer's world.
     """
     means = scene.gaussians.means[0].detach().cpu()
     # Gaussians that nobody sees may lie anywhere

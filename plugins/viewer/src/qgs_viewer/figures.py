@@ -1,4 +1,4 @@
-"""Draw sections of the report as figures for papers by Matplotlib, as PDF and PNG."""
+"""Draw sections of the report by Matplotlib as figures for papers, in PDF and PNG."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -42,7 +42,7 @@ def write_figures(
     query: int | None,
     notes: Sequence[str],
 ) -> Iterator[str]:
-    """Write figures and figures.md into `folder`; yield one line for each written or omitted file.
+    """Write figures and figures.md into `folder`; yield a line for each written or omitted figure.
 
     names: figures to draw; empty for all. query: index of the query to show; None chooses queries
     that are well visible. notes: sentences for the head of figures.md.
@@ -68,7 +68,7 @@ def write_figures(
 
 
 def grid(section: Section) -> Figure:
-    """Return a Matplotlib figure with a panel, not interpolated, for each tile of `section`."""
+    """Return a Matplotlib figure with a panel for each tile of `section`, without interpolation."""
     columns = max(map(len, section.rows.values()))
     tiles = [tile for tile in next(iter(section.rows.values())) if tile]
     # all pictures of a section have the shape of its first
@@ -100,7 +100,10 @@ def grid(section: Section) -> Figure:
 
 
 def write_figure(figure: Figure, folder: Path, name: str) -> None:
-    """Write NAME.pdf, in which text stays text, and NAME.png. Equal figures give equal bytes."""
+    """Write NAME.pdf, in which text is stored as text, and NAME.png.
+
+    Equal figures give files of equal bytes.
+    """
     # each drawing moves panels a little: both files show one layout
     figure.draw_without_rendering()
     figure.set_layout_engine("none")

@@ -1,4 +1,4 @@
-"""Style pages and figures: colours, Jinja templates, pictures embedded in pages."""
+"""Style of pages and figures: colours, Jinja templates, pictures embedded in pages."""
 
 import base64
 from collections.abc import Callable, Sequence
@@ -34,14 +34,14 @@ def hex_color(color: Color) -> str:
 
 
 def categorical(index: int) -> Color:
-    """Return the RGB colour of the series or query with this index; colours repeat after six."""
+    """Return the RGB colour number `index` of six for series and queries; colours repeat."""
     return CATEGORICAL[index % len(CATEGORICAL)]
 
 
 def running_mean(values: Sequence[float]) -> np.ndarray:
-    """Return the running mean of values, with a centred window of a twentieth of their number.
+    """Return the running mean of `values`, one mean for each value.
 
-    At both ends the window is cut off.
+    The window is centred and covers a twentieth of the values; at both ends it is cut off.
     """
     # an odd number, so that the window has a middle
     window = np.ones(2 * int(len(values) / 40) + 1)
@@ -50,7 +50,10 @@ def running_mean(values: Sequence[float]) -> np.ndarray:
 
 
 def page_environment(**filters: Callable[..., str]) -> Environment:
-    """Return a Jinja environment for the plug-in's templates. filters: functions by name."""
+    """Return a Jinja environment for the templates of this plug-in.
+
+    filters: functions to add as Jinja filters, by name.
+    """
     environment = Environment(
         loader=PackageLoader("qgs_viewer", "template"),
         autoescape=True,
@@ -63,7 +66,7 @@ def page_environment(**filters: Callable[..., str]) -> Environment:
 
 
 def data_uri(image: Picture, photo: bool = False) -> str:
-    """Return the picture as a data URI for HTML: WebP for a large `photo`, otherwise PNG."""
+    """Return a picture as a data URI for HTML: WebP for a large `photo`, otherwise PNG."""
     if not (photo and max(image.shape) > EXACT):
         return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
     buffer = BytesIO()
@@ -72,7 +75,7 @@ def data_uri(image: Picture, photo: bool = False) -> str:
 
 
 def enlarged(picture: Picture, side: int) -> Picture:
-    """Resize the picture (bicubic) so that its longer side has `side` pixels."""
+    """Resize a picture (bicubic) so that its longer side has `side` pixels."""
     height, width = picture.shape[:2]
     factor = side / max(height, width)
     size = (round(width * factor), round(height * factor))

@@ -14,17 +14,17 @@ SIDE = 192
 
 
 def model_html(model: QueryGaussianModel) -> str:
-    """Return HTML with the model's sizes and a table of its components and their parameters."""
+    """Return HTML with the model's sizes and a table of its components with parameter counts."""
     template = page_environment().get_template("model.html")
     return template.render(heading=heading(model), rows=slot_rows(model))
 
 
 @torch.no_grad()
 def prediction_png(prediction: Prediction) -> bytes | None:
-    """Return a PNG of the first scene and its depth, rendered from the origin of its world.
+    """Return a PNG of the first scene's colours and depth, rendered from its world's origin.
 
-    The origin is the first input camera or the mean of all, as the recipe says. None if no
-    Gaussian lies in front of it, or if positions are not finite.
+    The origin is the first input camera or the mean of all input cameras, as the recipe says.
+    Returns None if no Gaussian lies in front of the origin, or if positions are not finite.
     """
     gaussians = prediction.gaussians[:1]
     means = gaussians.means[0].float()
@@ -41,6 +41,6 @@ def prediction_png(prediction: Prediction) -> bytes | None:
 
 
 def show_pictures() -> None:
-    """Let notebooks show models as tables and predictions as pictures from now on."""
+    """Let notebooks show models as tables and predictions as pictures, for the whole process."""
     QueryGaussianModel._repr_html_ = model_html  # type: ignore[attr-defined]
     Prediction._repr_png_ = prediction_png  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Open what `qgs view` shows: a PLY, a finished reconstruction, or a model with photos."""
+"""Open what `qgs view` shows: a file of Gaussians, a reconstruction, or a model with photos."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -41,12 +41,12 @@ SAME = 0.02
 
 @dataclass
 class Source:
-    """Gaussians without a model in the viewer, whose input photos cannot be changed.
+    """Content of the viewer: here, fixed Gaussians without a model.
 
-    `ModelSource` derives from this class and can change them. title: heading of the viewer. notes:
-    remarks for the user. fixed: the Gaussians; None with a model. frames: indices of the first
-    input photos in their scene. labels: a name for every photo of the scene; empty where the inputs
-    cannot be changed.
+    The derived class `ModelSource` reconstructs a scene from photos that the user chooses. title:
+    heading of the viewer. notes: remarks for the user. fixed: the Gaussians to show; None in
+    `ModelSource`. frames: indices of the first input photos in their scene. labels: a name for
+    every photo of the scene; empty if the user cannot change the inputs.
     """
 
     title: str
@@ -56,7 +56,7 @@ class Source:
     labels: Sequence[str] = ()
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
-        """Return the scene reconstructed from the photos `frames`; without a model, always `fixed`.
+        """Return the scene reconstructed from the photos `frames`; always `fixed` without a model.
 
         Raises ValueError for frames that a model cannot take.
         """
@@ -67,7 +67,7 @@ class Source:
 class ModelSource(Source):
     """A model and a scene: the user may choose any photos of the scene as inputs.
 
-    All reconstructions are shown in the world coordinates of the first choice, `frames`.
+    All reconstructions are shown in the world coordinates of the first inputs, `frames`.
     """
 
     def __init__(
@@ -87,13 +87,13 @@ class ModelSource(Source):
         self.world = own_world(scene, tuple(frames), views)
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
-        """Reconstruct from the photos `frames`, and place the result in the viewer's world.
+        """Return the scene reconstructed from the photos `frames`, placed in the viewer's world.
 
-        Raises ValueError if no frames are given, and for frames that are missing, repeated or too
-        many.
+        Raises ValueError if `frames` is empty, has too many frames, or has a frame that does not
+        exist or occurs twice.
         """
         if not frames:
-            raise ValueError("a reconstruction needs an input photo: choose at least one")
+            raise ValueError("a reconstruction needs input photos: choose at least one photo")
         # refuses frames that are not there, twice or too many
         picked, _ = checked_window(len(self.scene), frames)
         world = own_world(self.scene, picked, self.views)
@@ -105,10 +105,10 @@ class ModelSource(Source):
 
 
 def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
-    """Open what `name` says: a file of Gaussians, a reconstruction, a run folder or a model.
+    """Open the file of Gaussians, the reconstruction, the run folder or the model `name`.
 
-    options: passed to `open_model`. Raises ValueError when options are given for a PLY or a
-    reconstruction, which have none, and what the readers of files raise.
+    options: passed to `open_model`. Raises ValueError if options are given for a file of Gaussians
+    or a reconstruction, which take no options, and what the readers of files raise.
     """
     path = Path(name).expanduser()
     finished = is_finished(path)
@@ -116,7 +116,8 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
         return open_model(name, device, **options)
     if given := [option for option, value in options.items() if value]:
         raise ValueError(
-            f"{listed(given)}: only for a model, but {name} holds Gaussians; leave this option out"
+            f"{listed(given)} can be given only for a model, but {name} holds finished Gaussians: "
+            "leave the option out, or name a model"
         )
     if finished:
         return open_finished(path, device)
@@ -136,11 +137,11 @@ def open_model(
     size: Size | None = None,
     overrides: Sequence[str] = (),
 ) -> Source:
-    """Open a model on the scene of `photos`, by default on a test scene of its recipe's data.
+    """Open a model on a scene of `photos`, by default on a test scene of the recipe's data.
 
-    The remaining arguments are the options of `qgs view` with these names. scene: name of one scene
-    among several. frames: indices or files of the input photos; None chooses them. inputs: their
-    number. size: (H, W) of the photos in pixels. overrides: settings of `views`, as `KEY=VALUE`.
+    The other arguments are the options of `qgs view` with these names. scene: name of the scene;
+    None takes the first. frames: indices or files of the input photos; None chooses `inputs` of the
+    photos. size: (H, W) of the photos in pixels. overrides: settings of `views`, as `KEY=VALUE`.
     """
     with CheckpointFile(name) as file:
         model = file.model(device)
@@ -174,27 +175,31 @@ def open_model(
 
 
 def _scene(recipe: Recipe, photos: str | None, size: Size | None, name: str | None) -> Scene:
-    """Return the scene of the folder `photos`, or without photos a scene of the recipe's data.
+    """Return a scene of the folder `photos`; if it is None, a scene of the recipe's data.
 
-    name: None is the first test scene. Raises ValueError if photos are not given and the recipe has
-    no data, or `size` is given.
+    name: name of the scene; None takes the first test scene. Raises ValueError if `photos` is None
+    and the recipe has no data or `size` is given.
     """
     if photos is not None:
         return chosen_scene(recipe, photos, size, name)[0]
     if recipe.data_config is None:
         raise ValueError(
-            "the checkpoint's recipe has no data: name a folder of photos after the checkpoint"
+            "the checkpoint's recipe has no data to show: add a folder of photos after the "
+            "checkpoint"
         )
     data = recipe.build_data()
     if size is not None:
-        raise ValueError("--size is for photos: name a folder of photos, or leave --size out")
+        raise ValueError(
+            "--size has an effect only on your own photos: give a folder of photos, or leave "
+            "--size out"
+        )
     if name is not None:
         return named_scene(data, "the data of the recipe", name)
     return data.scenes("test" if data.names("test") else "train")[0]
 
 
 def is_finished(folder: Path) -> bool:
-    """Return whether `folder` holds a finished reconstruction: its PLY and its cameras.json."""
+    """Return True if `folder` holds a finished reconstruction: gaussians.ply and cameras.json."""
     return (folder / CAMERAS).is_file() and (folder / PLY).is_file()
 
 
@@ -211,14 +216,17 @@ class FinishedScene(Scene):
 
     @property
     def cameras(self) -> Cameras:
-        """Cameras (V,) of all views in cameras.json."""
+        """Cameras (V,) of all V views in cameras.json."""
         c2w = torch.tensor([view["c2w"] for view in self._views], dtype=torch.float64)
         lenses = torch.tensor([view["intrinsics"] for view in self._views], dtype=torch.float64)
         height, width = self._views[0]["size"]
         return Cameras(c2w, lenses, (height, width))
 
     def images(self, frames: Sequence[int]) -> Tensor:
-        """Load photos (V, 3, H, W), the left halves of the pictures in the folder views/."""
+        """Load the photos (V, 3, H, W) of V frames.
+
+        They are the left halves of the pictures in the folder views/.
+        """
         height, width = self.cameras.size
         pictures = []
         for view in (self._views[frame] for frame in frames):
@@ -229,18 +237,18 @@ class FinishedScene(Scene):
         return to_tensor(np.stack(pictures))
 
     def label(self, frame: int) -> str:
-        """Return the file of the photo, or its number in the original scene.
+        """Return the file of a photo; if unknown, its frame number in the original scene.
 
-        frame: index in cameras.json, which may differ from that number.
+        frame: index of the view in cameras.json, which may differ from the frame number.
         """
         view = self._views[frame]
         return str(view.get("photo") or f"frame {view['frame']}")
 
 
 def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str, Any]]:
-    """Read the Gaussians, the photos and cameras.json of a reconstruction; queries are not stored.
+    """Read the Gaussians, the photos and cameras.json of a finished reconstruction.
 
-    Raises ValueError that names the broken file.
+    Queries are not stored there. Raises ValueError that names the broken file.
     """
     path = folder / CAMERAS
     gaussians = load_ply(folder / PLY)
@@ -263,9 +271,10 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
 
 
 def open_finished(folder: Path, device: str) -> Source:
-    """Open a reconstruction; show its queries if its model can be loaded and makes it again.
+    """Open a finished reconstruction, with its queries if its model is known.
 
-    Otherwise the Gaussians of the PLY are shown, with a note on the reason.
+    The model must make the same Gaussians again. Otherwise the Gaussians of the PLY file are shown
+    without queries, with a note on the reason.
     """
     plain, scene, record = read_finished(folder)
     title = f"{scene.name} ({folder.name})"
@@ -286,17 +295,18 @@ def _with_queries(
 ) -> ModelSource:
     """Return the reconstruction `plain` with the model that made it, whose queries can be shown.
 
-    record: cameras.json. Raises ValueError or OSError if the model is unknown or cannot be read,
-    or if it makes other Gaussians.
+    record: content of cameras.json. Raises ValueError or OSError if the model is unknown or cannot
+    be read, or if it now makes other Gaussians than those of `plain`.
     """
     for change in ("refinement", "tuning"):
         if record.get(change):
-            raise ValueError(f"{change} on photos changed the Gaussians that the model made.")
+            raise ValueError(f"the Gaussians were changed by {change} after the model made them.")
     name = str(record.get("model") or "")
     # nothing is fetched because a file says so
     if not name or "://" in name:
         raise ValueError(
-            f"the model is {name or 'not known'}: `qgs view MODEL PHOTOS` shows queries."
+            f"the model that made the Gaussians is {name or 'not known'}; to see queries, use "
+            "`qgs view MODEL PHOTOS`."
         )
     with CheckpointFile(name) as file:
         model = file.model(device)
@@ -309,5 +319,5 @@ def _with_queries(
     # medians: a few far Gaussians would hide any difference
     spread = (means - means.median(1, keepdim=True).values).norm(dim=-1).median()
     if made.shape != means.shape or (made - means).norm(dim=-1).median() > SAME * spread:
-        raise ValueError(f"{name} has changed and no longer makes these Gaussians.")
+        raise ValueError(f"the model {name} has changed and no longer makes these Gaussians.")
     return source

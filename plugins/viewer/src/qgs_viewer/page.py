@@ -1,4 +1,4 @@
-"""Serve scenes by viser without its output, set the first viewpoint, write scenes as HTML pages."""
+"""Show scenes in the browser: viser servers, first viewpoints, HTML pages of scenes."""
 
 import http
 import io
@@ -31,10 +31,10 @@ FIELD_OF_VIEW = 0.95
 def quiet_server(
     host: str = "127.0.0.1", port: int = 0, label: str | None = None
 ) -> Iterator[viser.ViserServer]:
-    """Run a viser server inside the block, and print nothing.
+    """Run a viser server inside the block, without the lines that viser prints.
 
-    port: the first port to try; later ones follow until one is free. 0 takes any free port. label:
-    title of the page. Only the page of this server may connect to it (see `foreign`).
+    port: the first port to try; if it is taken, the next free port is used. 0 takes any free port.
+    label: title of the page. Only pages of this server may connect to it (see `foreign`).
     """
     # a message that is none ends its connection, which is no news
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
@@ -55,11 +55,11 @@ def quiet_server(
 
 
 def foreign(headers: Mapping[str, str], host: str) -> bool:
-    """Return whether to refuse a request: it comes from another page or by another host name.
+    """Return True for a request to refuse: from a page of another server, or by a wrong host name.
 
-    Another page that is open in the browser could otherwise read the scene. By a host name that
-    resolves to this machine (DNS rebinding) such a page would look like the server's own. Names of
-    the server are: IP addresses, localhost, the name of this machine, and `host`.
+    Such a page, open in the same browser, could otherwise read the scene. With a host name of its
+    own that resolves to this machine (DNS rebinding), it would look like a page of this server.
+    Right host names are IP addresses, localhost, the name of this machine, and `host`.
     """
     named = headers.get("Host", "")
     origin = headers.get("Origin")
@@ -77,7 +77,10 @@ def foreign(headers: Mapping[str, str], host: str) -> bool:
 
 
 def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options: Any) -> Any:
-    """Call `serve` (`websockets.asyncio.server.serve`) so that it refuses `foreign` requests."""
+    """Call `serve` so that the server answers requests that are `foreign` with status 403.
+
+    serve: the function `websockets.asyncio.server.serve`. host: see `foreign`.
+    """
 
     def checked(connection: Any, request: Any) -> Any:
         if foreign(request.headers, host):
@@ -89,7 +92,7 @@ def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options
 
 
 def stand(server: viser.ViserServer, scene: QueryScene) -> None:
-    """Set the camera with which a browser first shows the scene (see `first_eye`)."""
+    """Set the camera from which a browser shows the scene at first (see `first_eye`)."""
     eye, target = first_eye(scene)
     up = up_of(scene).numpy()
     server.scene.set_up_direction(up)
@@ -103,7 +106,7 @@ def stand(server: viser.ViserServer, scene: QueryScene) -> None:
 def up_of(scene: QueryScene) -> torch.Tensor:
     """Return the mean up direction of the input cameras, a unit vector (3,) in the viewer's world.
 
-    Without cameras it is -y.
+    Without cameras, the up direction is -y.
     """
     if scene.views is None:
         return torch.tensor([0.0, -1.0, 0.0]).double()
@@ -114,8 +117,8 @@ def up_of(scene: QueryScene) -> torch.Tensor:
 def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
     """Return the first viewpoint and the point that it looks at, both (3,) in the viewer's world.
 
-    The viewpoint lies a little behind the input camera nearest to the mean of all. If the cameras
-    are far apart and do not look at one point, it lies before that camera, since a wall may be
+    The viewpoint lies a little behind the most central input camera. If the cameras are far apart
+    and do not look at one point, the viewpoint lies in front of that camera, since a wall may be
     behind it.
     """
     unit = distance_to(scene)
@@ -137,10 +140,10 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
-    """Return an HTML page in which `scene` can be turned and filmed.
+    """Return an HTML page of `scene`, which a reader can turn and film.
 
-    Its size is 0.8 MB and 40 bytes for each Gaussian. choice: what is shown; by default all
-    Gaussians, and the anchors after the last layer.
+    The page has 0.8 MB and 40 bytes for each Gaussian. choice: what is shown; by default all
+    Gaussians in their own colours, and the anchors after the last layer.
     """
     with quiet_server() as server:
         stand(server, scene)
@@ -152,8 +155,8 @@ def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
 
 
 def gaussians_html(gaussians: Gaussians, views: Views, background: Background = NEUTRAL) -> str:
-    """Return an HTML page with Gaussians (1, G) and photos (1, V) at their cameras.
+    """Return an HTML page that shows G Gaussians and, at their cameras, V photos of one scene.
 
-    background: RGB in [0, 1].
+    gaussians: (1, G). views: (1, V). background: RGB in [0, 1].
     """
     return scene_html(QueryScene(gaussians, views, background=background))

@@ -1,4 +1,4 @@
-"""Show the viewer's controls: what is visible, the picked query, the input photos."""
+"""Controls of the viewer: what is shown, which query is picked, which photos are inputs."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ NONE = -1
 
 
 class Panel:
-    """The viewer of one source: its scene, its controls, and the user's choices."""
+    """The viewer of one `Source`: its scene, its controls, and the user's choices."""
 
     def __init__(self, server: viser.ViserServer, source: Source) -> None:
         self.server = server
@@ -104,7 +104,7 @@ class Panel:
                 self.boxes.append(box)
 
     def _bind(self, name: str, control: Any) -> None:
-        """Let `control` set the field `name` of `Choice`."""
+        """Make changes of `control` set the field `name` of `self.choice`."""
         control.on_update(lambda _: self.choose(**{name: control.value}))
 
     def _typed(self, event: Any) -> None:
@@ -116,14 +116,14 @@ class Panel:
             self.choose(query=number)
 
     def choose(self, **changes: Any) -> None:
-        """Change fields of `choice`, and draw what they change."""
+        """Change fields of `self.choice`, and draw again what depends on them."""
         with self._lock:
             choice = replace(self.choice, **changes)
             if choice != self.choice:
                 self._show(self.drawing.update, self.scene, choice)
 
     def pick(self, query: int | None) -> None:
-        """Pick a query; None shows all queries."""
+        """Pick the query with the index `query`; None shows all queries."""
         # setting the field calls `_typed`
         self.number.value = NONE if query is None else query
 
@@ -137,7 +137,10 @@ class Panel:
                 self._show(self.drawing.put, self.source.scene_of(frames), self.choice)
 
     def _show(self, draw: Callable[..., None], scene: QueryScene, choice: Choice) -> None:
-        """Call `draw` and describe the picked query. If this fails, the state does not change."""
+        """Draw a scene, describe the picked query, and store `scene` and `choice`.
+
+        If drawing fails, the stored scene and choice do not change.
+        """
         with self.server.atomic():
             draw(scene, choice)
             if scene.queries:
@@ -154,7 +157,10 @@ class Panel:
         self._text.content = "" if query is None else description(scene, query, layer)
 
     def _reframed(self, event: Any) -> None:
-        """Reconstruct from the ticked photos; if this fails, keep the last scene and say why."""
+        """Reconstruct from the ticked photos, and show the result.
+
+        If this fails, the last scene stays, and a notification in the browser gives the error.
+        """
         try:
             self.take([frame for frame, box in enumerate(self.boxes) if box.value])
         except (ValueError, OSError) as error:
@@ -167,10 +173,10 @@ class Panel:
             self.pick(query)
 
     def under(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
-        """Return the query whose anchor or Gaussian a ray hits; None if it hits nothing.
+        """Return the query whose anchor or Gaussian a ray hits; None if the ray hits nothing.
 
-        origin, direction: start and direction of the ray, both (3,) in the viewer's world. Anchors
-        precede Gaussians.
+        origin, direction: start and direction of the ray, both (3,) in the viewer's world. An
+        anchor is hit before any Gaussian.
         """
         # anchors are drawn over Gaussians, so they are hit first
         found = self.scene.support(self.choice.layer) if self.choice.anchors else None
@@ -193,7 +199,10 @@ def plain(text: str) -> str:
 
 
 def description(scene: QueryScene, query: int, layer: int) -> str:
-    """Describe a query in Markdown: its Gaussians, its anchor, and, if it has no attention, why."""
+    """Describe a query in Markdown: its Gaussians, and its anchor after `layer`.
+
+    If the query's attention cannot be shown, the text says why.
+    """
     members = scene.members(query)
     lines = [f"**query {query}**, layer {layer}"]
     lines.append(f"Gaussians {members.start} to {members.stop - 1}")

@@ -1,4 +1,4 @@
-"""Place Gaussians, cameras and photos in the viewer's world, and pick a Gaussian by a ray."""
+"""Place Gaussians, cameras and photos in the viewer's world; find the Gaussian on a ray."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ FLOAT16 = 2.0**15
 
 @dataclass(frozen=True)
 class Placement:
-    """Similarity from one world to another: p -> scale * rotation p + translation, in float64."""
+    """Similarity transform between two worlds, float64: p -> scale * rotation p + translation."""
 
     rotation: Tensor
     translation: Tensor
@@ -32,9 +32,9 @@ class Placement:
 
     @staticmethod
     def between(world: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> "Placement":
-        """Return the map from the world of one reconstruction into that of another.
+        """Return the transform from the world of one reconstruction into the world of another.
 
-        world, other: pose and scale of the two worlds as `own_world` returns them.
+        world, other: pose and scale of the first and the second world, as `own_world` returns them.
         """
         pose, scale = world
         other_pose, other_scale = other
@@ -44,19 +44,19 @@ class Placement:
         return Placement(both[:3, :3], both[:3, 3] * float(other_scale), factor)
 
     def points(self, points: Tensor) -> Tensor:
-        """Map points (..., 3) into the other world."""
+        """Transform points (..., 3)."""
         return self.scale * points.detach().cpu().double() @ self.rotation.mT + self.translation
 
     def vectors(self, columns: Tensor) -> Tensor:
-        """Map vectors, the columns of (..., 3, n): rotate and scale them, without translation."""
+        """Rotate and scale n vectors, the columns of (..., 3, n), without translation."""
         return self.scale * self.rotation @ columns.detach().cpu().double()
 
 
 @dataclass(frozen=True)
 class Splats:
-    """G Gaussians for viser: float32 centres (G, 3), covariances (G, 3, 3), opacities (G, 1).
+    """G Gaussians in the form that viser takes, all in float32.
 
-    colors: RGB (G, 3) in [0, 1].
+    centers: (G, 3). covariances: (G, 3, 3). opacities: (G, 1). colors: RGB (G, 3) in [0, 1].
     """
 
     centers: np.ndarray
@@ -66,19 +66,20 @@ class Splats:
 
     @property
     def magnification(self) -> float:
-        """Factor by which lengths are multiplied so that covariances fit into float16.
+        """Factor to multiply lengths by, so that covariances fit into float16.
 
-        The largest covariance is then near the maximum of float16, and standard deviations that are
-        10,000 times smaller do not vanish.
+        The factor brings the largest covariance near the maximum of float16. Standard deviations
+        that are 10,000 times smaller than the largest then do not vanish.
         """
         return float(np.sqrt(FLOAT16 / max(np.abs(self.covariances).max(), 1e-30)))
 
 
 @full_precision
 def splats(gaussians: Gaussians, placement: Placement) -> Splats:
-    """Place the Gaussians (1, G) of one scene in the viewer's world.
+    """Return the Gaussians (1, G) of one scene, placed in the viewer's world.
 
-    Colours do not depend on the direction: a warning says so if the Gaussians have `sh`.
+    Their colours do not depend on the direction. A warning says so if `gaussians` has spherical
+    harmonics.
     """
     if gaussians.sh is not None:
         warn_once(
@@ -102,9 +103,9 @@ def _array(tensor: Tensor) -> np.ndarray:
 def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
     """Return the index of the Gaussian with the largest blending weight on a ray.
 
-    None if all weights are below LEAST_WEIGHT. The alpha of a Gaussian is its greatest value along
-    the ray; alphas are blended from near to far. origin, direction: start and direction of the ray,
-    both (3,).
+    Returns None if all weights are below LEAST_WEIGHT. The alpha of a Gaussian is its greatest
+    value along the ray; alphas are blended from near to far. origin, direction: start and direction
+    of the ray, both (3,).
     """
     offsets = origin - found.centers.astype(np.float64)
     # flat Gaussians have no inverse
@@ -126,7 +127,10 @@ def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
 
 @full_precision
 def on_photo(cameras: Cameras, pixels: Tensor, depth: float) -> Tensor:
-    """Return the world points (V, P, 3) that cameras (V,) see in pixels (P, 2) at z = `depth`."""
+    """Return the world points (V, P, 3) of P pixels in V cameras, at the depth z = `depth`.
+
+    cameras: (V,). pixels: (P, 2), the same pixels in all cameras.
+    """
     focal = cameras.intrinsics[:, None, :2]
     principal = cameras.intrinsics[:, None, 2:]
     flat = (pixels.to(focal) - principal) / focal * depth
@@ -135,15 +139,15 @@ def on_photo(cameras: Cameras, pixels: Tensor, depth: float) -> Tensor:
 
 
 def corners(size: tuple[int, int]) -> Tensor:
-    """Return the corners of a picture of `size` (H, W) in pixels: (4, 2), clockwise from (0, 0)."""
+    """Return the corners (4, 2) of a picture in pixels (x, y), clockwise from (0, 0)."""
     height, width = size
     return torch.tensor([[0, 0], [width, 0], [width, height], [0, height]]).double()
 
 
 def patch_centers(grid: tuple[int, int, int], size: tuple[int, int]) -> Tensor:
-    """Return the centres of the patches of one photo in pixels (x, y): (rows * columns, 2).
+    """Return the centres of all patches of one photo in pixels (x, y): (rows * columns, 2).
 
-    grid: number of views, rows and columns. size: (H, W) of the photo in pixels.
+    grid: numbers of photos, of patch rows and of patch columns. size: (H, W) of a photo in pixels.
     """
     _, rows, columns = grid
     height, width = size

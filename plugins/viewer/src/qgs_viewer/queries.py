@@ -1,4 +1,4 @@
-"""Draw queries on photos: their anchors and supports, their attention, their Gaussians."""
+"""Draw queries on photos: anchors, support ellipsoids, attention, Gaussians."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,10 +32,11 @@ FARTHEST = 1e4
 def outline(support: SpatialSupport, query: int, cameras: Cameras) -> Tensor | None:
     """Return the outline of a query's support ellipsoid in a photo: pixels (OUTLINE_POINTS, 2).
 
-    None if a part of the ellipsoid lies behind the camera. cameras: (1, 1), that of the photo.
+    Returns None if a part of the ellipsoid lies behind the camera. cameras: (1, 1), the camera of
+    the photo.
 
     In coordinates in which the ellipsoid is the unit ball, a camera at e sees as outline the circle
-    with centre e / |e|^2 and radius sqrt(1 - 1 / |e|^2), at right angles to e.
+    with centre e / |e|^2 and radius sqrt(1 - 1 / |e|^2), in a plane at right angles to e.
     """
     center = support.centers[0, query]
     axes = support.axes[0, query]
@@ -54,9 +55,10 @@ def outline(support: SpatialSupport, query: int, cameras: Cameras) -> Tensor | N
 
 
 def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
-    """Return pixels (P, 2) of world points (P, 3) in the first of cameras (1, V).
+    """Return the pixels (P, 2) of P world points (P, 3) in the first of V cameras (1, V).
 
-    Depths in the camera are at least 0.001, so that points behind it have a pixel.
+    Depths in the camera below 0.001 are set to 0.001, so that points behind the camera have a pixel
+    too.
     """
     in_camera = to_camera(points[None], cameras)[0, 0]
     in_camera = torch.cat([in_camera[:, :2], in_camera[:, 2:].clamp_min(1e-3)], -1)
@@ -65,7 +67,7 @@ def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
 
 
 def washed(picture: Picture, strength: float = 0.6) -> Picture:
-    """Return the picture in grey as a background to draw on.
+    """Return `picture` in grey, mixed with white, as a background to draw on.
 
     strength: share of white in each pixel, from 0 to 1.
     """
@@ -75,7 +77,7 @@ def washed(picture: Picture, strength: float = 0.6) -> Picture:
 
 
 def _oversampled(picture: Picture) -> Image.Image:
-    """Return the picture enlarged OVERSAMPLING times; `_reduced` undoes this."""
+    """Return `picture`, OVERSAMPLING times as large; `_reduced` restores the size."""
     return Image.fromarray(enlarged(picture, OVERSAMPLING * max(picture.shape[:2])))
 
 
@@ -89,7 +91,8 @@ def support_picture(
 ) -> Picture:
     """Draw all anchors as dots on a photo, and the supports of some queries as ellipses.
 
-    cameras: (1, 1), that of the photo. colors: the queries with an ellipse, by index, in RGB.
+    cameras: (1, 1), the camera of the photo. colors: RGB colours of the queries whose support is
+    drawn, by index of the query.
     """
     scale = OVERSAMPLING * photo.shape[1] / cameras.size[1]
     depths = to_camera(support.centers[:1], cameras)[0, 0, :, 2]
@@ -115,19 +118,21 @@ def support_picture(
 
 
 def patch_maps(rows_hM: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
-    """Return the mean over heads of scores (h, M), as one map for each view: (V, H/P, W/P).
+    """Return attention scores, averaged over heads, as maps of V photos: (V, rows, columns).
 
-    Scores belong to the M = V * H/P * W/P patches of the photos. A head with score -inf is masked
-    and left out of the mean; a patch that is masked in all heads has NaN.
+    rows_hM: scores (h, M) of h heads for the M patches of all V photos. grid: (V, rows, columns),
+    with M as product. A score of -inf is masked and left out of the mean; a patch that is masked in
+    all heads is NaN.
     """
     scores = rows_hM.detach().float().cpu()
     return scores.masked_fill(scores.isinf(), torch.nan).nanmean(0).reshape(grid).numpy()
 
 
 def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]:
-    """Turn each photo pale grey and colour it by its map: more colour for larger values.
+    """Turn each photo pale grey, and colour its patches more strongly for larger values of its map.
 
-    All photos share one scale, from the least to the greatest value. Patches with NaN are grey.
+    maps: (V, rows, columns), one map for each photo. All photos share one scale, from the least to
+    the greatest value of all maps. Patches with NaN are grey.
     """
     seen = maps[np.isfinite(maps)]
     low = float(seen.min()) if seen.size else 0.0
@@ -148,9 +153,10 @@ def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]
 
 @dataclass(frozen=True)
 class DrawnQuery:
-    """A query in a figure: its index, its colour (RGB) and its dispersion.
+    """A query in a figure.
 
-    dispersion: mean distance of its Gaussians from their centroid, in world units.
+    index: number of the query. color: RGB. dispersion: mean distance of the query's Gaussians from
+    their centroid, in world units.
     """
 
     index: int
@@ -159,9 +165,9 @@ class DrawnQuery:
 
 
 def colored_queries(gaussians: Gaussians, count: int, chosen: Sequence[int]) -> list[DrawnQuery]:
-    """Return the queries `chosen` with their dispersion; colours follow the order in `chosen`.
+    """Return the queries `chosen` with colours in the order of `chosen`, and with dispersions.
 
-    gaussians: (B, G), of which the first scene counts. count: queries of that scene.
+    gaussians: (B, G); only the first scene is used. count: number of all queries of a scene.
     """
     distances = token_dispersion(gaussians.means.detach(), gaussians.count // count)[0]
     mean = distances.view(count, -1).mean(1)
@@ -169,7 +175,10 @@ def colored_queries(gaussians: Gaussians, count: int, chosen: Sequence[int]) -> 
 
 
 def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return the blending weight (B, G) of each Gaussian, summed over all pixels of all views."""
+    """Return the blending weight (B, G) of each Gaussian, summed over pixels and views.
+
+    cameras: the views to render, (B, V).
+    """
     # it is the gradient of a render's sum by the colours
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
@@ -179,18 +188,18 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
 
 
 def _painted(gaussians: Gaussians, colors: Tensor) -> Gaussians:
-    """Return the Gaussians with `colors`, the same from all directions."""
+    """Return the Gaussians with `colors` as their colours from all directions."""
     return replace(gaussians, colors=colors, sh=None, features=None)
 
 
 def notable_queries(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
 ) -> list[DrawnQuery]:
-    """Choose `count` queries to show in the first of cameras (1, V).
+    """Choose `count` queries to show in the first of V cameras (1, V).
 
     Preferred are queries with large blending weights whose Gaussians lie, on average, away from the
     border of the picture and away from queries chosen before. Queries with a Gaussian wider than
-    half the picture (4 sigma) are taken only when others do not suffice.
+    half the picture (4 sigma) are chosen only if there are too few other queries.
     """
     per_query = model.head.gaussians_per_query
     weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().unflatten(0, (-1, per_query))
@@ -213,9 +222,9 @@ def notable_queries(
 
 
 def _widths(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return the widths (G,) of Gaussians in the first view as shares of its longer side.
+    """Return the widths (G,) of G Gaussians in the first view, as shares of its longer side.
 
-    The width is 4 sigma of the longest axis; 0 for Gaussians behind the camera.
+    The width is 4 sigma of a Gaussian's longest axis; 0 for Gaussians behind the camera.
     """
     depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2]
     focal = cameras.intrinsics[0, 0, :2].mean()
@@ -231,7 +240,7 @@ def query_picture(
 ) -> Picture:
     """Draw the Gaussians of the queries `chosen` in colour over the scene in grey.
 
-    Lines lead from each Gaussian to the centroid of its query's Gaussians.
+    Lines lead from each coloured Gaussian to the centroid of the Gaussians of its query.
     """
     scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
     per_query = model.head.gaussians_per_query
@@ -262,11 +271,12 @@ def query_picture(
 def attention_pictures_of(
     scene: QueryScene, query: int, layer: int, side: int
 ) -> dict[str, list[Picture]]:
-    """Return the input photos coloured by what a query attends to, averaged over heads.
+    """Return the input photos, coloured by what a query attends to (mean over heads).
 
-    Keys are those of `PARTS`: content logits, geometry bias, and the attention that results. Parts
-    that the model does not have are missing; without attention the result is empty. layer: number
-    of the decoder layer, from 1. side: pixels on the longer side of each photo.
+    The result has a list of pictures for each key of PARTS: content logits, geometry bias, and the
+    attention that results from both. A part that the model does not have is missing; without
+    attention the result is empty. layer: number of the decoder layer, from 1. side: pixels on the
+    longer side of each picture.
     """
     found = scene.attention(query, layer)
     if found is None or scene.views is None:

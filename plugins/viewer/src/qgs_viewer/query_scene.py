@@ -1,4 +1,4 @@
-"""Hold a reconstructed scene with its queries: their supports and their attention."""
+"""A reconstructed scene with its queries: their supports and their attention."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,10 +20,10 @@ NEUTRAL: Background = RendererConfig().background
 
 @dataclass(frozen=True)
 class Inside:
-    """The model of a scene, with its intermediate results.
+    """The model that made a scene, with its intermediate results.
 
-    memory: tokens of the input photos. states: query states before the first decoder layer and
-    after each layer.
+    memory: tokens of the input photos. states: states of the queries before the first decoder layer
+    and after each layer.
     """
 
     model: QueryGaussianModel
@@ -33,10 +33,10 @@ class Inside:
 
 @dataclass(frozen=True)
 class Reading:
-    """The k patches that a query attends to most.
+    """The k photo patches that a query attends to most.
 
-    points: their centres (k, 3) in the viewer's world. shares: the query's attention to each, (k,).
-    side: width of a patch in the viewer's world.
+    points: centres of the patches in space, (k, 3), in the viewer's world. shares: the query's
+    attention to each patch, (k,). side: width of a patch in the viewer's world.
     """
 
     points: Tensor
@@ -48,10 +48,10 @@ class Reading:
 class QueryScene:
     """A reconstruction: Gaussians (1, G), the input views (1, V), and the model's queries.
 
-    frames: indices of the input views in their scene. placement: map from the world of the
-    Gaussians and views into the viewer's world. inside: the model and its states; None if only the
-    Gaussians are known, and then there are no queries. background: RGB in [0, 1] behind the
-    Gaussians.
+    frames: indices of the input views in their scene. placement: transform from the world of the
+    Gaussians and views into the viewer's world. inside: the model and its intermediate results;
+    None if only the Gaussians are known, and then there are no queries. background: RGB in [0, 1]
+    behind the Gaussians.
     """
 
     gaussians: Gaussians
@@ -64,16 +64,16 @@ class QueryScene:
 
     @property
     def queries(self) -> int:
-        """Number of queries; 0 without a model."""
+        """Number of queries of the model; 0 if the model is not known."""
         return self.inside.states[0].features.shape[1] if self.inside else 0
 
     @property
     def depth(self) -> int:
-        """Number of decoder layers; 0 without a model."""
+        """Number of decoder layers of the model; 0 if the model is not known."""
         return self.inside.model.depth if self.inside else 0
 
     def refuse_missing(self, query: int | None) -> None:
-        """Raise ValueError if the scene has no query with this index; None passes."""
+        """Raise ValueError if the scene has no query with the index `query`. None is accepted."""
         if query is not None and query >= self.queries:
             last = self.queries - 1
             there = f"queries are 0 to {last}" if self.queries else "this source has no queries"
@@ -85,25 +85,25 @@ class QueryScene:
         return splats(self.gaussians, self.placement)
 
     def query_of(self, gaussian: int) -> int:
-        """Return the index of the query that made the Gaussian with this index."""
+        """Return the index of the query that made the Gaussian with the index `gaussian`."""
         # Gaussians lie query by query, as many of each
         return gaussian * self.queries // self.gaussians.count
 
     def members(self, query: int) -> slice:
-        """Return the indices of the Gaussians that a query made."""
+        """Return the indices of the Gaussians that the query with the index `query` made."""
         each = self.gaussians.count // self.queries
         return slice(query * each, (query + 1) * each)
 
     @property
     def has_anchors(self) -> bool:
-        """True if every query has an anchor, a point in space."""
+        """True if every query has an anchor, a point in space; False if none has."""
         return self.support(0) is not None
 
     def support(self, layer: int) -> SpatialSupport | None:
-        """Return the supports (1, N) of all queries in the viewer's world, float64.
+        """Return the support ellipsoids of all N queries in the viewer's world, (1, N), float64.
 
-        layer: decoder layer after which they are taken; 0 is before the first. None if the queries
-        have no anchors.
+        layer: decoder layer after which the supports are taken; 0 is before the first layer.
+        Returns None if the queries have no anchors, or if the model is not known.
         """
         if self.inside is None:
             return None
@@ -116,8 +116,9 @@ class QueryScene:
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
         """Return the cross-attention of a query in a layer to all patches of `grid`: (1, h, 1, M).
 
-        None in layer 0, which does not attend, without a model, if the tokens are not patches of
-        photos, and if the decoder does not report its attention.
+        The h heads attend to M patches. Returns None if the model is not known, in layer 0 (before
+        the first layer), if tokens are not patches of photos, or if the decoder does not report
+        attention.
         """
         inside = self.inside
         if inside is None or inside.memory.grid is None or self.views is None or not layer:
@@ -131,7 +132,7 @@ class QueryScene:
 
     @property
     def grid(self) -> tuple[int, int, int]:
-        """Shape of the patches of all input photos: (V, H/P, W/P), with P pixels on a side."""
+        """Numbers of input photos, of patch rows and of patch columns in each photo."""
         assert self.inside is not None
         assert self.inside.memory.grid is not None
         return self.inside.memory.grid
@@ -139,7 +140,8 @@ class QueryScene:
     def hub(self, query: int, layer: int) -> Tensor:
         """Return the point (3,) at which lines from a query start, in the viewer's world.
 
-        It is the anchor after `layer`, or the mean of the query's Gaussians if it has no anchor.
+        The point is the query's anchor after `layer`; for a query without anchor, it is the mean
+        position of the query's Gaussians.
         """
         found = self.support(layer)
         if found is not None:
@@ -147,9 +149,10 @@ class QueryScene:
         return self.placement.points(self.gaussians.means[0, self.members(query)]).mean(0)
 
     def strongest(self, query: int, layer: int, count: int, depth: float) -> Reading | None:
-        """Return the `count` patches that a query attends to most, averaged over heads.
+        """Return the `count` photo patches that a query attends to most, averaged over heads.
 
-        depth: distance from a camera to its photo in the viewer's world. None as for `attention`.
+        depth: distance from a camera at which its photo is drawn, in the viewer's world. Returns
+        None if `attention` does.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:
@@ -172,10 +175,10 @@ def explained(
     frames: Sequence[int],
     placement: Placement | None = None,
 ) -> QueryScene:
-    """Reconstruct views (1, V) by `model`, and keep the states of its queries after each layer.
+    """Reconstruct a scene from V views (1, V) by `model`, with its queries after each layer.
 
-    frames: indices of the views in their scene. placement: map into the viewer's world; by default
-    none.
+    frames: indices of the views in their scene. placement: transform from the model's world into
+    the viewer's; by default both worlds are equal.
     """
     memory = model.encoder(views)
     start = model.queries(memory, views)

@@ -1,4 +1,4 @@
-"""Write sentences on results: found scales, chosen photos, commands to run next."""
+"""Sentences on results: scales that were found, photos that were chosen, next commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
-    """Yield one sentence with the scales found by search; nothing if no model was searched."""
+    """Yield one sentence with the scales that a search found; nothing without a search."""
     parts = []
     for model in models:
         if found := model.search.found.values():
@@ -30,9 +30,9 @@ def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
 
 
 def remarks(models: Sequence[Model]) -> list[str]:
-    """Return remarks on chosen photos, on the evaluation of each model, and on scales.
+    """Return remarks on the chosen photos, on the evaluation of each model, and on scales.
 
-    A remark on several models is given once, with their names.
+    A remark that holds for several models is given once, with their names.
     """
     names: dict[str, list[str]] = {}
     for model in models:
@@ -46,7 +46,10 @@ def remarks(models: Sequence[Model]) -> list[str]:
 
 
 def chosen_windows(model: Model) -> Iterator[str]:
-    """Yield a line for each scene of a user's photos: inputs and scored photos of each window."""
+    """Yield a line for each scene of a user's photos, with inputs and scored photos of each window.
+
+    A window is a choice of input photos with the photos near them that are scored.
+    """
     if model.windows is None:
         return
     for score in model.evaluation.scores:
@@ -66,10 +69,11 @@ def next_commands(
     photos: str | None = None,
     options: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Return shell commands that a reader may run next, and what each does.
+    """Return shell commands that a reader may run next, by command, with what each command does.
 
     names: the models as given on the command line. target: folder of the report, into which the
-    commands write. options: options of the report that concern its photos, such as --size.
+    commands write. photos: the user's photos; None without. options: options of the report about
+    its photos, such as --size.
     """
     first, column = next(iter(models[0].evaluation.columns.items()))
     scores = [model.evaluation.mean(f"model_{first}") for model in models]

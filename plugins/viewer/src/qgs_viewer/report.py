@@ -1,4 +1,4 @@
-"""Write report.html, a page without other files that compares trained models."""
+"""Write report.html, a single file with pictures inside, which compares trained models."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,9 +30,9 @@ TARGETS = 2
 class Comparison:
     """Contents of a report that compares models on the same scenes.
 
-    models: compared models, in the order of the report. facts: lines on the training, text by
-    label. commands: commands that a reader may run next, and what each does. scenes: heading of the
-    pictures. notes: sentences below the table of scores.
+    models: compared models, in the order of the report. facts: lines about the training, by their
+    label. commands: shell commands that a reader may run next, with what each command does. scenes:
+    heading of the pictures. notes: sentences below the table of scores.
     """
 
     models: Sequence[Model]
@@ -43,9 +43,9 @@ class Comparison:
 
 
 def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
-    """Return rows of the table of scores: first the models, then the baselines.
+    """Return the table of scores as rows by name: first the models, then the baselines.
 
-    A cell is its text and whether the value is the best of all models.
+    A cell is a pair: its text, and True if its value is the best of all models.
     """
     columns = models[0].evaluation.columns
     means = [model.evaluation.means() for model in models]
@@ -69,7 +69,7 @@ def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
 
 
 def show_scores(comparison: Comparison, console: Console) -> None:
-    """Print the table of scores in the terminal."""
+    """Print the table of scores in the terminal, with the best values in green."""
     columns = comparison.models[0].evaluation.columns.values()
     lines = [["", *(column.title for column in columns), "Gaussians", "parameters"]]
     for name, row in score_rows(comparison.models).items():
@@ -81,9 +81,9 @@ def show_scores(comparison: Comparison, console: Console) -> None:
 
 @torch.no_grad()
 def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
-    """Return the whole page, which needs no other file and no network.
+    """Return the whole report as HTML, which needs no other file and no network.
 
-    shown: for each model of the comparison, its reconstructions of the scenes with pictures.
+    shown: the models of the comparison with their reconstructions of the scenes to show.
     """
     models = comparison.models
     first = models[0]
@@ -118,7 +118,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
 
 
 def write_report(comparison: Comparison, folder: Path, console: Console) -> None:
-    """Print the remarks and the scores, write report.html into `folder`, print next commands."""
+    """Print remarks, scores and next commands, and write report.html into `folder`."""
     notes = remarks(comparison.models)
     print_lines(console, notes)
     comparison = replace(comparison, notes=[*comparison.notes, *notes])

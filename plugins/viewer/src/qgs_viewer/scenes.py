@@ -1,4 +1,4 @@
-"""Reconstruct the scenes that pages and figures show."""
+"""Reconstruct the scenes that report pages and figures show."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ from qgs_viewer.query_scene import QueryScene, explained
 class ModelScenes:
     """A model and its reconstructions of several samples.
 
-    samples: inputs and targets in the world of this model. gaussians: the reconstruction of each
-    sample. scene: that of the first sample, with its queries. curves: loss and PSNR of the
-    training; empty without a stored history.
+    samples: input and target views in the world of this model. gaussians: the reconstruction of
+    each sample. scene: the reconstruction of the first sample, with its queries. curves: loss and
+    PSNR of the training; empty if no history is stored.
     """
 
     name: str
@@ -36,14 +36,14 @@ class ModelScenes:
 
     @property
     def target_camera(self) -> Cameras:
-        """The camera (1, 1) of the first target view of the first sample."""
+        """The camera (1, 1) of the first target view in the first sample."""
         return self.samples[0].targets.cameras[:, :1]
 
     def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
-        """Return `query`; if it is None, the `count` best visible queries (see `notable_queries`).
+        """Return the query `query`, or for None the `count` best visible queries.
 
-        cameras: (1, V), of which the first counts. Raises ValueError for a query that does not
-        exist.
+        cameras: (1, V); only the first camera is used (see `notable_queries`). Raises ValueError
+        for a query that does not exist.
         """
         if query is None:
             return notable_queries(self.network, self.gaussians[0], cameras, count)
@@ -55,10 +55,11 @@ class ModelScenes:
 def model_scenes(
     models: Sequence[Model], most: int | None = None, scene: str | None = None
 ) -> list[ModelScenes]:
-    """Reconstruct the scenes of the evaluation by each model, on the model's device.
+    """Reconstruct the scenes of the evaluation by each model, on the device of the model.
 
-    most: number of scenes, with one sample each; by default all samples of the evaluation. scene:
-    name of the scene that comes first. Raises ValueError for a scene that is not evaluated.
+    most: number of scenes, with one sample for each scene; by default all samples of the
+    evaluation. scene: name of the scene to put first. Raises ValueError for a scene that is not
+    evaluated.
     """
     first = models[0].recipe
     # Scenes are drawn, whatever index the scores are of.
@@ -100,7 +101,9 @@ def _samples(plan: EvaluationPlan) -> list[Sample]:
 def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample]:
     names = dict.fromkeys(sample.scene for sample in samples)
     if scene is not None and scene not in names:
-        raise ValueError(f"--scene {scene!r} is not evaluated: choose from {listed(names)}")
+        raise ValueError(
+            f"--scene {scene!r} is none of the evaluated scenes: choose from {listed(names)}"
+        )
     # sorting is stable: the others keep their order
     return sorted(samples, key=lambda sample: sample.scene != scene)
 
@@ -109,9 +112,10 @@ def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample
 def scenes_of(
     name: str, network: QueryGaussianModel, samples: Sequence[Sample], file: Path | None = None
 ) -> ModelScenes:
-    """Reconstruct `samples` by `network`.
+    """Reconstruct `samples` by `network`, and keep the queries of the first sample.
 
-    file: its checkpoint, beside which the history of the training may lie; None shows no curves.
+    file: checkpoint of the network, beside which the history of the training may lie; None gives no
+    curves.
     """
     # components draw random numbers in training mode
     network.eval()
@@ -129,7 +133,7 @@ def scenes_of(
 def ratio(sample: Sample, own: Sample) -> float:
     """Return the factor from lengths in the world of `own` to lengths in the world of `sample`.
 
-    Both samples have the same views.
+    Both samples show the same views, in worlds of two models.
     """
     lengths = []
     for one in (sample, own):

@@ -51,7 +51,7 @@ class Tile:
     """A picture of a section, with its caption.
 
     legend: queries that the picture shows, with their colours. page: a complete HTML page that a
-    reader can open in place of the picture; empty for none. The report shows this page in a frame
+    reader can open in place of the picture; "" for no page. The report shows the page in a frame
     that cannot read the report.
     """
 
@@ -65,9 +65,9 @@ class Tile:
 class Section:
     """A section of the report: pictures in rows.
 
-    name: key of its texts in sections.toml. rows: tiles by label of the row; None leaves a gap.
-    figure: what `qgs figures` writes; None draws the tiles. width: least width of a tile in CSS
-    pixels.
+    name: key of the section's texts in sections.toml. rows: tiles by label of the row; None leaves
+    a gap. figure: the figure that `qgs figures` writes; None draws the tiles. width: least width of
+    a tile in CSS pixels.
     """
 
     name: str
@@ -77,14 +77,14 @@ class Section:
 
     @property
     def words(self) -> Mapping[str, str]:
-        """Texts of the section: `title`, `text`, and `empty` (why it has no pictures)."""
+        """Texts of the section: `title`, `text`, and `empty`, which says why it has no pictures."""
         file = files("qgs_viewer") / "template" / "sections.toml"
         return tomllib.loads(file.read_text(encoding="utf-8"))[self.name]
 
 
 @dataclass(frozen=True)
 class Detail:
-    """Settings of the pictures.
+    """Options of the pictures in a section.
 
     side: pixels on the longer side of a picture. query: index of the query to show; None chooses
     queries that are well visible.
@@ -95,7 +95,10 @@ class Detail:
 
 
 def scene_to_turn(models: Shown) -> Section:
-    """Show every model's first scene as a picture, with a page in which it can be turned."""
+    """Return a section with the first scene of every model, as a picture and as an HTML page.
+
+    The page shows the scene in 3D, where it can be turned.
+    """
     tiles = []
     for model in models:
         camera = images.finer(model.target_camera, Detail.side)
@@ -109,7 +112,10 @@ def scene_to_turn(models: Shown) -> Section:
 
 
 def queries(models: Shown, detail: Detail) -> Section:
-    """Show the Gaussians of well visible queries of each model, seen from the first target view."""
+    """Return a section with the Gaussians of well visible queries of each model.
+
+    The Gaussians are seen from the first target view.
+    """
     tiles = []
     for model in models:
         camera = images.finer(model.target_camera, detail.side)
@@ -120,7 +126,10 @@ def queries(models: Shown, detail: Detail) -> Section:
 
 
 def anchors(models: Shown, detail: Detail) -> Section:
-    """Show anchors and supports on the first input photo: at the start and after some layers."""
+    """Return a section with anchors and support ellipsoids of queries on the first input photo.
+
+    The columns are the start and some decoder layers. Models without anchors are left out.
+    """
     rows = {}
     for model in models:
         if not model.scene.has_anchors:
@@ -145,7 +154,7 @@ def anchors(models: Shown, detail: Detail) -> Section:
 
 
 def attention(models: Shown, detail: Detail) -> Section:
-    """Show the cross-attention of one query of each model over the patches of the input photos.
+    """Return a section with the attention of one query of each model to photo patches.
 
     Columns: logits from content, bias from geometry, and the attention that results from both.
     """
@@ -163,7 +172,7 @@ def attention(models: Shown, detail: Detail) -> Section:
 
 
 def training_curves(models: Shown, detail: Detail) -> Section:
-    """Show loss and PSNR over the training, for every model with a stored history."""
+    """Return a section with loss and PSNR over the training, for models with a history."""
     curves = {model.name: model.curves for model in models if model.curves}
     if not curves:
         return Section("training")
@@ -173,9 +182,10 @@ def training_curves(models: Shown, detail: Detail) -> Section:
 
 
 def novel_views(models: Shown, detail: Detail) -> Section:
-    """Show the middle target view of up to three scenes: inputs, truth, and results of the models.
+    """Return a section with the middle target view of up to three scenes.
 
-    Rows for each scene: renders, their errors, depths.
+    Each scene has three rows: renders, their errors, depths. The columns are the inputs, the truth
+    and the models.
     """
     rows: dict[str, Sequence[Tile | None]] = {}
     for place, sample in enumerate(models[0].samples[:NOVEL_SCENES]):
@@ -196,7 +206,8 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
     """Return the pictures of a scene as a dict for the template.
 
     `name` of the scene; `inputs`, tiles of the input photos; `kinds`, tiles of the target views by
-    kind (Render, Error, Depth) and column (Truth, models); `most`, the error shown brightest.
+    kind (Render, Error, Depth), then by column (Truth, names of models); `most`, the error that is
+    shown brightest.
 
     place: index of the scene's sample. targets: indices of the target views to show.
     """

@@ -73,7 +73,10 @@ class Results(Scores):
 
     @property
     def shared(self) -> str | None:
-        """Name of the first evaluation by one protocol for all runs; None if all have several."""
+        """Name of the first evaluation in which all runs have the same protocol.
+
+        None if there is no such evaluation.
+        """
         # The order is that of the study, so the recipes' own evaluation comes first.
         return next((n for n in self.plan.evaluations if len(self.protocols(n)) == 1), None)
 
