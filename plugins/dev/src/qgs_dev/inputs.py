@@ -57,7 +57,7 @@ USUAL = Sizes()
 def many(case: Case) -> Sizes:
     """Return sizes with more than 128 queries, Gaussians and tokens.
 
-    They reveal errors of components that work in chunks or windows of up to 128.
+    Such sizes reveal errors of components that work in chunks or windows of up to 128.
     """
     image = (64, 96) if case.slot == "cross_attention" else None
     return Sizes(queries=200, views=3, gaussians=1, image=image)
@@ -89,7 +89,7 @@ def memory_width(case: Case) -> int:
 class Maker:
     """Generator of random inputs of the given sizes.
 
-    axes: size of each dimension, by its letter in slots.toml.
+    axes: size of each dimension, by its letter in slots.toml, such as N for queries.
     """
 
     def __init__(self, case: Case, sizes: Sizes = USUAL, seed: int = 0) -> None:
@@ -113,12 +113,18 @@ class Maker:
         return [self.axes[axis] if axis in self.axes else int(axis) for axis in axes]
 
     def normal(self, axes: str, *more: int) -> Tensor:
-        """Return normal random numbers of shape `axes`, followed by the sizes `more`."""
+        """Return normally distributed random numbers.
+
+        axes: leading dimensions, such as "BN"; see `shape`. more: sizes of further dimensions.
+        """
         shape = [*self.shape(axes), *more]
         return torch.randn(shape, generator=self.generator).to(self.case.device)
 
     def uniform(self, low: float, high: float, axes: str) -> Tensor:
-        """Return uniform random numbers between `low` and `high`, of shape `axes`."""
+        """Return uniformly distributed random numbers between `low` and `high`.
+
+        axes: dimensions, such as "BV3HW"; see `shape`.
+        """
         numbers = torch.rand(self.shape(axes), generator=self.generator)
         return (low + (high - low) * numbers).to(self.case.device)
 
@@ -192,7 +198,7 @@ class Maker:
         )
 
     def gaussians(self) -> Gaussians:
-        """Return random Gaussians before the cameras; with `sh` and `features` for renderers."""
+        """Return random Gaussians in front of the cameras, with the parts that `gives` tells."""
         return Gaussians(
             means=self.in_front(self.normal("BG3")),
             scales=self.uniform(0.05, 0.3, "BG3"),
@@ -206,7 +212,7 @@ class Maker:
     def gives(self, name: str) -> bool:
         """Return True if Gaussians should have the part `name`, such as "sh".
 
-        This holds for renderers, and for components that require the part.
+        Gaussians for renderers have all parts, others only the parts that the component requires.
         """
         return self.case.slot == "renderer" or f"gaussians.{name}" in self.case.reads
 
@@ -215,13 +221,13 @@ class Maker:
         return LayerPrediction(self.gaussians(), self.state())
 
     def rendering(self) -> Rendering:
-        """Return renderings of random noise, or of no views for a loss that needs no renderings."""
+        """Return random numbers as renderings; of no views for a loss that needs no renderings."""
         rendering = self.all_views()
         unseen = getattr(self.case.component, "renderings", "") == "none"
         return map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering
 
     def all_views(self) -> Rendering:
-        """Return renderings of random noise for all views."""
+        """Return random numbers as renderings of all views."""
         return Rendering(
             rgb=self.uniform(0, 1, "BV3HW"),
             alpha=self.uniform(0, 1, "BV1HW"),
@@ -230,7 +236,7 @@ class Maker:
         )
 
     def target(self) -> Views:
-        """Return random noise images with masks; with depth maps for a loss that reads depths."""
+        """Return random images, cameras and masks; and depth maps for a loss that reads them."""
         views = replace(self.views(), masks=self.uniform(0, 1, "BV1HW").round())
         if not getattr(self.case.component, "reads_depths", False):
             return views
@@ -241,9 +247,10 @@ class Maker:
 
 
 def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
-    """Return the shape of one query's or token's value of a field, in a model of `dims`.
+    """Return the shape of a field without the axes of scenes and of queries or tokens.
 
-    A size "4*D" is four times the model's width. Unknown names of sizes stand for 4.
+    dims: sizes of the model. A size "4*D" is four times the model's width. Unknown names of sizes
+    stand for 4.
     """
     named = {"D": dims.width, "h": dims.heads, "D/h": dims.width // dims.heads}
     sizes = []

@@ -16,7 +16,7 @@ def list_components(
     name: Annotated[
         str | None,
         typer.Argument(
-            help="A slot, a component such as qgs/latent, a trained model, a section of settings."
+            help="Name to explain: a slot, component, trained model or section of settings."
         ),
     ] = None,
 ) -> None:

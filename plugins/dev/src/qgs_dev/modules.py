@@ -1,4 +1,4 @@
-"""Random seeds, modes and stored values of modules in checks."""
+"""Helpers of checks for modules: random seeds, modes, and the values that a module stores."""
 
 import inspect
 from collections import deque
@@ -36,11 +36,10 @@ def tensors_of(module: nn.Module) -> dict[str, Tensor]:
 
 
 def attributes(module: nn.Module) -> dict[str, Any]:
-    """Return the values of a module's other attributes, as copies that can be compared.
+    """Return a module's attributes, as copies that can be compared with later ones.
 
-    Other attributes are all but parameters, buffers and submodules. Attributes of submodules and of
-    their classes are included. Values of a `cached_property` are left out, because they are
-    computed from the module.
+    Parameters, buffers and submodules are left out, and values of a `cached_property`, which are
+    computed from the module. Attributes of submodules and of their classes are included.
     """
     found = {}
     for name, part in module.named_modules():
@@ -67,7 +66,7 @@ def _is_code(value: Any) -> bool:
 def _comparable(value: Any, inside: tuple[int, ...] = ()) -> Any:
     """Return a copy of `value` that can be compared with a later copy.
 
-    inside: ids of the containers around `value`, to stop at cycles.
+    inside: ids of the containers that hold `value`, so that a container in itself is left out.
     """
     # A module may hold an object that holds the module.
     if id(value) in inside:

@@ -92,7 +92,10 @@ Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of one check on one case. message: reason for a verdict other than "passed"."""
+    """Result of one check on one case.
+
+    message: reason why the verdict is not "passed"; "" if it is.
+    """
 
     case: Case
     check: Check
@@ -181,24 +184,24 @@ def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
 
 
 def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) -> None:
-    """Raise ValueError for invalid expected failures.
+    """Raise ValueError for an expected failure without a reason, or of a check that does not run.
 
-    They are invalid without a reason, or for a check that does not run. expected: reasons by name
-    of the check.
+    expected: reasons by name of the check.
     """
     made = {check.name for run in runs for check in checks_for(run.case, variant=run.variant)}
     for name, why in expected.items():
         if name not in made.difference(BASICS):
             fix = did_you_mean(str(name), made, "checks made of it")
-            raise ValueError(f"`{name}` cannot be expected to fail here; {fix}")
+            raise ValueError(f"the check `{name}` cannot be expected to fail here; {fix}")
         if not (isinstance(why, str) and why.strip()):
             raise ValueError(f"the expected failure of `{name}` needs a text that gives the reason")
 
 
 def with_place(error: BaseException, component: type) -> str:
-    """Return type and message of `error`, and FILE:LINE in the component's package.
+    """Return type and message of `error`, and FILE:LINE in the component's package if known.
 
-    FILE:LINE is left out for a ContractError, and for an error from outside this package.
+    FILE:LINE is the innermost call in the package before the error. It is left out for a
+    ContractError, and for an error from outside the package.
     """
     # Notes say at which point of a check the error happened.
     noted = "".join(f"{note}, " for note in getattr(error, "__notes__", ()))
@@ -286,7 +289,10 @@ def _case(config: ComponentConfig) -> Case:
 
 
 def _accepts(case: Case) -> bool:
-    """Return True if `problems` reports none, or raises; the checks then report its error."""
+    """Return True if `problems` finds no fault with the options of `case`.
+
+    Return False if `problems` raises an error, which the checks then report.
+    """
     try:
         return not case.problems(case.size)
     except (Exception, SystemExit):

@@ -45,7 +45,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
 
 def _type(name: str, component: type[Component]) -> dict[str, Any]:
-    """Return the schema of a component: its options, and the value `name` of `type`."""
+    """Return the schema of a component: its options, and `type` with the only value `name`."""
     description = summary_of(component)
     schema = settings_schema(component.Config)
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}

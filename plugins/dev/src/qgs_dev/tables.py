@@ -40,7 +40,10 @@ def _origins(title: str, column: str, meanings: Mapping[str, str], registry: Reg
 
 
 def _table(title: str, *rows: Sequence[str]) -> Table:
-    """Return a table whose long cells are folded. The first of `rows` has the headers."""
+    """Return a table that wraps long cells.
+
+    rows: texts of the cells; the first row has the headers.
+    """
     table = Table(title=title or None, title_justify="left")
     for column in rows[0]:
         table.add_column(column, overflow="fold")
@@ -121,8 +124,8 @@ def recipe_path(slot: str) -> str:
 def option_rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:
     """Yield a table row for each option: name, type, default and meaning.
 
-    properties: JSON schemas by option. Options inside a mapping follow it as `option.inner`. above:
-    prefix of the names.
+    properties: JSON schema of each option, by name. The options of a mapping follow it, with names
+    such as `option.inner`. above: prefix of all names.
     """
     for name, option in properties.items():
         default = inline(option["default"]) if "default" in option else "required"

@@ -124,9 +124,9 @@ class Trial:
         self.inputs = inputs_of(case, sizes, seed)
 
     def __call__(self, inputs: Inputs | None = None, **replaced: Any) -> Any:
-        """Return the outputs of the component.
+        """Return the outputs of the component for `inputs`, by default `self.inputs`.
 
-        inputs: None takes `self.inputs`. replaced: inputs to replace, by name.
+        replaced: values that replace inputs of the same names.
         """
         given = {**(inputs or self.inputs), **replaced}
         return self.module(*given.values())
@@ -144,10 +144,9 @@ class Trial:
             yield mode, outputs
 
     def tracked(self, inputs: Inputs | None = None) -> Inputs:
-        """Return copies of the inputs whose tensors require gradients.
+        """Return copies of `inputs`, by default of `self.inputs`, whose tensors require gradients.
 
-        inputs: None takes `self.inputs`. Of a renderer's cameras, only the tensors in
-        `camera_gradients` require gradients.
+        Of a renderer's cameras, only the tensors in `camera_gradients` require gradients.
         """
         component = self.case.component
         fixed: set[str] = set()
@@ -176,7 +175,10 @@ def expect_none(names: Iterable[Any], fault: str) -> None:
 
 
 def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float = 0.0) -> None:
-    """Raise ContractError if two trees differ; see `difference`. where: start of the message."""
+    """Raise ContractError if two trees differ; see `difference`.
+
+    where: start of the message.
+    """
     found = difference(one, other, rtol, atol)
     expect(not found, f"{where}, {found}")
 
@@ -196,9 +198,9 @@ def expect_inside(x: Tensor, low: float, high: float, what: str) -> None:
 def expect_right_gradient(
     value: Callable[..., Tensor], points: Any, where: str, **tolerances: Any
 ) -> None:
-    """Raise ContractError unless the gradient of the function `value` at `points` is right.
+    """Raise ContractError if the gradient of `value` at `points` does not match finite differences.
 
-    The gradient is compared with finite differences. tolerances: options of gradcheck.
+    value: function to check. where: start of the message. tolerances: options of gradcheck.
     """
     try:
         gradcheck(value, points, **tolerances)

@@ -23,8 +23,8 @@ QUERIES = 6
 def check_memo_is_of_the_memory_alone(case: Case) -> None:
     """Require that values stored with `ImageMemory.once` depend on the memory only.
 
-    They must not depend on the state or on weights of a layer. A layer must give the same results
-    on a new memory and on a memory that another layer has read before.
+    The values must not depend on the query state or on weights of a layer. A layer must give the
+    same results on a new memory and on a memory that another layer has read before.
     """
     first = Trial(case)
     # The first layer fills the memo that the layers below read.
@@ -91,9 +91,9 @@ def check_explanation_is_a_softmax(case: Case) -> None:
 def check_updates_are_explained(case: Case) -> None:
     """Require that updates are sums of values with the weights that `explain` returns.
 
-    There is one value for each head and token. Updates of many queries, or with several masks, are
-    then linear in the unknown values. There are fewer values than updates, so a least-squares fit
-    of the values must leave no residual.
+    The values, one vector for each head and token, are not known here. Updates of many queries, or
+    with several masks, are linear in the values, and there are more updates than values. So a
+    least-squares fit of the values to the updates must leave no residual.
     """
     count = QUERIES if case.slot == "self_attention" else 60
     module = case.lively().double()
@@ -125,9 +125,9 @@ def check_updates_are_explained(case: Case) -> None:
 
 
 def explanation(module: Any, inputs: Inputs, queries: list[int] | None = None) -> Any:
-    """Return what `explain` gives for `queries`, or for all queries if None.
+    """Return the attention weights that `explain` gives for the queries with indices `queries`.
 
-    The result is None if the component explains nothing.
+    Without `queries`, return those of all queries. Return None if the component explains nothing.
     """
     chosen = queries or range(inputs["state"].features.shape[1])
     return module.explain(*inputs.values(), torch.tensor([*chosen]))
@@ -151,10 +151,10 @@ _ORDER = (
 
 
 def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
-    """Require that `grid` is the number of patches, and `patch_rays` are the mean rays of patches.
+    """Require that `grid` counts the patches, and `patch_rays` are the rays of the patches.
 
-    Rays must be in the order of the grid: by view, row and column. A memory without rays is not
-    checked.
+    The grid has views, rows and columns of patches; rays must be in this order. The ray of a patch
+    is the mean of the rays of its pixels. A memory without rays is not checked.
     """
     module = case.lively()
     for where, views in _wide_and_tall(case, case.size):
@@ -170,8 +170,8 @@ def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
 def check_tokens_are_those_of_the_grid(case: Case) -> None:
     """Require that a change of one patch changes the token at the same place in `grid` most.
 
-    The mean over patches counts. An offset of half a patch is allowed, as strided convolutions
-    have. Keys may depend on rays only. A memory without a grid is not checked.
+    The changes are averaged over patches. A token may be centred half a patch off, as in strided
+    convolutions. Keys may depend on rays only. A memory without a grid is not checked.
     """
     # Initial parameters without noise: in a random network every token depends on all patches.
     module = case.build().eval()
@@ -228,7 +228,7 @@ def check_project_makes_the_memory_again(case: Case) -> None:
 
 
 def _wide_and_tall(case: Case, size: tuple[int, int]) -> Iterator[tuple[str, Views]]:
-    """Yield views of `size` (H, W), then of (W, H) if the component accepts this size."""
+    """Yield views of `size` (H, W), then of (W, H) if that is accepted, each with a description."""
     for image in dict.fromkeys([size, (size[1], size[0])]):
         if image == size or not case.problems(image):
             where = f"with images of {image[0]} x {image[1]}"
@@ -251,8 +251,9 @@ def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
 def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int, int, int]) -> str:
     """Return how tokens are misplaced in `grid`, and how to fix that; "" if they are not misplaced.
 
-    change: (T, M), the change of each of M tokens by each of T changed patches. changed: (T,),
-    indices of the tokens that belong to the changed patches. places: their view, row and column.
+    change: (T, M), how much each of T changed patches changes each of M tokens. changed: (T,),
+    indices of the tokens that belong to the changed patches. places: view, row and column of the
+    changed patches.
     """
     # Use shares of a token's total change: near borders and after norms, some tokens change more.
     share = change / change.sum(0).clamp_min(1e-30)
@@ -277,9 +278,9 @@ def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int,
 
 
 def _one_patch_each(views: Views, places: Tensor, patch: int) -> Views:
-    """Return copies of a scene, one for each of `places`, with new noise in the patch at the place.
+    """Return copies of a scene, one for each patch in `places`, with new noise in this patch.
 
-    patch: side of a patch in pixels.
+    places: view, row and column of each patch. patch: side of a patch in pixels.
     """
     scenes = map_tensors(lambda x: x.repeat(len(places), *[1] * (x.ndim - 1)), views)
     generator = torch.Generator().manual_seed(1)

@@ -1,7 +1,7 @@
 """Checks that a component can be built, called with any sizes and strides, and compiled.
 
-They include what the bases `Component`, `Config` and `nn.Module` provide, because a class may
-override it.
+Methods of the bases `Component`, `Config` and `nn.Module` are checked too, because a class may
+override them.
 """
 
 import random
@@ -65,7 +65,7 @@ SLACK = 2
 
 
 def check_builds(case: Case) -> None:
-    """Require that `problems` reports none for the options, and that the component can be built."""
+    """Require that `problems` returns none for the options, and that the component can be built."""
     found = [f"`{p.option}`: {p.reason}" for p in case.problems(case.size)]
     # A case with invalid options says nothing about the component.
     expect(not found, f"`problems` refuses the options of this case: {', '.join(found)}")
@@ -203,7 +203,7 @@ def check_compiles(case: Case) -> None:
 
 
 def _gradients(module: Any, inputs: Inputs, outputs: Any) -> dict[str, Tensor]:
-    """Return the gradients of inputs and parameters by name, except gradients of zeros."""
+    """Return the gradients of inputs and parameters by name, but no gradient that is all zero."""
     given = {**inputs, "parameter": dict(module.named_parameters())}
     return {name: x for name, x in gradients(scalar(outputs), given).items() if bool(x.any())}
 
@@ -255,7 +255,7 @@ def _expect_strict_options(case: Case) -> None:
 
 
 def _configs_in(annotation: Any) -> set[type[BaseModel]]:
-    """Return the config classes that an option of type `annotation` can hold, also nested ones."""
+    """Return all config classes in the type `annotation` of an option, including nested ones."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         inside = [field.annotation for field in annotation.model_fields.values()]
         return {annotation}.union(*map(_configs_in, inside))
@@ -265,7 +265,8 @@ def _configs_in(annotation: Any) -> set[type[BaseModel]]:
 def _decoded(case: Case, options: dict[str, Any]) -> tuple[ComponentConfig | None, str]:
     """Write options as YAML and read them again as a recipe does.
 
-    Returns the options or None, and the message of the error or "".
+    Returns the options that were read and "". If they are refused, returns None or some options,
+    and the message of the error.
     """
     problems = Problems()
     node = load_mapping(dump(options), "case", problems)
@@ -292,9 +293,9 @@ def _expect_drawn_from_torch(case: Case) -> None:
 
 
 def other_generators() -> tuple[Any, str]:
-    """Return the states of the random generators of numpy and of the module random.
+    """Return the states of the random generators of numpy and of Python's module `random`.
 
-    Components must not use these generators.
+    Components must use torch's generator instead of these two.
     """
     return random.getstate(), str(numpy.random.get_state())
 

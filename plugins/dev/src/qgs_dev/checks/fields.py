@@ -82,7 +82,7 @@ def check_reads_are_declared(case: Case) -> None:
 
 
 class AskedFields(dict[str, Tensor]):
-    """Dict of state fields that adds every name that is read to the set `asked`."""
+    """Dict of state fields that adds the name of every field that is read to the set `asked`."""
 
     def __init__(self, fields: Mapping[str, Tensor], asked: set[str]) -> None:
         super().__init__(fields)
@@ -117,8 +117,8 @@ def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
 def check_declared_reads_are_used(case: Case) -> None:
     """Require that every field in `reads` affects the outputs.
 
-    Otherwise recipes without the field would be refused for no reason. Features of Gaussians may be
-    read from their rendering.
+    Otherwise recipes without the field would be refused for no reason. Features of Gaussians count
+    as used if a change of their rendering affects the outputs.
     """
     trial = Trial(case)
     # At least one of several draws must differ, since a ReLU may be closed for some.
@@ -130,7 +130,7 @@ def check_declared_reads_are_used(case: Case) -> None:
 
 
 def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
-    """Yield the inputs of a trial with several other values of the required field `field`."""
+    """Yield copies of a trial's inputs, each with other values of the required field `field`."""
     inputs = trial.inputs
     if field == "memory.grid":
         views, rows, columns = inputs["memory"].grid
@@ -196,7 +196,7 @@ def check_unmet_reads_fail_at_compose(case: Case) -> None:
 
 
 def _refusal(case: Case, given: Fields) -> str:
-    """Return the error of a recipe whose queries provide the fields `given`, or ""."""
+    """Return the error of a recipe with queries that provide the fields `given`; "" if accepted."""
     try:
         resolved(case, given)
     except RecipeError as error:
@@ -240,9 +240,9 @@ def resolved(case: Case, given: Fields) -> Recipe:
 
 
 def _given(base: type, provides: Fields, **methods: Any) -> Any:
-    """Return a subclass of the component class `base` that declares the fields `provides`.
+    """Return a subclass of the component class `base` that declares that it writes `provides`.
 
-    methods: methods of the subclass.
+    methods: further methods of the subclass, by name.
     """
     # Make a new class each time; otherwise two cases would share one registry entry.
     written = classmethod(lambda cls, config: provides)
@@ -252,7 +252,7 @@ def _given(base: type, provides: Fields, **methods: Any) -> Any:
 
 
 def _head_with(look: Fields) -> Any:
-    """Return a head whose Gaussians have the parts in `look`, `sh` or `features`."""
+    """Return a head class whose Gaussians have `sh`, `features` or both, as `look` requires."""
 
     def forward(self: GaussianHead, state: QueryState) -> Any:
         x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)
@@ -264,7 +264,7 @@ def _head_with(look: Fields) -> Any:
 
 
 def _encoder_with(case: Case) -> Any:
-    """Return an encoder whose memory features have the width that the component requires."""
+    """Return an encoder class whose memory features have the width that the component requires."""
     wide = torch.arange(memory_width(case))
 
     def forward(self: MultiViewViT, views: Any) -> Any:
@@ -277,7 +277,7 @@ def _encoder_with(case: Case) -> Any:
 
 
 def _queries_with(case: Case, given: Fields) -> Any:
-    """Return a queries component that provides the fields `given`, the same in all scenes."""
+    """Return a queries class that provides the fields `given`, equal in all scenes."""
 
     def start(self: LatentQueries, batch_size: int) -> QueryState:
         maker = Maker(case, Sizes(batch=1, queries=self.count))

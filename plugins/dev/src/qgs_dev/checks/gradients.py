@@ -51,9 +51,9 @@ SEPARATE = 200
 def check_gradients_reach_inputs(case: Case) -> None:
     """Require a gradient for each input that the slot must read and for each required field.
 
-    If a component stops a gradient on purpose, for example that of reference points, list this
-    check and `gradients_match_differences` as expected failures. A component for ablations, which
-    requires no fields and returns only zeros, passes.
+    If a component stops a gradient on purpose, for example the gradient of reference points, list
+    this check and `gradients_match_differences` as expected failures. A component for ablations,
+    which requires no fields and returns only zeros, passes.
     """
     trial = Trial(case)
     missing = {*_read(case)}
@@ -91,7 +91,7 @@ def _are_zero(outputs: Any) -> bool:
 
 
 def check_terms_have_gradients(case: Case) -> None:
-    """Require that every loss term has a gradient for the prediction or for the rendering.
+    """Require that every loss term has a gradient with respect to the prediction or the rendering.
 
     A loss that requires no fields and is zero for all inputs passes, such as a loss of weight 0.
     """
@@ -308,7 +308,7 @@ def _halved(inputs: Inputs) -> Inputs:
 
 
 def _with_explanation(trial: Trial, inputs: Inputs) -> dict[str, Any]:
-    """Return the outputs by name; for attention, with the geometry term that `explain` returns."""
+    """Return the outputs by name. For attention, add the geometry term that `explain` returns."""
     outputs = leaves(trial(inputs))
     if trial.case.slot in ATTENTION:
         weights = explanation(trial.module, inputs)
@@ -346,12 +346,14 @@ def check_float64_stays_float64(case: Case) -> None:
 
 
 class LearnedLayers(TorchFunctionMode):
-    """Recorder of the outputs of learned layers in call order; with `replayed`, it replays them.
+    """Mode that records the outputs of learned layers, or replays recorded ones.
 
     A product counts as a learned layer if all its factors require gradients, as parameters,
-    features and values computed from them do. halved: names of products of float32 geometry that
-    autocast computed in bfloat16. differs: True if other layers are called than `replayed` has;
-    from the first such layer on, layers return what they compute.
+    features and values computed from them do.
+    replayed: recorded outputs, which layers return in the order of their calls; None records.
+    halved: names of products of float32 geometry that autocast computed in bfloat16.
+    differs: True if the layers that are called are not those in `replayed`; from the first such
+        layer on, layers return what they compute.
     """
 
     def __init__(self, replayed: Iterable[tuple[str, Any]] | None = None) -> None:

@@ -60,8 +60,8 @@ def check_masked_queries_are_not_judged(case: Case) -> None:
 def check_renderings_as_declared(case: Case) -> None:
     """Require that a loss uses renderings as its `renderings` declares.
 
-    With "each", terms must be means over views. Terms must be 0-d tensors. Their names must differ
-    from those of other numbers in history.jsonl.
+    If `renderings` is "each", every loss term must be a mean over views. Terms must be 0-d tensors.
+    The name of a term must differ from those of other numbers in history.jsonl.
     """
     trial = Trial(case)
     terms = trial()
@@ -123,9 +123,9 @@ def _metric(case: Case) -> Metric:
 
 
 def _metric_input(case: Case, module: Metric, noise: float) -> MetricInput:
-    """Return inputs for a metric: images and depth with added noise, only as far as it needs them.
+    """Return inputs for a metric, with noise added to images and depth.
 
-    noise: standard deviation of the noise.
+    Inputs that are not in the metric's `needs` are None. noise: standard deviation of the noise.
     """
     maker = Maker(case, Sizes(batch=1))
     target = maker.target()
@@ -154,7 +154,8 @@ def check_objective_gives_an_outcome(case: Case) -> None:
     """Require an Outcome whose total is the sum of its terms and depends on the model.
 
     The total must have a gradient for the model's parameters. An objective must have no parameters
-    of its own. Terms and signs must be 0-d and detached. The signs must be those in SIGNS.
+    of its own. Terms and signs (warning values of training) must be 0-d and detached. The signs
+    must be those in SIGNS.
     """
     module = case.build()
     expect(
@@ -193,7 +194,7 @@ def check_objective_repeats(case: Case) -> None:
 
 
 def rehearsed(case: Case, module: Any) -> dict[str, Tensor]:
-    """Return total, terms and signs that an objective gives with a small model."""
+    """Return the total, terms and signs of an objective that is called with a small model."""
     outcome, _ = _outcome(case, module, 3)
     return cloned({"total": outcome.total, **outcome.terms, **outcome.signs})
 

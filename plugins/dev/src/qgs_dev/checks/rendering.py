@@ -104,7 +104,7 @@ def check_colours_depend_on_the_direction(case: Case) -> None:
 
 
 def check_features_are_blended_as_colours(case: Case) -> None:
-    """Require that features are blended like colours on a black background, for any number.
+    """Require that features are blended like colours on black, for any number of channels.
 
     Features must not change the image. If Gaussians have no features, the rendering must have none.
     """
@@ -210,7 +210,10 @@ def _expect_changes(trial: Trial, name: str, gradient: Tensor) -> None:
 
 
 def _brightness(rendering: Any) -> Tensor:
-    """Return a weighted mean of colours, alpha, depth and features, with smooth weights."""
+    """Return a weighted mean of a rendering's colours, alpha, depth and features.
+
+    Weights vary smoothly over the image, and differ between images.
+    """
     total = torch.zeros(()).double()
     for number, (_, image) in enumerate(named_tensors(rendering), 1):
         y, x = (torch.linspace(-1, 1, size, dtype=torch.float64) for size in image.shape[-2:])

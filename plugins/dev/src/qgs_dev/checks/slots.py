@@ -77,8 +77,8 @@ def check_queries_are_shared_by_scenes(case: Case) -> None:
 def check_queries_resize(case: Case) -> None:
     """Require that `resized` adapts a state dict with more or fewer queries to this component.
 
-    Queries that both have must be kept. The check applies to components whose option `count` is the
-    number of queries.
+    Queries that exist in both must keep their values. The check applies to components whose option
+    `count` is the number of queries.
     """
     module = case.build()
     options = case.config.model_dump(mode="json")
@@ -123,8 +123,8 @@ def check_supervision_weights(case: Case) -> None:
 def check_feedback_compares_the_photos(case: Case) -> None:
     """Require that `compared` returns views with the poses, rays and mean colours of the photos.
 
-    `rounds` and `drawn`, the numbers of rounds, must not be negative. A round must repeat at most
-    as many layers as the decoder has.
+    The numbers of rounds, `rounds` in evaluation and `drawn` in training, must not be negative. A
+    round must repeat at most as many layers as the decoder has.
     """
     trial = Trial(case)
     module = trial.module
@@ -152,7 +152,7 @@ def check_feedback_compares_the_photos(case: Case) -> None:
 
 
 def _corners(cameras: Cameras) -> Tensor:
-    """Return x / z and y / z of the rays through two opposite image corners, shape (..., 4)."""
+    """Return x / z and y / z of the rays through two opposite image corners, as (..., 4)."""
     focal = cameras.intrinsics[..., :2]
     principal = cameras.intrinsics[..., 2:]
     size = torch.tensor(cameras.size[::-1]).to(focal)
@@ -202,7 +202,7 @@ def check_scenes_are_as_listed(case: Case) -> None:
 
 
 def check_optimizer_steps(case: Case) -> None:
-    """Require that steps change all parameters with a gradient, and no others.
+    """Require that optimiser steps change all parameters with a gradient, and no others.
 
     Learning rates must be finite. Parameter groups must hold all given parameters, and must have
     the key `factor`, by which the learning rate is multiplied.
@@ -244,7 +244,7 @@ def check_optimizer_continues(case: Case) -> None:
 
 
 class _Optimization:
-    """Optimiser of three parameters: with weight decay, without it, and without a gradient."""
+    """Optimiser of three parameters: one with weight decay, one without, one without a gradient."""
 
     def __init__(self, case: Case) -> None:
         generator = torch.Generator().manual_seed(0)

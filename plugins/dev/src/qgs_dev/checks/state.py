@@ -97,9 +97,9 @@ def check_inputs_are_not_changed(case: Case) -> None:
 def check_outputs_share_no_memory(case: Case) -> None:
     """Require that outputs share no memory with inputs, parameters or buffers.
 
-    Inputs that a component passes on unchanged are not checked. All kinds pass on the query fields
-    that they do not write. Besides, a refinement passes on the query features, a layer the image
-    memory, and a feedback both of these.
+    Inputs that a component passes on unchanged are not checked: query fields that it does not
+    write, the query features in a refinement, the image memory in a layer, and both of these in a
+    feedback.
     """
     trial = Trial(case)
     outputs = leaves(trial())
@@ -177,9 +177,9 @@ def _outputs(module: Any, inputs: Inputs, seed: int) -> tuple[Any, torch.Tensor]
 def check_scheduled_options_are_read_anew(case: Case) -> None:
     """Require that a change of a scheduled option takes effect in the next call.
 
-    Scheduled options are those in `scheduled`. The result must be that of a component built with
-    the new value. The fields that the component requires and provides must not depend on such an
-    option.
+    Scheduled options, which a component lists in `scheduled`, may change during training. After a
+    change, results must be those of a component built with the new value. The fields that the
+    component requires and provides must not depend on such an option.
     """
     for option in sorted(case.component.scheduled):
         other = case.with_config(_with_another(case.config, option))
@@ -197,7 +197,7 @@ def check_scheduled_options_are_read_anew(case: Case) -> None:
 
 
 def _with_another(config: ComponentConfig, option: str) -> ComponentConfig:
-    """Return `config` with another valid value of `option`; unchanged if no value tried is valid.
+    """Return `config` with another valid value of `option`, or `config` if no value tried is valid.
 
     Half and twice the value are tried, or 0.5 and 1 for a value of 0.
     """

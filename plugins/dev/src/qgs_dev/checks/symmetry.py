@@ -45,8 +45,8 @@ def check_batch_independence(case: Case) -> None:
     """Require that results for a scene do not depend on other scenes of the batch.
 
     Gradients of a scene's results with respect to other scenes must be exactly zero, in evaluation
-    and in training. Results must be the same in a batch with other scenes; in evaluation, also
-    alone.
+    and in training. Results must not change if the other scenes of the batch change. In evaluation,
+    they must not change either if the scene is alone.
     """
     sizes = many(case)
     trial = Trial(case, sizes)
@@ -94,7 +94,7 @@ def check_view_permutation(case: Case) -> None:
     """Require that the order of views does not matter, unless `ordered_views` is declared.
 
     An encoder or a cross-attention may declare `ordered_views`; then the order must matter. Tokens
-    of a memory without a grid, such as learned latents, must not be permuted.
+    of a memory without a grid, such as learned latents, must keep their order.
     """
     order = _shuffled(many(case).views)
 
@@ -137,9 +137,9 @@ def _difference_after(
 ) -> str:
     """Compare outputs with the expected ones after a permutation of the inputs `names`.
 
-    Returns a description of the first difference, or "". outputs_too: True if the outputs should be
-    permuted, too. part: which output of a layer should be permuted, 0 for the state and 1 for the
-    memory.
+    Returns a description of the first difference, or "" if there is none. outputs_too: True if the
+    permutation must permute the outputs, too. part: the output of a layer that it must permute, 0
+    for the state and 1 for the memory.
     """
     trial = Trial(case, many(case))
     moved = {name: permute(x) if name in names else x for name, x in trial.inputs.items()}
