@@ -22,16 +22,16 @@ The ray through the point (u, v), from (0, 0) to (1, 1), has the direction corne
 
 
 def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> Tensor:
-    """Return softmax(q k / sqrt(d)) v (B, T, D) for concatenated q, k and v (B, T, 3 D)."""
+    """Return multi-head self-attention (B, T, D) for concatenated q, k and v (B, T, 3 D)."""
     q_BhTd, k_BhTd, v_BhTd = (split_heads(part, heads) for part in qkv_BTX.chunk(3, -1))
     return merge_heads(F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask))
 
 
 @full_precision
 def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
-    """Return the rays of each part of images that are cut into rows x columns parts.
+    """Return the rays of each part of images that are divided into rows x columns parts.
 
-    They are (B, V * rows * columns, 4, 3), encoded as in PIXEL_ENCODING.
+    The rays are (B, V * rows * columns, 4, 3), encoded as PIXEL_ENCODING says.
     """
     height, width = cameras.size
     c2w = cameras.c2w
@@ -52,7 +52,7 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
 
 @full_precision
 def quaternions(rotations: Tensor) -> Tensor:
-    """Convert rotations (..., 3, 3) to unit quaternions w x y z (..., 4) of either sign."""
+    """Convert rotations (..., 3, 3) to unit quaternions w x y z (..., 4), of arbitrary sign."""
     a, b, c, d, e, f, g, h, i = rotations.flatten(-2).unbind(-1)
     # 4 q q^T: each row is the quaternion times 4 times one of its numbers. The row with the
     # largest diagonal entry is the most precise.
@@ -71,9 +71,9 @@ def quaternions(rotations: Tensor) -> Tensor:
 def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], remedy: str) -> None:
     """Read the tensors of a weight file, and call `fill` with them. Nothing is downloaded.
 
-    file: a safetensors file, or a torch file, whose tensors may be in its entry `model` or
-    `state_dict`. Raises MissingExtraError, whose message ends with `remedy`, if the file is missing
-    or `fill` fails.
+    file: a safetensors file or a torch file. The tensors of a torch file may be in its entry
+    `model` or `state_dict`. Raises MissingExtraError, whose message ends with `remedy`, if the file
+    is missing or `fill` fails.
     """
     path = Path(file).expanduser()
     try:
@@ -94,14 +94,17 @@ def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], reme
 def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
     """Return the mean of the `outcomes` of several passes, with `terms` added to the objective.
 
-    All outcomes have the same losses. terms: losses that are already weighted, 0-d. Raises
-    ValueError if a loss in the outcomes has the name of a term.
+    All outcomes must have the same losses. terms: further losses by name, already weighted, 0-d.
+    Raises ValueError if an outcome has a loss with the name of one of the `terms`.
     """
     first = outcomes[0]
     share = 1 / len(outcomes)
     # Of two equal names, the log would lose one.
     if taken := sorted(first.terms.keys() & terms.keys()):
-        raise ValueError(f"the recipe's losses have terms {taken} already; rename these losses")
+        raise ValueError(
+            f"the recipe's losses have terms {taken} already, which the objective adds itself; "
+            "rename these losses"
+        )
     judged = {n: share * _sum(o.terms[n] for o in outcomes) for n in first.terms}
     signs = {n: share * _sum(o.signs[n] for o in outcomes) for n in first.signs}
     # The maximum, because a mean would hide a single collapsed pass.

@@ -41,11 +41,11 @@ SMALLEST_SIDE = 2 ** (len(_BLOCKS) - 1)
 
 
 class PerceptualDistance(nn.Module):
-    """LPIPS of rendered images against true ones, with fixed weights. Call `load` first."""
+    """Network that computes LPIPS of rendered and true images. Call `load` before the first use."""
 
     @full_precision
     def forward(self, images: Tensor, truth: Tensor) -> Tensor:
-        """Return the LPIPS (X,) of X pairs of images, each (X, 3, H, W) in [0, 1].
+        """Return the LPIPS (X,) of X pairs of images, (X, 3, H, W) in [0, 1].
 
         Equal images have LPIPS 0. Only `images` get a gradient. Raises ValueError if a side is
         shorter than 16 pixels.
@@ -64,7 +64,7 @@ class PerceptualDistance(nn.Module):
         return total
 
     def _features(self, images: Tensor) -> list[Tensor]:
-        """Return the outputs of VGG-16's blocks, with the channels of each pixel at length 1."""
+        """Return the outputs of VGG-16's blocks, with each pixel normalised to length 1."""
         x = images * 2 - 1
         shift, scale = (x.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
         x = (x - shift) / scale
@@ -78,8 +78,9 @@ class PerceptualDistance(nn.Module):
     def load(self, weights: str | None) -> None:
         """Read the weights of VGG-16 and LPIPS from files. Nothing is downloaded.
 
-        weights: file of VGG-16, safetensors or torchvision's. None uses torchvision's file in
-        torch's cache. Raises MissingExtraError if a file is missing or does not fit.
+        weights: file of VGG-16's weights, in safetensors or torchvision's format. None uses
+        torchvision's file in torch's cache. Raises MissingExtraError if a file is missing or does
+        not fit.
         """
         # The package is only located: importing it would import torchvision.
         package = find_spec("lpips")
@@ -118,7 +119,7 @@ def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]
 
 
 class LpipsLoss(Loss):
-    """Mean LPIPS of the rendered views with VGG-16 (TokenGS 2026.6). Nothing is downloaded."""
+    """Loss: mean LPIPS of rendered views with VGG-16 (TokenGS 2026.6). Nothing is downloaded."""
 
     name = "vgg16"
     renderings = "each"
@@ -146,7 +147,7 @@ class LpipsLoss(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """Return the mean LPIPS of the views. Raises ValueError for sides below 16 pixels."""
+        """Return the mean LPIPS of the views. Raises ValueError for image sides below 16 pixels."""
         images = rendering.rgb.flatten(0, 1)
         truth = target.images.flatten(0, 1)
         return self.network(images, truth).mean()
@@ -164,7 +165,7 @@ class Lpips(Metric):
     column = Column("LPIPS", "lower")
 
     class Config(ComponentConfig):
-        """Options of LPIPS."""
+        """Options of the metric LPIPS."""
 
         weights: str | None = None
         """File of VGG-16 weights: safetensors, or torchvision's vgg16-397923af.pth. Null uses
@@ -181,12 +182,12 @@ class Lpips(Metric):
         self.network.load(self.config.weights)
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return the LPIPS (1, T) of T views. Raises ValueError for sides below 16 pixels."""
+        """Return the LPIPS (1, T) of T views. Raises ValueError for image sides below 16 pixels."""
         return self.distance(given.images, given.targets.images)
 
     @torch.no_grad()
     def distance(self, images: Tensor, truth: Tensor) -> Tensor:
-        """Return the LPIPS (...) of pairs of images (..., 3, H, W), which are clipped to [0, 1]."""
+        """Return the LPIPS (...) of pairs of images (..., 3, H, W), after clipping to [0, 1]."""
         # pair by pair, so that memory does not grow with the number of views
         pairs = zip(*(x.clamp(0, 1).flatten(0, -4).split(1) for x in (images, truth)), strict=True)
         return torch.cat([self.network(*pair) for pair in pairs]).reshape(images.shape[:-3])

@@ -1,6 +1,6 @@
 """Conversion of colours and rotations from the pixelSplat family of models to qgs.
 
-The family has harmonics in e3nn's basis and rotations in the camera's frame.
+These models predict spherical harmonics in e3nn's basis and rotations in the camera's frame.
 """
 
 import math
@@ -29,7 +29,8 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
     """Return real spherical harmonics (..., K) of degrees 0 to `degree` at unit vectors (..., 3).
 
     The functions of each degree l are in e3nn's order: m from -l to l, with y as the polar axis and
-    azimuth from z to x. So degree 1 is (x, y, z). They are orthonormal up to one common factor.
+    azimuth from z to x. So degree 1 is (x, y, z). All functions are orthonormal up to one common
+    factor. K: their number.
     """
     x, y, z = directions.unbind(-1)
     # cos and sin of m times the azimuth, by angle addition, without computing an angle.
@@ -57,9 +58,9 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
 
 
 def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return 64 directions, the pseudo-inverse of harmonics there, and a change of basis.
+    """Return 64 directions, the pseudo-inverse of harmonics at them, and a change of basis.
 
-    The change of basis is a matrix from e3nn's harmonics to qgs's.
+    The change of basis is a matrix from coefficients of e3nn's harmonics to those of qgs's.
     """
     generator = torch.Generator().manual_seed(0)
     double = {"dtype": torch.float64, "device": "cpu"}
@@ -93,9 +94,9 @@ def _fixed(degree: int, device: torch.device) -> tuple[Tensor, ...]:
 def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
     """Return the Wigner matrices (..., K, K) of rotations (..., 3, 3) in e3nn's basis.
 
-    They map the coefficients of a function on the sphere to those of the rotated function. They are
-    an exact fit, in float64, to values in 64 directions. The released code uses Euler angles, which
-    lose digits for small tilts.
+    The matrices map the coefficients of a function on the sphere to the coefficients of the rotated
+    function. They are an exact fit, in float64, to values in 64 directions. The released code uses
+    Euler angles, which lose digits for small tilts.
     """
     directions, inverse, _ = _fixed(degree, rotation.device)
     turned = torch.einsum("...ij,sj->...si", rotation.double(), directions)
@@ -104,9 +105,9 @@ def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
 
 
 def band_mask(degree: int, like: Tensor) -> Tensor:
-    """Return pixelSplat's factors of raw coefficients (K,).
+    """Return the factors (K,) by which pixelSplat multiplies raw coefficients of harmonics.
 
-    They are 1 for degree 0, and 0.1 / 4^l for each higher degree l.
+    The factors are 1 for degree 0, and 0.1 / 4^l for each higher degree l.
     """
     # Higher degrees start small (pixelSplat): at first colours hardly depend on the direction.
     each = [1.0, *(0.1 * 0.25**n for n in range(1, degree + 1))]
@@ -115,12 +116,13 @@ def band_mask(degree: int, like: Tensor) -> Tensor:
 
 @full_precision
 def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
-    """Return matrices (..., K, K) from raw coefficients in a camera's frame to qgs's in the world.
+    """Return matrices (..., K, K) from raw coefficients to coefficients in qgs's world frame.
 
-    rotation: camera to world (..., 3, 3). Degrees above SH_DEGREE stay in e3nn's basis. The matrix
-    first rotates in e3nn's basis, then changes the basis; these do not commute, because the
-    family's rasteriser uses different signs than e3nn. Published weights expect this order, and the
-    world frame in which they were trained (`views.frame: given`).
+    Raw coefficients are in a camera's frame. rotation: camera to world (..., 3, 3). Degrees above
+    SH_DEGREE stay in e3nn's basis. The matrix first rotates in e3nn's basis, then changes the
+    basis. These steps do not commute, because pixelSplat's rasteriser uses different signs than
+    e3nn. Published weights expect this order, and the world frame in which they were trained
+    (`views.frame: given`).
     """
     turn = turn_of_harmonics(rotation, degree) * band_mask(degree, rotation)
     return _fixed(degree, rotation.device)[2].to(rotation) @ turn
@@ -134,6 +136,7 @@ def camera_quaternions(raw_xyzw: Tensor) -> Tensor:
 def world_quaternions(camera_xyzw: Tensor, turn_wxyz: Tensor) -> Tensor:
     """Convert rotations of Gaussians to unit quaternions (..., 4), w x y z, in the world's frame.
 
-    camera_xyzw: rotations in the camera's frame; zeros mean none. turn_wxyz: camera to world.
+    camera_xyzw: rotations in the camera's frame; zeros mean no rotation. turn_wxyz: rotation from
+    the camera's frame to the world's.
     """
     return F.normalize(quat_product(turn_wxyz, unit(camera_xyzw.roll(1, -1))), dim=-1)

@@ -1,4 +1,7 @@
-"""CNN that gives the multi-view transformer features at 1/4 or 1/8 size (GMFlow, UniMatch)."""
+"""CNN from images to feature maps at 1/4 or 1/8 of the image size (GMFlow, UniMatch).
+
+The multi-view transformer reads these maps.
+"""
 
 from typing import NamedTuple
 
@@ -10,7 +13,7 @@ WIDTHS = (64, 96, 128)
 
 
 class Stages(NamedTuple):
-    """Maps of the CNN's three stages, and `features`, a 1 x 1 convolution of the third map."""
+    """Feature maps of the CNN's stages, and `features`, a 1 x 1 convolution of the third map."""
 
     first: Tensor
     second: Tensor
@@ -47,7 +50,7 @@ class ResidualBlock(nn.Module):
 class CNN(nn.Module):
     """CNN: 7 x 7 convolution to half size, three stages of two residual blocks, 1 x 1 convolution.
 
-    width: channels of the last convolution. strides: those of stages two and three. widths:
+    width: channels of the last convolution. strides: strides of stages two and three. widths:
     channels of the three stages. Instance norms have neither parameters nor running statistics, so
     the CNN computes the same in training and evaluation.
     """
@@ -67,7 +70,7 @@ class CNN(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images_N3HW: Tensor) -> Stages:
-        """Return the maps of images that are normalised by ImageNet's statistics."""
+        """Return feature maps of images that are normalised by ImageNet's mean and deviation."""
         # All stages are returned: the upsamplers take the finer ones.
         first = self.layer1(F.relu(F.instance_norm(self.conv1(images_N3HW))))
         second = self.layer2(first)

@@ -1,7 +1,7 @@
 """DepthSplat (Xu et al., arXiv 2410.13862): depth from a plane sweep and a pretrained ViT.
 
-Modules have the names of the released weights. Levels 0, 1 and 2 mean maps of 1/2, 1/4 and 1/8 of
-the image size. A scale is a sweep: 0 is the first.
+Names of parameters are those of the released weights. Level 0, 1 or 2 means maps of 1/2, 1/4 or 1/8
+of the image size. Scale 0 means the first plane sweep, scale 1 the second.
 """
 
 from collections.abc import Sequence
@@ -47,8 +47,8 @@ class DepthSplatConfig(ComponentConfig):
     """Sizes of DepthSplat's networks, by default of its small model for RealEstate10K."""
 
     features: int = Field(default=128, ge=32, multiple_of=32)
-    """Channels of the multi-view features and of the networks after the first sweep. The networks
-    after a second sweep have half as many."""
+    """Channels of the multi-view features and of the networks that process the first sweep. The
+    networks that process a second sweep have half as many."""
     cnn: tuple[Width, Width, Width] = WIDTHS
     """Channels of the three stages of the CNN."""
     candidates: int = Field(default=128, ge=16, multiple_of=8)
@@ -61,19 +61,20 @@ class DepthSplatConfig(ComponentConfig):
     """Side, in pixels of the image, of the square for which the first sweep finds a depth."""
     neighbours: int = Field(default=2, ge=1)
     """Number of nearest views with which each view is compared if there are more than three views.
-    With two or three, each is compared with all others."""
+    With two or three views, each view is compared with all others."""
     vit: VitConfig
     """Sizes and weights of DINOv2. `{}` is a ViT-S with random initial weights."""
     blocks: tuple[Block, Block, Block, Block] = Field(default=(2, 5, 8, 11), validate_default=True)
-    """Indices of the ViT blocks whose tokens are read, from 0. With a ViT-L: 4, 11, 17, 23."""
+    """Indices of the ViT blocks whose tokens are read. The first block has index 0. Published
+    values for a ViT-L: 4, 11, 17, 23."""
     dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)
-    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16 of the image size. With a ViT-B: 96,
-    192, 384, 768. With a ViT-L: 128, 256, 512, 1024."""
+    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16 of the image size. Published values for
+    a ViT-B: 96, 192, 384, 768; for a ViT-L: 128, 256, 512, 1024."""
     full_features: int = Field(default=64, ge=4, multiple_of=4)
     """Channels of the full-size features from which Gaussians are predicted. The DPT head that
-    corrects depths has half as many. With a ViT-B: 96. With a ViT-L: 128."""
+    corrects depths has half as many. Published values: 96 for a ViT-B, 128 for a ViT-L."""
     regressor: int = Field(default=64, ge=1)
-    """Channels that the first of the two networks for Gaussians passes to the second."""
+    """Number of channels between the two consecutive networks that predict Gaussians."""
 
     @field_validator("blocks")
     @classmethod
@@ -89,26 +90,30 @@ class DepthSplatConfig(ComponentConfig):
         return blocks
 
     def level(self, scale: int) -> int:
-        """Return the level of a sweep's cost volume; level 0 has 1/2 of the image size."""
+        """Return the level of a sweep's cost volume.
+
+        Level 0, 1 or 2 means 1/2, 1/4 or 1/8 of the image size.
+        """
         return self.stride.bit_length() - 2 - scale
 
     @property
     def finest(self) -> int:
-        """Level of the last sweep's cost volume; level 0 has 1/2 of the image size."""
+        """Level of the last sweep's cost volume: 0, 1, 2 mean 1/2, 1/4, 1/8 of the image size."""
         return self.level(self.scales - 1)
 
     @property
     def cnn_levels(self) -> tuple[int, int, int]:
-        """Levels of the CNN's three stages; level 0 has 1/2 of the image size."""
+        """Levels of the CNN's three stages: 0, 1, 2 mean 1/2, 1/4, 1/8 of the image size."""
         return (0, 0, 1) if self.stride == 4 else (0, 1, 2)
 
 
 class Depths(NamedTuple):
     """Results of `DepthPredictor`.
 
-    depths: camera-frame z (B, V, H, W) in world units, from each sweep; only the last is corrected
-    by the DPT head. confidence: largest probability in the last sweep (B V, 1, H, W). maps: tokens
-    of the ViT (B V, C, H/8, W/8). joined: maps of other networks that join these in a DPT head.
+    depths: camera-frame z (B, V, H, W) in world units, one tensor for each sweep; a DPT head
+    corrects only the last tensor. confidence: largest probability of a depth in the last sweep,
+    (B V, 1, H, W). maps: tokens of the ViT (B V, C, H/8, W/8). joined: maps of other networks,
+    which a DPT head reads together with `maps`.
     """
 
     depths: list[Tensor]
@@ -118,7 +123,7 @@ class Depths(NamedTuple):
 
 
 class Pyramid(nn.Module):
-    """Network that returns its input and a map with half the channels and twice the size."""
+    """Network that returns its input, and also a map with half the channels and twice the size."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -134,7 +139,7 @@ def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
     """Return the indices (B, V, J) of the views with which each view is compared.
 
     With up to three views, these are all other views in ascending order. With more views, they are
-    the `count` nearest, nearest first.
+    the J = `count` views with the nearest cameras, nearest first.
     """
     scenes, views = c2w_BV44.shape[:2]
     if views <= 3:
@@ -147,7 +152,7 @@ def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
 
 
 def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
-    """Return the least and the largest inverse depth of a sweep, each (B V, 1, 1)."""
+    """Return the least and the largest inverse depth of a sweep, two tensors (B V, 1, 1)."""
     least, most = (1 / x.flatten()[:, None, None] for x in (sweep.far, sweep.near))
     return least, most
 
@@ -156,7 +161,8 @@ def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
 def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) -> Tensor:
     """Return inverse depths (N, D, 2h, 2w) for a second sweep, around the result of the first.
 
-    coarse: inverse depths from the first sweep. first: its number of candidates. count: D.
+    coarse: inverse depths from the first sweep. first: number of depths in the first sweep. count:
+    D, the number of depths in the second sweep.
     """
     height, width = coarse_N1hw.shape[-2:]
     # No gradient: the first scale learns from its own depth.
@@ -208,7 +214,7 @@ class DepthPredictor(nn.Module):
     def forward(
         self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
     ) -> Depths:
-        """Return the depths of all pixels. near, far: their bounds, camera-frame z, world units."""
+        """Return the depths of all pixels. near, far: bounds of camera-frame z in world units."""
         size = images_BV3HW.shape[-2:]
         shape = images_BV3HW.shape[:2]
         normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
@@ -240,10 +246,10 @@ class DepthPredictor(nn.Module):
     def match(
         self, cnn: Stages, multi: Sequence[Tensor], mono: Sequence[Tensor], sweep: Sweep
     ) -> tuple[list[Tensor], Tensor]:
-        """Return inverse depths (B V, 1, h, w) from all sweeps, and a confidence of the last.
+        """Return inverse depths (B V, 1, h, w) from each sweep, and the last sweep's confidence.
 
-        The confidence of a pixel is the largest probability of its candidates. cnn: maps of the
-        CNN. multi, mono: features of the transformer and the ViT for each sweep.
+        The confidence of a pixel is the largest probability of a depth. cnn: maps of the CNN.
+        multi, mono: features of the transformer and features of the ViT, one map for each sweep.
         """
         # `list[Tensor]()` would break the graph of torch.compile.
         found: list[Tensor] = []
@@ -285,9 +291,9 @@ class DepthPredictor(nn.Module):
     def beside(
         self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None
     ) -> list[tuple[list[Tensor], list[Tensor]]]:
-        """Return the maps that join the ViT's map in a DPT head, at 1/2, 1/4 and 1/8 size.
+        """Return the maps that a DPT head concatenates with the ViT's, at 1/2, 1/4 and 1/8 size.
 
-        Each size has two lists: maps before the ViT's channels, and maps after them.
+        Each size has two lists: maps to put before the ViT's channels, and maps to put after them.
         """
         # The order of the release: CNN, ViT, transformer, depth. If its CNN ends at 1/4, nothing
         # joins at 1/8.
@@ -306,7 +312,7 @@ class DepthPredictor(nn.Module):
 def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
     """Make a DPT head that reads the maps of CNN, transformer and ViT.
 
-    depth: read inverse depth as well, and return a correction of it.
+    depth: True makes a head that also reads inverse depth, and returns a correction of this depth.
     """
     # Channels that join at each level, for the sizes of the projections.
     others = [0] * LEVELS
@@ -345,7 +351,8 @@ class DepthSplat(nn.Module):
     ) -> tuple[list[Tensor], Tensor]:
         """Return depths (B, V, H, W) from each sweep, and raw Gaussians (B, V, 10 + 3 K, H, W).
 
-        near, far: bounds of depth, camera-frame z, world units. K: number of harmonics per colour.
+        near, far: bounds of depth, camera-frame z in world units. K: number of harmonics per
+        colour.
         """
         found = self.depth_predictor(images_BV3HW, cameras, near_BV, far_BV)
         features_NFHW = self.feature_upsampler(found.maps, found.joined)

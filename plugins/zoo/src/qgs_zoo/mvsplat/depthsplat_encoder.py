@@ -19,10 +19,10 @@ from qgs_zoo.mvsplat.sweep import DepthRange, SweepEncoder
 class DepthSplatEncoder(SweepEncoder):
     """Encoder that predicts depth and raw Gaussian of each pixel, with a plane sweep and a ViT.
 
-    The ViT is pretrained. The memory has a token for each pixel. Its D numbers are those of
-    `qgs_zoo.mvsplat.pixels.CHANNELS`, then coefficients of harmonics. The pixel's colour is added
-    to the constant coefficient. D is the model's width: 38 for harmonics of degree 2 (published).
-    A wider model has zeros at the end.
+    The ViT is pretrained. The memory has a token for each pixel. The D numbers of a token are those
+    of `qgs_zoo.mvsplat.pixels.CHANNELS`, then coefficients of harmonics. The pixel's colour is
+    added to the constant coefficient. D is the model's width: 38 for harmonics of degree 2
+    (published). In a wider model, tokens have zeros at the end.
     """
 
     name = "depthsplat"

@@ -1,7 +1,8 @@
-"""DPT heads (Ranftl et al., arXiv 2103.13413) of DepthSplat, from ViT tokens to full-size maps.
+"""DepthSplat's DPT heads (Ranftl et al., arXiv 2103.13413), from ViT tokens to full-size maps.
 
 Four maps of a ViT are resized to 1/2, 1/4, 1/8 and 1/16 of the image size. Features of other
-networks join them at 1/2, 1/4 and 1/8. Coarse maps are then added to finer ones, step by step.
+networks are concatenated with the maps at 1/2, 1/4 and 1/8. Then each map is added to the next
+finer map, from coarse to fine.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ LEVELS = 3
 
 
 class ResidualUnit(nn.Module):
-    """Residual unit x + conv(relu(conv(relu x))), with 3 x 3 convolutions, on (X, F, h, w)."""
+    """Residual unit x + conv(relu(conv(relu(x)))) with 3 x 3 convolutions, on maps (X, F, h, w)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -37,9 +38,9 @@ class Fusion(nn.Module):
         self.resConfUnit2 = ResidualUnit(channels)
 
     def forward(self, coarse: Tensor | None, skip: Tensor, size: Sequence[int]) -> Tensor:
-        """Return the sum of the map `skip` and `coarse`, resized to `size`: (X, F, *size).
+        """Return the sum of the maps `skip` and `coarse`, resized to `size`: (X, F, *size).
 
-        coarse: sum of the coarser maps, or None if `skip` is the coarsest map.
+        coarse: sum of all maps coarser than `skip`, or None if `skip` is the coarsest map.
         """
         if self.resConfUnit1 is not None and coarse is not None:
             skip = coarse + self.resConfUnit1(skip)
@@ -61,7 +62,10 @@ class Scratch(nn.Module):
         self.output_conv = _to_depth(features) if ends_in_depth else None
 
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
-        """Return a full-size map (X, F or 1, H, W) from maps at 1/2, 1/4, 1/8 and 1/16 size."""
+        """Return a full-size map from maps at 1/2, 1/4, 1/8 and 1/16 of the image size.
+
+        The map is (X, F, H, W), or with `ends_in_depth` (X, 1, H, W).
+        """
         path = None
         # From coarse to fine: each fusion doubles the size.
         for number in range(len(maps), 0, -1):
@@ -74,7 +78,7 @@ class Scratch(nn.Module):
 
 
 def _to_depth(features: int) -> nn.Sequential:
-    """Return layers that predict a correction of depth, which is 0 before training."""
+    """Return layers that predict a correction of depth. The correction is 0 before training."""
     return nn.Sequential(
         *two_convolutions(features, features // 2, 16, "replicate"),
         nn.GELU(),
@@ -83,12 +87,11 @@ def _to_depth(features: int) -> nn.Sequential:
 
 
 class DptHead(nn.Module):
-    """Head that makes one full-size map of four ViT maps at 1/8 size and maps of other networks.
+    """Head that combines four ViT maps at 1/8 size and maps of other networks in a full-size map.
 
-    width: channels of the ViT's maps. channels: those of the head at its four resolutions.
+    width: channels of the ViT's maps. channels: channels of the head at its four resolutions.
     features: F, channels of the result. joined: total channels of the other networks' maps at 1/2,
-    1/4 and 1/8.
-    ends_in_depth: return one channel, a correction of depth.
+    1/4 and 1/8. ends_in_depth: True makes the result one channel, a correction of depth.
     """
 
     def __init__(
@@ -124,8 +127,8 @@ class DptHead(nn.Module):
     ) -> Tensor:
         """Return a full-size map (X, F, H, W), or (X, 1, H, W) if the head ends in depth.
 
-        joined: two lists for 1/2, 1/4 and 1/8 each, the maps to put before and those to put after
-        the ViT's.
+        joined: maps of other networks, two lists for each of the sizes 1/2, 1/4 and 1/8: maps to
+        put before the ViT's channels, and maps to put after them.
         """
         own = [
             resize(project(x))

@@ -1,6 +1,6 @@
-"""`mvsplat/gaussians`, `mvsplat/depthsplat_gaussians`: heads that make Gaussians of raw numbers.
+"""`mvsplat/gaussians`, `mvsplat/depthsplat_gaussians`: heads that turn raw numbers into Gaussians.
 
-Each pixel has raw numbers, from which one Gaussian gets its attributes.
+Each pixel has raw numbers, which a head turns into the attributes of one Gaussian.
 """
 
 from abc import abstractmethod
@@ -36,16 +36,16 @@ SCALE_SHIFT = 4.0
 
 
 class PixelHead(Head):
-    """Base of heads without parameters that make a Gaussian of each query of `mvsplat/pixels`."""
+    """Base of heads without parameters that turn each query of `mvsplat/pixels` into a Gaussian."""
 
     writes: ClassVar[Fields] = {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]}
 
     @abstractmethod
     def scales(self, raw: Tensor, log_depth: Tensor, state: QueryState) -> Tensor:
-        """Return scales (B, N, 1, 3), world units, from raw scales and logarithms of depths."""
+        """Return scales (B, N, 1, 3) in world units, from raw scales and logarithms of depths."""
 
     def opacities(self, p: Tensor) -> Tensor:
-        """Return opacities from p, the sigmoids of the opacity logits."""
+        """Return the opacities of Gaussians. p: sigmoids of their logits."""
         return p
 
     @property
@@ -73,7 +73,7 @@ class PixelHead(Head):
 
 
 class RayHead(PixelHead):
-    """Head of MVSplat: scales follow the depth and size of the pixel.
+    """Head of MVSplat: scales are proportional to the size of a pixel at the Gaussian's depth.
 
     Scales are (scale_min + (scale_max - scale_min) sigmoid(raw)) * 0.1 t (1 / fx + 1 / fy), with t
     the depth and fx, fy the focal lengths in pixels. Opacities are (1 - (1 - p)^e + p^(1 / e)) / 2,
@@ -110,7 +110,7 @@ class RayHead(PixelHead):
 
 
 class WorldHead(PixelHead):
-    """Head of DepthSplat: scales do not depend on depth or size of the pixel.
+    """Head of DepthSplat: scales do not depend on the depth and size of a pixel.
 
     Scales are softplus(raw - 4), bounded by `scale_min` and `scale_max`.
     """
@@ -120,9 +120,9 @@ class WorldHead(PixelHead):
 
     class Config(ComponentConfig):
         scale_min: float = Field(default=1e-10, gt=0)
-        """Least scale of a Gaussian, world units."""
+        """Least scale of a Gaussian, in world units."""
         scale_max: float = Field(default=3.0, gt=0)
-        """Largest scale of a Gaussian, world units. DepthSplat's demos at 512 x 960 use 0.1."""
+        """Largest scale of a Gaussian, in world units. DepthSplat's demos at 512 x 960 use 0.1."""
 
     config: Config
 
@@ -131,7 +131,7 @@ class WorldHead(PixelHead):
 
 
 def harmonics_of(features_BND: Tensor) -> Tensor:
-    """Return from the features of pixels the coefficients (B, N, K, 3) of rendered harmonics."""
+    """Return the K coefficients (B, N, K, 3) of rendered harmonics from the features of pixels."""
     degree = degree_of(features_BND.shape[-1])
     first = sum(CHANNELS)
     sh_BNC = numbers_of(features_BND)[..., first : first + 3 * coefficients(degree)]
@@ -140,7 +140,7 @@ def harmonics_of(features_BND: Tensor) -> Tensor:
 
 
 def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
-    """Return opacities (1 - (1 - p)^e + p^(1 / e)) / 2 with e = 2^exponent; p for exponent 0."""
+    """Return opacities (1 - (1 - p)^e + p^(1 / e)) / 2, with e = 2^exponent. Exponent 0 gives p."""
     if exponent == 0:
         return p
     # The mean of two curves, which is p for an exponent of 0 (published weights). The released code

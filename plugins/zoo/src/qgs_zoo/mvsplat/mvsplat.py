@@ -1,6 +1,6 @@
 """`mvsplat/mvsplat`: MVSplat's networks as an encoder (arXiv 2403.14627).
 
-They are a CNN, a window transformer, a plane sweep and two U-Nets.
+The networks are a CNN, a window transformer, a plane sweep and two U-Nets.
 """
 
 from typing import Literal, NamedTuple
@@ -40,7 +40,7 @@ class Backbone(nn.Module):
         self.transformer = WindowTransformer(width)
 
     def forward(self, images_BV3HW: Tensor, neighbours_BVJ: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features of the CNN and of the transformer, each (B, V, D, H/4, W/4)."""
+        """Return features of the CNN, and features of the transformer, each (B, V, D, H/4, W/4)."""
         normalized = imagenet_normalised(images_BV3HW).flatten(0, 1)
         cnn = self.backbone(normalized).features.unflatten(0, images_BV3HW.shape[:2])
         return cnn, self.transformer(with_positions(cnn), neighbours_BVJ)
@@ -50,9 +50,9 @@ class MVSplatEncoder(SweepEncoder):
     """Encoder that predicts depth and raw Gaussian of each pixel with a plane sweep.
 
     The memory has a token for each pixel, or for each square of pixels if `stride` is more than 1.
-    Its D numbers are those of `qgs_zoo.mvsplat.pixels.CHANNELS`, then harmonics. D is the model's
-    width: 86 for harmonics of degree 4 (published). The order of views matters. A single view is
-    compared with itself.
+    The D numbers of a token are those of `qgs_zoo.mvsplat.pixels.CHANNELS`, then coefficients of
+    harmonics. D is the model's width: 86 for harmonics of degree 4 (published). The order of views
+    matters. A single view is compared with itself.
     """
 
     name = "mvsplat"
@@ -63,8 +63,8 @@ class MVSplatEncoder(SweepEncoder):
         features: int = Field(default=128, ge=4, multiple_of=4)
         """Channels of the features that the plane sweep compares."""
         stride: Literal[1, 2, 4] = 1
-        """Side, in pixels, of the square of pixels that gives one Gaussian. 1 gives one Gaussian
-        per pixel (published)."""
+        """Side, in pixels, of the square that gives one Gaussian. 1 gives one Gaussian per pixel
+        (published)."""
         candidates: int = Field(default=128, ge=2)
         """Number of depths in the plane sweep, evenly spaced in inverse depth from `far` to
         `near`."""
@@ -79,8 +79,8 @@ class MVSplatEncoder(SweepEncoder):
         """Number of levels of the U-Net that refines depths. The lowest level has attention over
         all views."""
         cost_volume: bool = True
-        """Compare views in the plane sweep. With false, zeros replace the correlations of views, so
-        depths are predicted from features alone (the paper's ablation)."""
+        """Compare views in the plane sweep. False replaces the correlations of views by zeros, so
+        that depths are predicted from features alone (the paper's ablation)."""
 
     config: Config
 
@@ -103,9 +103,10 @@ class MVSplatEncoder(SweepEncoder):
 
 
 class Sweep(NamedTuple):
-    """Inputs of a plane sweep: cameras (B, V), views to compare, least and largest depths (B, V).
+    """Inputs of a plane sweep: cameras, views to compare, and depths.
 
-    neighbours: indices (B, V, J) of the views with which each view is compared.
+    cameras: (B, V). neighbours: indices (B, V, J) of the J views with which each view is compared.
+    near, far: least and largest depth in world units, (B, V).
     """
 
     cameras: Cameras
@@ -150,7 +151,8 @@ class DepthPredictor(nn.Module):
     ) -> Tensor:
         """Return C numbers per pixel (B, V, C, H, W).
 
-        They are the logarithm of the depth, the opacity logit and the rest of the raw Gaussian.
+        These numbers are the logarithm of the depth, the opacity logit and the rest of the raw
+        Gaussian.
         """
         views = images_BV3HW.shape[1]
         # These networks see images in [0, 1]; only the CNN sees normalised ones.
@@ -176,7 +178,7 @@ class DepthPredictor(nn.Module):
     def match(self, features_BVDhw: Tensor, sweep: Sweep) -> tuple[Tensor, Tensor]:
         """Return inverse depths and confidences, each (B V, 1, h, w), at 1/4 of the image size.
 
-        The confidence is the largest probability of the pixel's candidates.
+        The confidence of a pixel is the largest probability of a depth of the sweep.
         """
         count = self.regressor_residual.out_channels
         candidates_BVD = inverse_depth_candidates(sweep.near, sweep.far, count)
@@ -200,7 +202,10 @@ class DepthPredictor(nn.Module):
 
 @full_precision
 def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean of candidates, weighted by softmax(logits), and the largest weight."""
+    """Return the mean of candidates, weighted by softmax(logits), and the largest weight.
+
+    Candidates are inverse depths of a plane sweep.
+    """
     probability = logits_NDhw.softmax(1)
     # A mean, not the best candidate: it has a gradient and can lie between candidates.
     disparity = (probability * candidates_NDhw).sum(1, keepdim=True)
@@ -213,7 +218,7 @@ def refined_log_depth(
 ) -> Tensor:
     """Return logarithms of depths (B V, 1, H, W), with depths clamped to [near, far].
 
-    disparity: inverse depth. change: its correction, which is added.
+    disparity: inverse depth. change: correction to add to the inverse depth.
     """
     # Inverse depth grows towards the camera.
     least, most = (1 / x.flatten()[:, None, None, None] for x in (far_BV, near_BV))

@@ -46,18 +46,18 @@ WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 
 def degree_of(width: int) -> int:
     """Return the largest degree of harmonics that fits into the D = `width` numbers of a pixel.
 
-    Numbers after these harmonics are not read.
+    Numbers after the harmonics of this degree are not read.
     """
     return max([1, *(degree for least, degree in WIDTHS.items() if least <= width)])
 
 
 def numbers_of(features_BND: Tensor) -> Tensor:
-    """Return features, padded with zeros if they are narrower than the numbers of a pixel."""
+    """Return features, padded with zeros if they have fewer channels than a pixel needs."""
     return F.pad(features_BND, (0, max(0, min(WIDTHS) - features_BND.shape[-1])))
 
 
 def width_problems(context: RecipeContext) -> Iterable[Problem]:
-    """Report a model whose width is too small for the numbers of a pixel."""
+    """Report a model whose width is less than the number of channels that a pixel needs."""
     least = min(WIDTHS)
     if context.dims.width < least:
         reason = f"the model is {context.dims.width} wide, but a pixel has at least {least} numbers"
@@ -68,8 +68,8 @@ def width_problems(context: RecipeContext) -> Iterable[Problem]:
 class PixelQueries(Queries):
     """One query for each pixel, with the rays through the pixel and the rotation of its camera.
 
-    Its features are the encoder's numbers of the pixel, with harmonics rotated from the camera's
-    frame to the world's.
+    The features of a query are the encoder's numbers of the pixel, with harmonics rotated from the
+    camera's frame to the world's.
     """
 
     name = "pixels"
@@ -90,9 +90,9 @@ class PixelQueries(Queries):
 
 @full_precision
 def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
-    """Return numbers of pixels with harmonics rotated from the cameras' frames to the world's.
+    """Return features of pixels with harmonics rotated from the cameras' frames to the world's.
 
-    features: numbers of pixels in the cameras' frames, view by view. rotation: camera to world.
+    features: features of pixels in the cameras' frames, view by view. rotation: camera to world.
     """
     numbers_BMC = numbers_of(features_BMD)
     degree = degree_of(features_BMD.shape[-1])
@@ -108,7 +108,10 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
 
 
 def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
-    """Return PIXEL_FIELDS, (B, V * rows * columns, ...), of images of rows x columns pixels."""
+    """Return the state fields PIXEL_FIELDS of images of rows x columns pixels.
+
+    Each field is (B, V * rows * columns, ...): rays of a pixel, or the rotation of its camera.
+    """
     turn = quaternions(cameras.c2w[..., :3, :3]).repeat_interleave(rows * columns, 1)
     return {PIXEL: pixel_rays(cameras, rows, columns), TURN: turn}
 
@@ -116,9 +119,9 @@ def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]
 class OnRays(Centers):
     """Gaussian means at o + t d on rays through pixels, with o the camera's centre.
 
-    A Gaussian's three offsets are two raw numbers and the logarithm of t in world units. The
-    sigmoids of the raw numbers are the position in the pixel, from its upper left corner, through
-    which the ray with direction d goes.
+    A Gaussian's three offsets are two raw numbers and the logarithm of t in world units. The ray
+    with direction d goes through a position in the pixel. The sigmoids of the raw numbers are this
+    position, from the pixel's upper left corner, in pixels.
     """
 
     name = "on_rays"
@@ -126,9 +129,9 @@ class OnRays(Centers):
 
     class Config(ComponentConfig):
         measure: Literal["distance", "depth"] = "distance"
-        """Measure t along the ray ("distance", MVSplat), or along the camera's axis ("depth",
-        DepthSplat). MVSplat's sweep finds depths, but its head uses them as distances, which its
-        published weights expect."""
+        """Direction in which t is measured. `distance`: along the ray (MVSplat). `depth`: along the
+        camera's axis (DepthSplat). MVSplat's sweep finds depths, but its head uses them as
+        distances, which its published weights expect."""
 
     config: Config
 
@@ -142,8 +145,8 @@ class OnRays(Centers):
 def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:
     """Return directions (B, N, K, 3) of rays through positions in pixels.
 
-    place: logits of positions (B, N, K, 2). pixel: rays of pixels. unit: return directions of
-    length 1; with False, directions with z = 1 in the camera's frame.
+    place: logits of positions in the pixel (B, N, K, 2). pixel: rays of pixels. unit: True gives
+    directions of length 1, False directions with z = 1 in the camera's frame.
     """
     _, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
     # The sigmoid keeps places inside their pixel.

@@ -37,9 +37,9 @@ PAIRS = 40
 
 
 def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
-    """Return the indices (B, V, V - 1) of the views after each view; the first follows the last.
+    """Return the indices (B, V, V - 1) of the views that follow each view in cyclic order.
 
-    A single view is its own neighbour.
+    The first view follows the last view. A single view is its own neighbour.
     """
     view = torch.arange(views, device=device)
     # A single view is compared with itself.
@@ -64,18 +64,18 @@ def relative_poses(c2w_BV44: Tensor, neighbours_BVJ: Tensor) -> Tensor:
 
 @full_precision
 def feature_lenses(cameras: Cameras, size: Sequence[int]) -> Tensor:
-    """Return the intrinsics (B, V, 4) of cameras for images resized to `size`, (H, W)."""
+    """Return the intrinsics (B, V, 4) of cameras after resizing the images to `size` (H, W)."""
     scale = (size[1] / cameras.size[1], size[0] / cameras.size[0])
     return cameras.intrinsics * constant([*scale, *scale], cameras.intrinsics)
 
 
 @full_precision
 def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
-    """Project pixels at given depths into another view: positions (N, D, h, w, 2).
+    """Project pixels at D given depths into another view, and return positions (N, D, h, w, 2).
 
-    Positions are in the units of torch's `grid_sample`. depth: camera-frame z of pixels, world
-    units. lens: fx, fy, cx, cy of both views. pose: transform from this view's camera to the
-    other's.
+    Positions are in the units of torch's `grid_sample`. depth: camera-frame z of pixels, in world
+    units. lens: fx, fy, cx, cy in pixels, used for both views. pose: transform from the frame of
+    the pixels' camera to the frame of the other camera.
     """
     height, width = depth_NDhw.shape[-2:]
     fx, fy, cx, cy = (x[:, None, None] for x in lens_N4.unbind(-1))
@@ -97,7 +97,10 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
 
 
 def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
-    """Sample features of another view at the positions `grid`: (N, C, D, h, w), 0 outside."""
+    """Sample features of another view at the positions `grid`: (N, C, D, h, w).
+
+    The result is 0 outside of the other view.
+    """
     flat = grid_NDhw2.flatten(1, 2).to(features_NCHW)
     sampled = F.grid_sample(features_NCHW, flat, "bilinear", "zeros", align_corners=True)
     return sampled.unflatten(2, grid_NDhw2.shape[1:3])
@@ -112,10 +115,10 @@ def cost_volume(
 ) -> Tensor:
     """Correlate the features of each pixel with those of neighbour views at D depths.
 
-    Returns the mean over neighbours of <f, f'> / sqrt(C), (B, V, D, h, w), with f the feature of
-    the pixel and f' that of the neighbour at the pixel's position there. It is 0 outside of the
-    neighbour. inverse_depth: candidates in 1 / world units; its h and w may be 1, for the same
-    candidates in all pixels.
+    Returns the mean over neighbours of <f, f'> / sqrt(C), (B, V, D, h, w). f is the feature of a
+    pixel, and f' the neighbour's feature where the pixel is projected to. f' is 0 outside of the
+    neighbour. inverse_depth: the D inverse depths of each pixel, in 1 / world units; h and w of
+    this tensor may be 1, which gives all pixels the same depths.
     """
     scenes, views, channels, height, width = features_BVChw.shape
     depth_NDhw = (1 / inverse_depth_BVDhw.detach()).flatten(0, 1)
@@ -138,7 +141,7 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlate features with those sampled from another view, part by part: (N, D, h, w)."""
+    """Correlate features with features sampled from another view, part by part: (N, D, h, w)."""
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
@@ -152,9 +155,9 @@ def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Te
 def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
     """Correlate all pairs of pixels of both views, then sample the correlations: (N, D, h, w).
 
-    The result is that of `_of_warped`, because sampling is linear in the features. All correlations
-    are one matrix product, and sampling them handles one channel instead of C. This is faster if
-    there are few pixels per depth.
+    The result equals the result of `_of_warped`, because sampling is linear in the features. All
+    correlations are one matrix product, and sampling them handles one channel instead of C. This is
+    faster if there are few pixels per depth.
     """
     count, _, height, width = own.shape
     grid_NPD2 = warp_grid(depth, lens, pose).permute(0, 2, 3, 1, 4).flatten(1, 2)
@@ -173,9 +176,9 @@ def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose:
 
 
 def _each(part: Callable[..., Tensor], given: Sequence[tuple[Tensor, ...]]) -> list[Tensor]:
-    """Return the results of `part` for each tuple of tensors in `given`.
+    """Return the results of calling `part` with each tuple of tensors in `given`.
 
-    If there are several, they are computed again in the backward pass, to save memory.
+    If there are several tuples, results are computed again in the backward pass, to save memory.
     """
     if len(given) == 1:
         return [part(*given[0])]
@@ -189,11 +192,11 @@ class DepthRange(ComponentConfig):
     """Range of depths in a plane sweep."""
 
     near: float = Field(gt=0)
-    """Least depth in the sweep, world units. Published models use 1 (MVSplat) or 0.5 (DepthSplat),
-    with `views.frame: given`."""
+    """Least depth in the sweep, in world units. Published models use 1 (MVSplat) or 0.5
+    (DepthSplat), with `views.frame: given`."""
     far: float = Field(gt=0)
-    """Largest depth in the sweep, world units. Published models use 100, or 200 for DepthSplat on
-    DL3DV."""
+    """Largest depth in the sweep, in world units. Published models use 100, but DepthSplat uses 200
+    on DL3DV."""
 
     @field_validator("far")
     @classmethod
@@ -223,14 +226,14 @@ class SweepEncoder(Encoder):
     @classmethod
     @abstractmethod
     def multiple(cls, config: DepthRange) -> int:
-        """Return the number of pixels that must divide the sides of images.
+        """Return a number of pixels, of which the sides of images must be multiples.
 
         The windows of the transformer and the levels of the U-Nets require this.
         """
 
     @abstractmethod
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        """Return C numbers of each pixel (B, V, C, H, W), with depths from `near` to `far`."""
+        """Return C numbers of each pixel (B, V, C, H, W). near, far: depth bounds, world units."""
 
     @classmethod
     def problems(cls, config: DepthRange, context: RecipeContext) -> Iterable[Problem]:

@@ -1,4 +1,4 @@
-"""Supervision of DepthSplat's coarse and final depths: the same Gaussians are placed at each.
+"""Supervision of DepthSplat's two depths: the Gaussians are rendered at coarse and final depth.
 
 With two decoder layers `mvsplat/exchange`, the Gaussians of layer 1 have the coarse depth, and the
 Gaussians of layer 2 the final depth. `mvsplat/decayed` sets the weights of the layers in the
@@ -17,7 +17,7 @@ from qgs.types import ImageMemory, QueryState
 
 
 class Exchange(DecoderLayer):
-    """Decoder layer that exchanges a query's first and last feature: coarse and final depth.
+    """Decoder layer that swaps a query's first and last feature: its final and its coarse depth.
 
     The first feature is the depth at which the Gaussian is placed. The encoder needs
     `coarse_depth: true`. With an even number of these layers, the last one has the final depth.
@@ -27,7 +27,7 @@ class Exchange(DecoderLayer):
     reads_layer_scale = False
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Return queries with exchanged depths, and the memory unchanged."""
+        """Return queries with swapped depths, and the memory unchanged."""
         # The depth in use is first, the other one last.
         own, rest, other = state.features.tensor_split([1, state.features.shape[-1] - 1], -1)
         return state.replace(features=torch.cat([other, rest, own], -1)), memory
@@ -36,7 +36,7 @@ class Exchange(DecoderLayer):
 class DecayedSupervision(LayerSupervision):
     """Supervision in which the weight of each layer is `decay` times that of the next layer.
 
-    Weights add up to 1. In the released code their sum is 1.9 for two depths. This factor of all
+    Weights add up to 1. In the released code, they add up to 1.9 for two depths. This factor of all
     gradients does not affect Adam, but it affects gradient clipping.
     """
 
@@ -63,7 +63,10 @@ class DepthError(Metric):
     column = Column("AbsRel", "lower")
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return |z - true z| / true z where the true depth is known; 1 if nothing is rendered."""
+        """Return |z - true z| / true z of all pixels with a known true depth.
+
+        z is the rendered depth. A pixel where nothing is rendered gives 1.
+        """
         assert given.depth is not None
         assert given.true_depth is not None
         # Zero means that there is no measurement.

@@ -1,6 +1,6 @@
 """Small convolutional networks, and a U-Net with attention over the pixels of all views.
 
-The U-Net is that of latent diffusion, without the embedding of time.
+The U-Net is the one of latent diffusion, without the embedding of time.
 """
 
 from collections.abc import Sequence
@@ -58,7 +58,7 @@ class OverViews(nn.Sequential):
 class ResidualBlock(nn.Module):
     """Residual block of two convolutions.
 
-    pre_norm: put a norm before each convolution; with False, after each.
+    pre_norm: True puts a norm before each convolution, False after each convolution.
     """
 
     def __init__(self, inputs: int, outputs: int, pre_norm: bool) -> None:
@@ -81,7 +81,10 @@ class ResidualBlock(nn.Module):
 
 
 class ViewAttention(nn.Module):
-    """Attention over the pixels of all views, with heads of 32 channels, without positions."""
+    """Self-attention over the pixels of all views, with heads of 32 channels.
+
+    Positions of pixels are not embedded.
+    """
 
     def __init__(self, width: int, pre_norm: bool) -> None:
         super().__init__()
@@ -92,7 +95,7 @@ class ViewAttention(nn.Module):
         zeroed(self.proj_out if pre_norm else self.norm)
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
-        """Return maps (B V, C, H, W) after attention to all V = `views` maps of their scene."""
+        """Return maps (B V, C, H, W). Each attends to all V = `views` maps of its scene."""
         x_NCT = x_NCHW.flatten(2)
         raw_NCT = self.qkv(self.norm(x_NCT) if self.pre_norm else x_NCT)
         # Rows of `qkv` are ordered head by head: q, k, v of the first head, then of the second ...
@@ -116,7 +119,7 @@ class Downsample(nn.Module):
 
 
 class Upsample(nn.Module):
-    """Resizing to twice the size by nearest neighbours, then a 3 x 3 convolution."""
+    """Upsampling to twice the size by nearest neighbours, then a 3 x 3 convolution."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -129,8 +132,8 @@ class Upsample(nn.Module):
 class UNet(nn.Module):
     """U-Net with one residual block per level on the way down and two on the way up.
 
-    It maps (B V, C, H, W) to the same shape. On the lowest level, attention follows each of these
-    blocks. H and W must be multiples of 2 ** (levels - 1).
+    The U-Net maps (B V, C, H, W) to the same shape. On the lowest level, an attention layer follows
+    each of these blocks. H and W must be multiples of 2 ** (levels - 1).
     """
 
     def __init__(self, width: int, levels: int, pre_norm: bool) -> None:
@@ -161,7 +164,7 @@ class UNet(nn.Module):
             self.out = nn.Sequential(final, group_norm(width), nn.SiLU())
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
-        """Return maps of the same shape. x: V = `views` maps of each scene, scene by scene."""
+        """Return maps with the shape of `x_NCHW`: `views` maps of each scene, scene by scene."""
         skips = []
         for module in self.input_blocks:
             x_NCHW = module(x_NCHW, views)

@@ -1,4 +1,7 @@
-"""Multi-view transformer with attention in 2 x 2 windows of the views (GMFlow, UniMatch)."""
+"""Multi-view transformer with attention in windows (GMFlow, UniMatch).
+
+The feature map of each view is divided into 2 x 2 windows.
+"""
 
 import math
 
@@ -17,7 +20,7 @@ MASKED = -100.0
 
 
 def positions(width: int, rows: int, columns: int, device: torch.device) -> Tensor:
-    """Return the sine embedding (D, rows, columns) of positions in a window (DETR).
+    """Return DETR's sine embedding (D, rows, columns) of positions in a window.
 
     The first half of the channels embeds y, the second half x.
     """
@@ -37,7 +40,7 @@ def positions(width: int, rows: int, columns: int, device: torch.device) -> Tens
 
 
 def with_positions(x_BVCHW: Tensor) -> Tensor:
-    """Add the embedding of the position inside each window to the features."""
+    """Add to the features of each pixel an embedding of the pixel's position in its window."""
     width, height, columns = x_BVCHW.shape[2:]
     # Positions repeat in each window, because attention sees one window at a time.
     window = positions(width, height // SPLIT, columns // SPLIT, x_BVCHW.device).to(x_BVCHW)
@@ -45,10 +48,11 @@ def with_positions(x_BVCHW: Tensor) -> Tensor:
 
 
 def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
-    """Return the numbers (4, L, L) to add to logits when the map is rolled by half a window.
+    """Return the numbers (4, L, L) to add to attention logits for a map rolled by half a window.
 
-    A rolled window may hold pixels from opposite edges of the map. Between them the number is
-    MASKED; otherwise it is 0. L is the number of pixels in each of the four windows.
+    A window of a rolled map may contain pixels from opposite edges of the map. The number for such
+    a pair of pixels is MASKED, and for all other pairs 0. L is the number of pixels in each of the
+    four windows.
     """
 
     def pieces(size: int) -> Tensor:
@@ -63,7 +67,7 @@ def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
 
 
 def in_windows(x_BVHWC: Tensor, shift: tuple[int, int]) -> Tensor:
-    """Roll maps (B, V, H, W, C) by minus `shift` (rows, columns), and cut them into windows.
+    """Roll maps (B, V, H, W, C) by minus `shift` (rows, columns), and cut them into 2 x 2 windows.
 
     Returns (B, V, 4, L, C), with L the number of pixels in a window.
     """
@@ -82,9 +86,8 @@ def out_of_windows(x_BVWLC: Tensor, size: tuple[int, int], shift: tuple[int, int
 class Attention(nn.Module):
     """Attention with one head and no biases: x + message, with message = LN(merge(attention)).
 
-    LN is a LayerNorm and merge a linear layer. If `mlp` is true, the result is instead
-    x + LN(MLP([x, message])), with an MLP of widths 2 D, 8 D and D, GELU and no biases. There is no
-    norm before attention.
+    LN is a LayerNorm and merge a linear layer. With `mlp`, the result is x + LN(MLP([x, message])),
+    with an MLP of widths 2 D, 8 D and D, GELU and no biases. There is no norm before attention.
     """
 
     def __init__(self, width: int, mlp: bool) -> None:
@@ -113,7 +116,8 @@ class Attention(nn.Module):
     ) -> Tensor:
         """Return x (B, V, 4, L, C) after attention to windows of `source`.
 
-        Each view reads its own windows, or those of the views `neighbours` (B, V, J) if given.
+        neighbours: indices (B, V, J) of the J views whose windows each view reads. None makes each
+        view read its own windows.
         """
         q = self.q_proj(x_BVWLC)
         k = self.k_proj(source_BVWLC)
@@ -136,14 +140,14 @@ class Attention(nn.Module):
 def _of_neighbours(x_BVWLC: Tensor, neighbours_BVJ: Tensor) -> Tensor:
     """Return the windows of each view's J neighbours (B, V, 4, L J, C).
 
-    The J pixels at the same position follow each other.
+    Pixels are ordered by their position in the window, then by neighbour.
     """
     scenes = torch.arange(len(x_BVWLC), device=x_BVWLC.device)[:, None, None]
     return rearrange(x_BVWLC[scenes, neighbours_BVJ], "n v j w l c -> n v w (l j) c")
 
 
 class Layer(nn.Module):
-    """Transformer layer: self-attention, then cross-attention to other views and an MLP."""
+    """Transformer layer: self-attention, then cross-attention to neighbour views, then an MLP."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -169,8 +173,8 @@ class WindowTransformer(nn.Module):
     def forward(self, x_BVCHW: Tensor, neighbours_BVJ: Tensor) -> Tensor:
         """Return updated maps (B, V, C, H, W).
 
-        x: maps with embedded positions. neighbours: indices (B, V, J) of the views that each view
-        reads.
+        x: maps to which embeddings of positions are added. neighbours: indices (B, V, J) of the J
+        views that each view reads.
         """
         size = (x_BVCHW.shape[-2], x_BVCHW.shape[-1])
         shifted = (size[0] // SPLIT // 2, size[1] // SPLIT // 2)

@@ -1,6 +1,6 @@
 """Queries for moving scenes: static queries, and dynamic queries for the requested time.
 
-They follow TokenGS 2026.6.
+The queries follow TokenGS 2026.6.
 """
 
 from collections.abc import Iterable
@@ -34,9 +34,9 @@ _FIELDS: Fields = {MOVES: FieldSpec((), torch.bool)}
 
 
 class DynamicQueries(Queries):
-    """N learned queries, static ones first, then dynamic ones, to which the time is added.
+    """N learned queries: static queries first, then dynamic queries.
 
-    The time is the one for which the scene is requested.
+    An embedding of the time for which the scene is requested is added to dynamic queries.
     """
 
     name = "dynamic"
@@ -44,16 +44,18 @@ class DynamicQueries(Queries):
 
     class Config(ComponentConfig):
         count: int = Field(default=1280, ge=1)
-        """N, the number of static and dynamic queries together (TokenGS: 1024 + 256)."""
+        """N, the number of static and dynamic queries together (TokenGS: 1024 static + 256
+        dynamic)."""
         dynamic: int = Field(default=256, ge=0)
-        """Number of dynamic queries, which are the last of the N. With 0, the time is added to all
+        """Number of dynamic queries, which are the last of the N queries. 0 adds the time to all
         queries."""
         std: float = Field(default=0.02, ge=0)
-        """Standard deviation of the initial features, which are normally distributed."""
+        """Standard deviation of the queries' initial features, which are normally distributed."""
         time_channels: int = Field(default=2, ge=0, multiple_of=2)
         """Number of channels that encode the requested time. 0 ignores the time."""
         patch_size: int = Field(default=8, ge=1)
-        """Side of the patches, in pixels, that embed the time. The release uses the encoder's."""
+        """Side, in pixels, of the patch whose convolution embeds the time. The release uses the
+        encoder's patch size."""
 
     config: Config
 
@@ -84,7 +86,7 @@ class DynamicQueries(Queries):
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Return initial queries, with the field `dynamic.moves` (B, N) if some are dynamic.
 
-        Raises ValueError for views without a target time if the queries read it.
+        Raises ValueError for views without a target time, except with `time_channels: 0`.
         """
         config = self.config
         batch = len(memory.features)
@@ -105,7 +107,7 @@ class DynamicQueries(Queries):
 
 
 class BlockCausalSelfAttention(ContentSelfAttention):
-    """Self-attention in which static queries read only each other, and dynamic queries read all.
+    """Self-attention in which static queries read static queries, and dynamic queries read all.
 
     So static queries do not depend on the requested time.
     """
@@ -123,7 +125,7 @@ class BlockCausalSelfAttention(ContentSelfAttention):
 class DynamicObjective(Objective):
     """Objective of one pass: the losses, plus the losses of dynamic Gaussians rendered alone.
 
-    Dynamic Gaussians are those of dynamic queries.
+    Dynamic Gaussians are the Gaussians of dynamic queries.
     """
 
     name = "dynamic"
@@ -140,7 +142,10 @@ class DynamicObjective(Objective):
     config: Config
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """Return the losses of all Gaussians, and the term `dynamic` of the dynamic ones."""
+        """Return the losses of all Gaussians, plus the term `dynamic`.
+
+        This term has the losses of dynamic Gaussians, rendered alone.
+        """
         prediction = passes.predict(inputs)
         whole = passes.judge(prediction, targets, inputs)
         added = torch.zeros_like(whole.total)
@@ -154,7 +159,10 @@ class DynamicObjective(Objective):
 
 
 def _alone(layer: LayerPrediction) -> LayerPrediction:
-    """Return a layer's dynamic queries, which must be the same in all scenes, with Gaussians."""
+    """Return a layer's prediction with only its dynamic queries and their Gaussians.
+
+    The dynamic queries must be the same in all scenes of the batch.
+    """
     moves_N = layer.state[MOVES][0]
     each = layer.gaussians.count // len(moves_N)
     of_gaussians = moves_N.repeat_interleave(each)
@@ -165,7 +173,7 @@ def _alone(layer: LayerPrediction) -> LayerPrediction:
 
 
 def _readable(state: QueryState) -> Tensor:
-    """Return a mask (B, N, N): True where the query of the row may read that of the column."""
+    """Return a mask (B, N, N): True where the row's query may attend to the column's query."""
     moves_BN = state[MOVES]
     # Static queries read only static ones, so that they are the same at all times.
     readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]

@@ -1,9 +1,11 @@
-"""Encoders with the outputs of several ViT blocks (TokenGS 2026.6).
+"""Encoders that read the outputs of several ViT blocks (TokenGS 2026.6).
 
 `tokengs2026/multiscale_vit` computes keys and values from the outputs of the blocks.
-`tokengs2026/latent_bottleneck` computes them from learned latents that attend to the outputs.
+`tokengs2026/latent_bottleneck` computes keys and values from learned latents that attend to the
+outputs.
 
-Axes: T channels that encode a time, L latents, S blocks, C = S D the width of their joined outputs.
+Axes: T channels that encode a time, L latents, S blocks, C = S D the width of the blocks'
+concatenated outputs.
 """
 
 import math
@@ -44,7 +46,7 @@ def time_features(times: Tensor, channels: int) -> Tensor:
 
 
 def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
-    """Report an option `time_channels` above 0 if the data of the recipe have no times."""
+    """Report a problem if `time_channels` is above 0, but the recipe's data have no times."""
     if channels and context.inputs is not None and not context.times:
         yield Problem(
             "time_channels",
@@ -55,9 +57,10 @@ def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
 
 
 class TimeEmbedding(nn.Module):
-    """Embedding of times (B, V) as (B, V, D), which is zero before training.
+    """Embedding of times (B, V) as (B, V, D). It is zero before training.
 
-    It is a convolution of a patch of equal pixels, because the release embeds a map of times.
+    The embedding is a convolution of a patch of equal pixels, because the release embeds a map of
+    times.
     """
 
     def __init__(self, channels: int, width: int, patch_size: int) -> None:
@@ -74,9 +77,10 @@ class TimeEmbedding(nn.Module):
 
 
 class MultiscaleReadout(PatchViT):
-    """Base of encoders with the outputs of S chosen ViT blocks as features, each with its own norm.
+    """Base of encoders whose features are the outputs of S chosen ViT blocks.
 
-    Unlike the default encoder, they can embed the times of photos.
+    Each block's output has its own norm. Unlike the default encoder, these encoders can embed the
+    times of photos.
     """
 
     class Config(PatchViT.Config):
@@ -123,9 +127,9 @@ class MultiscaleReadout(PatchViT):
             )
 
     def embed(self, views: Views, plucker: Tensor) -> Tensor:
-        """Return the sum (B, M, D) of the embeddings of colours, rays and, if any, times.
+        """Return the sum (B, M, D) of the embeddings of colours, rays and, if embedded, times.
 
-        Raises ValueError for views without times if times are embedded.
+        Raises ValueError for views without times, except with `time_channels: 0`.
         """
         x_BMD = super().embed(views, plucker)
         if not self.config.time_channels:
@@ -140,9 +144,9 @@ class MultiscaleReadout(PatchViT):
         return x_BMD + times_BVD.repeat_interleave(x_BMD.shape[1] // times_BVD.shape[1], 1)
 
     def features(self, views: Views, plucker: Tensor) -> Tensor:
-        """Return the joined outputs (B, M, S D) of the chosen blocks, in the order of the blocks.
+        """Return the concatenated outputs (B, M, S D) of the chosen blocks, in block order.
 
-        plucker: rays of all pixels.
+        plucker: Plücker rays of all pixels.
         """
         x_BMD = self.embed(views, plucker)
         outputs = []
@@ -155,7 +159,7 @@ class MultiscaleReadout(PatchViT):
 
 
 class MultiscaleViT(MultiscaleReadout):
-    """Encoder with keys and values of image tokens, from the outputs of several ViT blocks."""
+    """Encoder that computes keys and values of image tokens from outputs of several ViT blocks."""
 
     name = "multiscale_vit"
 
@@ -172,7 +176,7 @@ class MultiscaleViT(MultiscaleReadout):
         return {**MEMORY_FIELDS, "memory.features": wide}
 
     def forward(self, views: Views) -> ImageMemory:
-        """Return the memory, with features (B, M, S D).
+        """Return the memory of the photos, with features (B, M, S D) of S blocks.
 
         Raises ValueError if the patch size does not divide the sides of the images.
         """
@@ -185,9 +189,9 @@ class MultiscaleViT(MultiscaleReadout):
 
 
 class LatentBlock(nn.Module):
-    """Transformer block: cross-attention to given keys and values, self-attention, MLP.
+    """Transformer block: cross-attention to given keys and values, then self-attention, then MLP.
 
-    The output of each is multiplied by a LayerScale and added.
+    The output of each of these layers is multiplied by a LayerScale and added.
     """
 
     def __init__(
@@ -212,7 +216,7 @@ class LatentBlock(nn.Module):
 class LatentBottleneck(MultiscaleReadout):
     """Encoder whose tokens are L learned latents that attend to the outputs of several ViT blocks.
 
-    The memory has the same size for any number of photos. It has no rays and no grid.
+    The memory has the same size for any number of photos. It contains no rays and no grid.
     """
 
     name = "latent_bottleneck"
@@ -232,8 +236,8 @@ class LatentBottleneck(MultiscaleReadout):
         latent_std: float = Field(default=0.02, ge=0)
         """Standard deviation of the initial latents, which are normally distributed."""
         latent_depth: int = Field(default=12, ge=1, le=256)
-        """Number of transformer blocks that update the latents. Their MLPs and LayerScales are
-        those of the ViT."""
+        """Number of transformer blocks that update the latents. Sizes of their MLPs and initial
+        LayerScales are those of the ViT."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -250,7 +254,7 @@ class LatentBottleneck(MultiscaleReadout):
         self.k_norm = nn.LayerNorm(width // dims.heads, eps)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Leave the latents out of weight decay (TokenGS release)."""
+        """Return whether a parameter has weight decay. The latents have none (TokenGS release)."""
         return name != "latents" and super().decays(name, parameter)
 
     def forward(self, views: Views) -> ImageMemory:
@@ -268,7 +272,7 @@ class LatentBottleneck(MultiscaleReadout):
         return self._memory(x_BLD)
 
     def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
-        """Return the memory, with keys and values, of the latents `features` (B, L, D)."""
+        """Return the memory for changed latents `features` (B, L, D), with new keys and values."""
         # Tuning at test time changes the latents, and then needs new keys and values.
         return self._memory(features)
 
