@@ -1,4 +1,4 @@
-"""The range of cameras that a model was trained on, and checks of new cameras against this range.
+"""The range of cameras that a model was trained on, and comparison of new cameras with it.
 
 Only cameras in the model's frame are compared, not images, so this works for any data.
 """
@@ -37,17 +37,18 @@ REMEDY = "try another scale of the world, other input views, or train on views l
 
 @dataclass
 class Domain:
-    """Measurements of the cameras of `samples` samples.
+    """Measurements of the cameras of several samples, such as their distances and angles.
 
-    values: all measured values, by the names in WORDS. A domain that was loaded from a checkpoint
-    has only the smallest and largest value of each range.
+    values: all measured values, by the names in WORDS. After loading from a checkpoint, there are
+        only the smallest and largest value under each name.
+    samples: number of measured samples.
     """
 
     values: dict[str, list[float]] = field(default_factory=dict)
     samples: int = 0
 
     def see(self, inputs: Cameras, targets: Cameras) -> None:
-        """Measure a sample and add the values. Cameras are (1, V), in the model's frame."""
+        """Measure the cameras of a sample, (1, V) in the model's frame, and add the values."""
         # In float32 a cosine near 1 is off by angles of 0.02 degrees.
         c2w = inputs.c2w[0].double()
         measured = {"views": [float(len(c2w))]}
@@ -71,7 +72,7 @@ class Domain:
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Smallest and largest value by name, without the fraction OUTLIERS at each end."""
+        """Smallest and largest value by name, after dropping the fraction OUTLIERS at each end."""
         found = {}
         for name, values in self.values.items():
             left_out = int(OUTLIERS * len(values))
@@ -81,7 +82,7 @@ class Domain:
 
     @property
     def text(self) -> str:
-        """Ranges as JSON; null stands for infinity."""
+        """Ranges and number of samples as JSON, in which null stands for infinity."""
         # JSON has no infinity, which is the depth of parallel axes.
         ranges = {
             name: [end if math.isfinite(end) else None for end in ends]
@@ -91,7 +92,7 @@ class Domain:
 
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Domain:
-        """Return the domain of a parsed `text`.
+        """Return the domain that `plain`, the parsed JSON of `text`, describes.
 
         Raises ValueError, TypeError or KeyError for damaged content.
         """
@@ -105,7 +106,7 @@ class Domain:
         return domain
 
     def differences(self, found: Domain) -> dict[str, str]:
-        """Describe, by name, each range in which `found` leaves the trained range."""
+        """Describe, by name, each measurement whose range in `found` leaves this trained range."""
         phrases: dict[str, str] = {}
         seen = found.ranges
         for name, trained in self.ranges.items():
@@ -117,9 +118,10 @@ class Domain:
 
 
 def verdict(trained: Domain, found: Domain) -> str:
-    """Return a sentence on whether cameras lie in the trained range, with advice if they do not.
+    """Return a sentence that says whether cameras lie in the trained range, with advice if not.
 
-    trained: the domain of the training; empty if it is unknown. found: the domain of the cameras.
+    trained: measurements of the training cameras; empty if unknown. found: measurements of the
+        cameras to check.
     """
     if not trained.values:
         return "the checkpoint does not record the views on which this model was trained"
@@ -135,6 +137,6 @@ def verdict(trained: Domain, found: Domain) -> str:
 
 
 def _shown(values: tuple[float, float]) -> str:
-    """Return a range as text, with three digits."""
+    """Return a range as text, its numbers with three digits."""
     low, high = (f"{value:.3g}" if math.isfinite(value) else "infinitely far" for value in values)
     return low if low == high else f"{low} to {high}"

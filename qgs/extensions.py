@@ -1,4 +1,4 @@
-"""Loading of entry points, found in the metadata of installed distributions."""
+"""Loading of plug-ins through entry points, which the metadata of installed distributions lists."""
 
 import os
 import sys
@@ -19,7 +19,7 @@ class ExtensionError(ValueError):
 def installed(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of `group`, including distributions installed since the last call.
 
-    No distribution is imported.
+    This imports no distribution.
     """
     # Reading all metadata takes some 10 ms, so that it is repeated only after a change of sys.path.
     searched = [path for path in sys.path if os.path.exists(path)]
@@ -30,18 +30,22 @@ def load(entry: EntryPoint, base: type[T]) -> type[T]:
     """Load the class that `entry` names; raise ExtensionError unless it is a subclass of `base`."""
     offered = imported(entry)
     if not (isinstance(offered, type) and issubclass(offered, base)):
-        raise ExtensionError(f"{_where(entry)} is not a subclass of {base.__name__}: update it")
+        raise ExtensionError(
+            f"{_where(entry)} is not a subclass of {base.__name__}: update the distribution"
+        )
     return offered
 
 
 def imported(entry: EntryPoint) -> Any:
-    """Import the object that `entry` names; raise ExtensionError with its distribution."""
+    """Import the object that `entry` names; errors become ExtensionError with the distribution."""
     try:
         return entry.load()
     except Exception as error:
         # Importing runs the distribution's code.
         reason = f"{type(error).__name__}: {error}"
-        raise ExtensionError(f"{_where(entry)} cannot be imported ({reason}): update it") from error
+        raise ExtensionError(
+            f"{_where(entry)} cannot be imported ({reason}): update the distribution"
+        ) from error
 
 
 def _where(entry: EntryPoint) -> str:

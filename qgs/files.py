@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, and reading of files of JSON records."""
+"""Atomic writing of files and folders, and reading of files with one JSON record on each line."""
 
 import errno
 import json
@@ -26,10 +26,10 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def replacing(path: AnyPath) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, which it replaces when the block ends well.
+    """Yield a temporary path in the folder of `path`; it replaces `path` when the block ends.
 
     If the block raises, `path` stays unchanged. Missing parent folders are made. The new file gets
-    the usual permissions, and is on the disk before it replaces the old one.
+    the usual permissions, and is on the disk before it replaces the old file.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -84,12 +84,12 @@ def _synchronise(path: Path) -> None:
 
 @contextmanager
 def replacing_entries(folder: AnyPath, mark: str) -> Iterator[Path]:
-    """Yield a temporary folder whose entries move into `folder` when the block ends well.
+    """Yield a temporary folder; its entries move into `folder` when the block ends.
 
     An entry replaces the file or folder of the same name; all other entries of `folder` stay. If
     the block raises, `folder` stays unchanged.
-    mark: name of an entry that every earlier result has. Raises FileExistsError if an entry would
-    be replaced and `folder` has no entry `mark`.
+    mark: name of an entry by which an earlier result is recognised. Raises FileExistsError if an
+        entry would be replaced and `folder` has no entry `mark`.
     """
     target = Path(folder)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -121,22 +121,22 @@ def replacing_entries(folder: AnyPath, mark: str) -> Iterator[Path]:
 
 
 def refuse_existing(target: Path) -> None:
-    """Raise FileExistsError if `target` exists, a broken link included."""
+    """Raise FileExistsError if `target` exists, even as a broken link."""
     if os.path.lexists(target):
         raise FileExistsError(f"{target} exists and is never overwritten; choose another name")
 
 
 def write_text(path: AnyPath, text: str) -> None:
-    """Write `text` as UTF-8 to `path`, whole or not at all."""
+    """Write `text` as UTF-8 to `path`; if this fails, `path` stays unchanged."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
-    """Read JSON records, one on each line, that have a "step"; none if `path` does not exist.
+    """Read JSON records with a "step", one on each line; none if `path` does not exist.
 
     Damaged lines are skipped with a warning. An unfinished last line, which a killed process
-    leaves, is skipped without one.
+    leaves, is skipped without a warning.
     """
     if not path.is_file():
         return []

@@ -1,4 +1,4 @@
-"""Choice of the data source for a path, and opening of data for a trained model."""
+"""Choice of the data source that reads a path, and opening of data for a trained model."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,10 +13,10 @@ from qgs.wording import one_line, warn_once
 
 
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
-    """Return the name PLUGIN/NAME of the first source that recognises `path`, else qgs/photos.
+    """Return the name PLUGIN/NAME of the first data source that recognises `path`.
 
-    If several sources recognise it, a warning names all. Raises FileNotFoundError if `path` does
-    not exist.
+    The name is qgs/photos if no source does. If several sources recognise the path, a warning names
+    them all. Raises FileNotFoundError if `path` does not exist.
     """
     if not path.exists():
         raise FileNotFoundError(
@@ -43,7 +43,10 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
 
 
 def is_training_data(path: str, trained: SceneSourceConfig | None) -> bool:
-    """Return whether the data at `path` was training data. trained: data options of the model."""
+    """Return whether the data at `path` was training data of a model.
+
+    trained: data options of the model; None if unknown, which returns False.
+    """
     root = getattr(trained, "path", None)
     if trained is None or not isinstance(root, str):
         return False
@@ -61,8 +64,8 @@ def open_for(
 
     Training data opens with the options of the training, including held-out frames. Other data
     opens with the source from `recognised`; `with_cameras` adds cameras to photos without cameras.
-    trained: data options of the model. image_size: (H, W), by default that of `trained`. Raises
-    the errors of `recognised` and of the source.
+    trained: data options of the model, or None if unknown. image_size: (H, W), by default that of
+    `trained`. Raises the errors of `recognised` and of the source.
     """
     size = image_size or (trained or SceneSourceConfig()).image_size
     source: Any

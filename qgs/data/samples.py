@@ -1,8 +1,8 @@
-"""Samples of scenes: the views in a model's coordinates, mirrored if asked.
+"""Samples of scenes: views in a model's coordinate frame, mirrored on request.
 
 Source: TokenGS release (pose normalisation, mirroring).
-Everything here is a pure function of its arguments, including the random generator. NumPy copies
-images on one thread, because threads of torch would wait for cores that training uses.
+Everything here is a pure function of its arguments, which include the random generator. NumPy
+copies images on one thread, because threads of torch would wait for cores that training uses.
 """
 
 import math
@@ -33,8 +33,8 @@ from qgs.wording import listed, numbered, warn_once
 class Sample:
     """Input and target Views (1, V) of one scene, in the model's coordinate frame.
 
-    world: reference pose (4, 4) and scale of this frame, see `own_world`. names: names of frames,
-    such as file names, by number; frames without a name are absent.
+    world: reference pose (4, 4) and scale of this coordinate frame, see `own_world`. names: names
+        of photos, such as file names, by frame number; photos without a name are absent.
     """
 
     scene: str
@@ -46,15 +46,16 @@ class Sample:
     names: Mapping[int, str] = field(default_factory=dict)
 
     def label(self, frame: int) -> str:
-        """Return the number of a frame and its name, if any, for messages."""
+        """Return the number of a frame, with its name if it has one, for messages."""
         return numbered(frame, self.names.get(frame, ""))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Batch of B samples: inputs (B, V_in), targets (B, V_out), names of scenes, and frames.
+    """Batch of B samples: views (B, V_in) and (B, V_out), with names of scenes and frame numbers.
 
-    Tensors are float32 and contiguous.
+    V_in and V_out are the numbers of input views and target views. Tensors are float32 and
+    contiguous.
     """
 
     inputs: Views
@@ -63,7 +64,7 @@ class Batch:
     input_frames: tuple[Frames, ...]
     target_frames: tuple[Frames, ...]
     left_out: tuple[str, ...] = ()
-    """Messages about samples that could not be made: scene, frame and reason."""
+    """Messages about samples that failed and were replaced: scene, frame and reason."""
 
 
 def make_sample(
@@ -75,11 +76,11 @@ def make_sample(
     noise: np.random.Generator | None = None,
     depths: bool = False,
 ) -> Sample:
-    """Decode the frames of a sample, normalise their poses, and mirror them if asked.
+    """Decode the frames of a sample, normalise their poses, and mirror them if `mirror` is true.
 
     Poses are normalised in the scene's precision and returned in float32. noise: random generator
-    for `views.pose_noise`; None adds no noise. depths: read depth maps if the scene has them. They
-    are 0 (unknown) in views with noisy poses, because the moved camera did not see that surface.
+    for `views.pose_noise`; None adds no noise. depths: read depth maps if the scene has them.
+    Depths are 0 (unknown) in views with noisy poses, because they do not fit the moved camera.
     """
     world = own_world(scene, input_frames, views)
     both = views_in(world, scene, (*input_frames, *target_frames), depths)
@@ -105,7 +106,7 @@ def make_sample(
 
 
 def _asked(times: Tensor, inputs: int) -> Tensor | None:
-    """Return the time (1, 1) of the targets; None if they have several times.
+    """Return the time (1, 1) at which to reconstruct: that of the targets; None if times differ.
 
     Without targets, return the median time of the inputs. times: times (1, V) of inputs, then
     targets. inputs: number of inputs.
@@ -117,10 +118,10 @@ def _asked(times: Tensor, inputs: int) -> Tensor | None:
 def with_noise(
     cameras: Cameras, inputs: int, views: ViewsConfig, rng: np.random.Generator
 ) -> Cameras:
-    """Add noise to the poses of all input cameras but the first.
+    """Return `cameras` with noise on the poses of all input cameras but the first.
 
-    cameras: (1, F), of which the first `inputs` are the input cameras. They turn and move as
-    `ViewsConfig.pose_noise` says. If it is 0, no random numbers are drawn.
+    cameras: (1, F), of which the first `inputs` are the input cameras. The noise is that of the
+        option `views.pose_noise`. If this is 0, `rng` is not used.
     """
     if not views.pose_noise:
         return cameras
@@ -140,7 +141,7 @@ def with_noise(
 def views_in(
     world: tuple[Tensor, Tensor], scene: Scene, frames: Frames, depths: bool = False
 ) -> Views:
-    """Read frames as float32 views (1, F) in the coordinates `world`, the result of `own_world`.
+    """Read F frames as float32 views (1, F) in the coordinate frame `world`, from `own_world`.
 
     Times are scaled to [0, 1]. depths: read depth maps if the scene has them.
     """
@@ -160,7 +161,7 @@ def views_in(
 
 
 def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Cameras:
-    """Return cameras (1, F) of frames in the coordinates `world`, the result of `own_world`.
+    """Return cameras (1, F) of F frames in the coordinate frame `world`, from `own_world`.
 
     No image is decoded.
     """
@@ -168,7 +169,7 @@ def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Ca
 
 
 def in_world(world: tuple[Tensor, Tensor], cameras: Cameras) -> Cameras:
-    """Return a scene's cameras, (V,) or (B, V), in float32 in the coordinates `world`.
+    """Return a scene's cameras, (V,) or (B, V), as float32 in the coordinate frame `world`.
 
     world: the result of `own_world`.
     """
@@ -179,7 +180,7 @@ def in_world(world: tuple[Tensor, Tensor], cameras: Cameras) -> Cameras:
 
 
 def from_0_to_1(times: Tensor) -> Tensor:
-    """Return times (F,) scaled to [0, 1] (TokenGS 2026.6), or zeros if all are equal."""
+    """Return times (F,) scaled to [0, 1] (TokenGS 2026.6), or zeros if all times are equal."""
     first, last = times.aminmax()
     return (times - first) / (last - first) if last > first else torch.zeros_like(times)
 
@@ -187,9 +188,9 @@ def from_0_to_1(times: Tensor) -> Tensor:
 def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[Tensor, Tensor]:
     """Return the model's coordinate frame for given inputs: reference pose (4, 4) and 0-d scale.
 
-    A point p in the model's coordinates is the point reference @ (p / scale) of the scene. With
-    `scale: auto`, the point that all cameras of the scene look at gets depth 1. Without such a
-    point (see `look_at_depth`), a warning is logged, and the largest distance from the first camera
+    A point p in this frame is the point reference @ (p / scale) of the scene. With `scale: auto`,
+    the point at which all cameras of the scene look gets depth 1. Without such a point (see
+    `look_at_depth`), a warning is logged, and the largest distance from the scene's first camera
     becomes 1. Raises ValueError if a scale is needed but the cameras are at one point, and for
     `scale: search`, which needs a model.
     """
@@ -226,7 +227,7 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
 
 
 def mirrored_views(views: Views) -> Views:
-    """Mirror views in x: images, masks, depth maps, poses and principal points."""
+    """Mirror views left to right: images, masks, depth maps, poses and principal points."""
     cameras = views.cameras
     intrinsics = cameras.intrinsics.clone()
     intrinsics[..., 2] = cameras.size[1] - intrinsics[..., 2]
@@ -260,10 +261,10 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 
 def stack_views(views: Sequence[Views]) -> Views:
-    """Join views (b, V) on the CPU to views (B, V).
+    """Join views (b, V) on the CPU along the first axis, to (B, V) with B the sum of all b.
 
-    If only some have masks or depths, masks of 1 and depths of 0 (unknown) are added. Raises
-    ValueError if only some have times.
+    If only some of them have masks or depths, the others get masks of 1 and depths of 0 (unknown).
+    Raises ValueError if only some have times.
     """
     others: list[dict[str, Any]] = [
         {"cameras": v.cameras, "times": v.times, "target_time": v.target_time} for v in views
@@ -277,9 +278,10 @@ def stack_views(views: Sequence[Views]) -> Views:
 def _stacked(
     maps: Sequence[Tensor | None], views: Sequence[Views], missing: Callable[[Tensor], Tensor]
 ) -> Tensor | None:
-    """Join maps (b, V, 1, H, W); return None if all are None.
+    """Join maps (b, V, 1, H, W) along the first axis; return None if all are None.
 
-    missing: makes the map in place of a None, from one channel of the images.
+    missing: function that makes a map in place of None, such as `torch.zeros_like`; its argument is
+        one channel of the images.
     """
     if all(part is None for part in maps):
         return None

@@ -1,4 +1,4 @@
-"""Helpers for sources of scenes: a cache, and lists of scenes that open on demand."""
+"""Helpers for data sources: a cache, and lists of scenes that open when they are needed."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -11,10 +11,10 @@ Value = TypeVar("Value")
 
 
 class BoundedCache(Generic[Value]):
-    """Thread-safe cache that drops the least recently used values; empty after pickling.
+    """Thread-safe cache that drops the least recently used values. A pickled copy is empty.
 
     limit: largest sum of the costs of kept values. cost: function that returns the cost of a value;
-    by default each value costs 1.
+        by default each value costs 1.
     """
 
     def __init__(self, limit: int, cost: Callable[[Value], int] | None = None) -> None:
@@ -29,7 +29,10 @@ class BoundedCache(Generic[Value]):
         return type(self), (self._limit, self._cost)
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """Return the cached value of `key`; or call `make`, and cache the result if it fits."""
+        """Return the cached value of `key`, or else the result of `make`, which is then cached.
+
+        A value that costs more than the limit is not cached.
+        """
         with self._lock:
             if key in self._kept:
                 # The front is the least recently used.
@@ -49,9 +52,10 @@ class BoundedCache(Generic[Value]):
 
 
 class LazyScenes(Sequence[Scene]):
-    """Sequence of scenes that open when they are indexed; at most 64 stay open.
+    """Sequence of scenes that are opened when they are indexed; at most 64 stay open.
 
-    places: what `open` needs besides the name to open a scene, by name of the scene.
+    open: function that opens a scene from its name and its entry in `places`. places: whatever
+        `open` needs, such as a folder, by name of the scene.
     """
 
     def __init__(self, places: Mapping[str, Any], open: Callable[[str, Any], Scene]) -> None:
@@ -73,17 +77,17 @@ class LazyScenes(Sequence[Scene]):
 
 
 class LazySource(SceneSource):
-    """Base of sources whose scenes are `LazyScenes`. Their `__init__` must set `splits`.
+    """Base class of data sources with `LazyScenes`. The `__init__` of a subclass must set `splits`.
 
-    splits: the scenes of "train" and "test".
+    splits: the scenes of "train" and of "test".
     """
 
     splits: Mapping[Split, LazyScenes]
 
     def scenes(self, split: Split) -> LazyScenes:
-        """See `SceneSource`."""
+        """Return the scenes of a split, without opening them."""
         return self.splits[split]
 
     def names(self, split: Split) -> Sequence[str]:
-        """See `SceneSource`."""
+        """Return the names of the scenes of a split."""
         return self.scenes(split).names

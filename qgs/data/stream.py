@@ -1,4 +1,4 @@
-"""Endless training batches: order of scenes, random samples, and processes that decode."""
+"""Endless training batches: order of scenes, random samples, and decoding in other processes."""
 
 import atexit
 import hashlib
@@ -39,7 +39,7 @@ class SampleError(ValueError):
 
 
 class WorkerError(ChildProcessError):
-    """Error for a data-decoding process that ended suddenly."""
+    """Error for a process that decodes data and ended suddenly."""
 
 
 def training_batches(
@@ -57,17 +57,17 @@ def training_batches(
     accumulate: int = 1,
     depths: bool = False,
 ) -> Generator[Batch, None, None]:
-    """Return a generator of training batches without end, each with `batch_size` samples.
+    """Return an endless generator of training batches, each with `batch_size` samples.
 
     Samples are numbered, and sample k depends only on (seed, k). Batch n consists of the samples
-    from n * batch_size * processes on, split among the processes by `rank`. Numbers of processes
-    and workers therefore do not change the samples. start: number n of the first batch, to resume a
-    run exactly.
+    from n * batch_size * processes on, split among the training processes by `rank`. The samples
+    therefore do not depend on the number of processes or workers. start: number n of the first
+    batch, to resume a run exactly.
 
-    workers: number of decoding processes; 0 decodes in a thread. Closing the generator ends them.
-    skips, sampler, depths: see `SampleStream`. accumulate: batches per optimiser step.
-    Raises ValueError if there are no training scenes or too few frames, SampleError, and
-    WorkerError.
+    workers: number of processes that decode; they end when the generator is closed. 0 decodes in a
+        thread. skips, sampler, depths: see `SampleStream`. accumulate: batches per optimiser step.
+    Raises ValueError if there are no training scenes or too few frames, SampleError for a sample
+    that fails, and WorkerError for a process that ends suddenly.
     """
     every = batch_size * processes
     stream = SampleStream(source, views, seed, skips, sampler, every * accumulate, depths)
@@ -85,9 +85,9 @@ def trained_domain(
 ) -> Domain:
     """Measure the cameras of the first MEASURED training samples, without decoding images.
 
-    Since options of `sampler` may depend on the step, the samples are drawn at steps spread evenly
-    from 0 to `steps`, the length of training. Scenes that fail are left out here; training itself
-    reports them.
+    Options of `sampler` may follow a schedule. So the samples are chosen as at optimiser steps
+    spread evenly from 0 to `steps`, the length of training. Scenes that fail are left out here;
+    training itself reports them.
     """
     stream = SampleStream(source, views, seed, sampler=sampler)
     domain = Domain()
@@ -99,7 +99,7 @@ def trained_domain(
 
 
 def scenes_fingerprint(source: SceneSource) -> str:
-    """Return a hash of the training scenes' indices, grouped as by `SceneSource.groups`."""
+    """Return a hash of the training scenes: their indices and groups, see `SceneSource.groups`."""
     digest = hashlib.sha256()
     for group in filter(len, source.groups("train")):
         digest.update(len(group).to_bytes(8, "little") + np.asarray(group, "<i8").tobytes())
@@ -108,15 +108,17 @@ def scenes_fingerprint(source: SceneSource) -> str:
 
 @dataclass(eq=False)
 class SampleStream(Dataset[Batch | Exception]):
-    """Endless stream of training samples. Each depends only on the seed and its number.
+    """Endless stream of training samples. Each sample depends only on the seed and its number.
 
     Each epoch visits the groups of scenes (see `SceneSource.groups`) in random order, and the
     scenes of a group in random order. A copy in a worker process opens the data at first use.
     Raises ValueError if there are no training scenes.
 
     skips: replace a failing sample by a sample of the next scene, up to MAX_REPLACED times.
-    sampler: view sampler, by default `Span`. per_step: number of samples per optimiser step, from
-    which the step of each sample is computed for the sampler. depths: see `make_sample`.
+    sampler: view sampler, by default `Span`.
+    per_step: number of samples per optimiser step; gives the step at which a sample is used, on
+        which options of the sampler may depend.
+    depths: read depth maps if a scene has them.
     """
 
     source: InitVar[SceneSource]
@@ -157,7 +159,7 @@ class SampleStream(Dataset[Batch | Exception]):
         return np.concatenate([rng.permutation(groups[index]) for index in shuffled])
 
     def batch(self, numbers: Sequence[int]) -> Batch:
-        """Make a batch of the samples with these numbers.
+        """Make a batch of the samples that have these numbers in the stream.
 
         Raises ValueError if a scene has too few frames, and SampleError for other failures.
         """
@@ -185,10 +187,15 @@ class SampleStream(Dataset[Batch | Exception]):
                 if not self.skips or is_out_of_memory(error):
                     raise
                 left_out.append(one_line(error))
-        raise SampleError(f"{MAX_REPLACED + 1} samples in a row failed; the last: {left_out[-1]}")
+        raise SampleError(
+            f"{MAX_REPLACED + 1} samples in a row failed to load; the last: {left_out[-1]}"
+        )
 
     def cameras(self, number: int, step: int) -> tuple[Cameras, Cameras]:
-        """Return the cameras (1, V) of a sample's inputs and targets at an optimiser step."""
+        """Return cameras (1, V) of inputs and of targets of sample `number`, without images.
+
+        step: optimiser step, on which options of the view sampler may depend.
+        """
         rng = np.random.default_rng([self.seed, 1, number])
         scene = self._scene(number)
         _, inputs, targets = self._drawn(scene, rng, step)
@@ -200,12 +207,12 @@ class SampleStream(Dataset[Batch | Exception]):
     def _drawn(
         self, scene: Scene, rng: np.random.Generator, step: int
     ) -> tuple[bool, Frames, Frames]:
-        """Draw at random whether a sample is mirrored, its input frames and its target frames."""
+        """Choose at random whether a sample is mirrored, its input frames and its target frames."""
         mirror = bool(rng.random() < self.views.mirror)
         return mirror, *self._sampler.draw(scene, self.views, rng, step)
 
     def _sample_after(self, number: int, attempt: int) -> Sample:
-        """Make sample `number`, or its replacement after `attempt` failures."""
+        """Make sample `number`; or its replacement, if `attempt` earlier attempts failed."""
         # The first attempt always draws from (seed, 1, number), also if other samples failed.
         key = [self.seed, 1, number]
         rng = np.random.default_rng([*key, attempt] if attempt else key)
@@ -222,7 +229,10 @@ class SampleStream(Dataset[Batch | Exception]):
 def _from_thread(
     stream: SampleStream, numbers: Iterator[Sequence[int]]
 ) -> Generator[Batch, None, None]:
-    """Yield a batch for each list of sample numbers, made in a thread while the last is in use."""
+    """Yield a batch for each list of sample numbers.
+
+    A thread makes the next batch while the caller uses the last one.
+    """
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
         pending = pool.submit(stream.batch, next(numbers))
         for following in numbers:
@@ -235,7 +245,7 @@ def _from_thread(
 def _from_workers(
     stream: SampleStream, numbers: Iterator[Sequence[int]], workers: int
 ) -> Generator[Batch, None, None]:
-    """Yield a batch for each list of sample numbers, made in `workers` processes.
+    """Yield a batch for each list of sample numbers, made in `workers` other processes.
 
     Processes are spawned, because numba and torch do not survive a fork.
     """
@@ -274,7 +284,7 @@ def _from_workers(
 
 
 def _prepare_worker(number: int) -> None:
-    """Ignore SIGINT and SIGTERM in a worker, because the training process ends its workers."""
+    """Ignore SIGINT and SIGTERM in a worker process, which the training process ends itself."""
     show_safely()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""Held-out frames of a scene, and the sampler `qgs/span` of training views.
+"""Held-out frames of a scene, and the view sampler `qgs/span` for training.
 
 Source: TokenGS release (gap between inputs, targets from the span of the inputs).
 """
@@ -21,23 +21,24 @@ _T = TypeVar("_T")
 
 
 def held_out_frames(total: int, every: int) -> Frames:
-    """Return every nth of `total` frames, starting at n // 2, with n = `every`.
+    """Return every nth of `total` frames, starting at n // 2, where n is `every`.
 
-    With fewer than n frames, return the middle frame; none if `every` is 0 or `total` is at most 2.
+    If there are fewer than n frames, return the middle frame. If `every` is 0 or `total` is at most
+    2, return no frame.
     """
     every = min(every, total)
     return tuple(range(every // 2, total, every)) if every and total > 2 else ()
 
 
 def training_frames(scene: Scene) -> list[int]:
-    """Return all frames but the held-out frames, which training must not see."""
+    """Return all frames of `scene` except the held-out frames."""
     return sorted({*range(len(scene))} - {*scene.held_out})
 
 
 def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
-    """Group frames by time, in ascending order; without times, each frame is a group.
+    """Group frames by time, in ascending order; in scenes without times, each frame is a group.
 
-    frames: frames to group; default: `training_frames`.
+    frames: frames to group, by default those of `training_frames`.
     """
     frames = training_frames(scene) if frames is None else frames
     if scene.times is None:
@@ -49,9 +50,10 @@ def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
 
 
 def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
-    """Return least and largest gap between first and last input, in moments of a scene.
+    """Return the least and the largest gap between first and last input in a scene.
 
-    count: number of moments in the scene, see `moments`. Raises ValueError if they are too few.
+    Gaps are in moments, see `moments`; count is their number in the scene. Raises ValueError if
+    there are too few moments for the inputs.
     """
     low, high = views.gap
     what = "frames" if scene.times is None else "times"
@@ -88,7 +90,10 @@ def refuse_too_many(frames: int, scene: Scene) -> None:
 
 
 def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
-    """Return one frame of each moment in `chosen`, taking the numbers in `cameras` in turn."""
+    """Return one frame of each moment in `chosen`: frame c of the moment, with c from `cameras`.
+
+    The numbers in `cameras` are used in turn, modulo the number of frames.
+    """
     turns = zip(chosen, cycle(cameras), strict=False)
     return tuple(moment[camera % len(moment)] for moment, camera in turns)
 
@@ -96,7 +101,7 @@ def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
 def evenly(items: Sequence[_T], count: int) -> list[_T]:
     """Return `count` items, evenly spaced from first to last; for a count of 1, the middle item.
 
-    With fewer than `count` items, return all.
+    If there are fewer than `count` items, return all of them.
     """
     last = len(items) - 1
     count = min(count, len(items))
@@ -105,19 +110,24 @@ def evenly(items: Sequence[_T], count: int) -> list[_T]:
 
 
 def spread(span: Sequence[Frames], count: int) -> Frames:
-    """Return one frame from each of `count` evenly spaced moments of `span`."""
+    """Return one frame from each of `count` evenly spaced groups of `span`.
+
+    Each group holds the frames of one time, see `moments`.
+    """
     return one_of_each(evenly(span, count), range(count))
 
 
 class Span(ViewSampler):
-    """Sampler of views from a random span of frames (TokenGS release).
+    """View sampler that takes views from a random span of frames (TokenGS release).
 
-    The last frame of the span is min_gap to max_gap frames after the first. Inputs are both ends
-    and random frames between. Targets are random frames of the span that are not inputs. If there
-    are too few, inputs are used as targets, and then frames repeat.
+    The last frame of the span is min_gap to max_gap frames after the first. Inputs are the first
+    and the last frame, and random frames between them. Targets are random frames of the span that
+    are not inputs. If there are too few such frames, inputs are used as targets, and then frames
+    repeat.
 
-    In scenes with times, the span and the gap count times. Each input has a different time, and a
-    different camera if there are enough cameras. All targets have the same time (TokenGS 2026.6).
+    In scenes with times, the span and the gap count distinct times. Each input has a different
+    time, and a different camera if there are enough cameras. All targets have the same time
+    (TokenGS 2026.6).
     """
 
     name = "span"
@@ -125,21 +135,21 @@ class Span(ViewSampler):
 
     class Config(ComponentConfig):
         min_gap: int | None = Field(default=None, ge=1)
-        """Least distance in frames from the first to the last input. null uses `views.gap`."""
+        """Least distance in frames from the first to the last input view. null uses `views.gap`."""
         max_gap: int | None = Field(default=None, ge=1)
-        """Largest distance in frames from the first to the last input. null uses `views.gap`. A
-        schedule lets it grow during training."""
+        """Largest distance in frames from the first to the last input view. null uses `views.gap`.
+        With a schedule, it can grow during training."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Yield a problem if the gaps contradict each other."""
+        """Yield a problem if `min_gap` is larger than `max_gap`."""
         if config.min_gap and config.max_gap and config.min_gap > config.max_gap:
             yield Problem("min_gap", "`min_gap` is larger than `max_gap`", "raise `max_gap`")
 
     def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
-        """Draw input and target frames from a random span of `scene`."""
+        """Choose input and target frames from a random span of `scene`."""
         options = self.options(step)
         high = options.max_gap or views.gap[1]
         # A schedule may lower the largest gap below the least one of the recipe.

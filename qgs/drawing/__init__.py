@@ -1,1 +1,1 @@
-"""Pictures (arrays of pixels) and Matplotlib figures."""
+"""Pictures, which are arrays of pixels, and Matplotlib figures."""

@@ -1,4 +1,4 @@
-"""Matplotlib style of all figures, and figures of picture grids with a depth scale."""
+"""Matplotlib style of all figures, and figures that show a grid of pictures with a depth scale."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -18,12 +18,12 @@ COLUMN_INCHES = 1.9
 
 
 def figure_style() -> AbstractContextManager[None]:
-    """Return a context manager that sets the Matplotlib style of all figures within its block."""
+    """Return a context manager that sets the project's Matplotlib style inside its block."""
     return style.context(Path(__file__).with_name("figures.mplstyle"))
 
 
 def figure_picture(figure: Figure, dpi: int = 120) -> Picture:
-    """Render a figure to a picture (H, W, 3)."""
+    """Render a figure to an RGB array (H, W, 3) of uint8."""
     buffer = BytesIO()
     with figure_style():
         figure.savefig(buffer, format="png", dpi=dpi)
@@ -37,8 +37,8 @@ def grid_figure(
 ) -> Figure:
     """Draw a grid of pictures, with titles above the columns.
 
-    rows: pictures of each row, by the row's label. columns: titles. depths: (near, far) of a depth
-    scale beside the last row; None draws no scale.
+    rows: pictures of each row, by the label of the row. columns: titles of the columns. depths:
+        (near, far) of a depth scale beside the last row, in world units; None draws no scale.
     """
     height, width, _ = next(iter(rows.values()))[0].shape
     row_inches = COLUMN_INCHES * height / width

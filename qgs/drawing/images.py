@@ -1,4 +1,7 @@
-"""Pictures, arrays (H, W, 3) of uint8, from tensors of RGB, depth or other values; PNG and GIF."""
+"""Pictures from tensors of RGB, depth or other values, and their PNG and GIF files.
+
+A picture is an array (H, W, 3) of uint8.
+"""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -38,7 +41,10 @@ def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
 
 
 def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
-    """Draw values (1, H, W) in colours from `low` to `high`. colors: name of a Matplotlib map."""
+    """Draw values (1, H, W) in colours from `low` to `high`.
+
+    colors: name of a Matplotlib colormap.
+    """
     from matplotlib import colormaps
 
     shade = (values.detach().float().cpu().numpy()[0] - low) / max(high - low, 1e-12)
@@ -46,7 +52,10 @@ def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
 
 
 def depth_range(depths: Tensor) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of depths above 0, as the colour scale of pictures."""
+    """Return 2nd and 98th percentile of the depths above 0, as limits of a colour scale.
+
+    Without depths above 0, return 0 and 1.
+    """
     depths = depths.detach()
     seen = depths[depths > 0].float()
     if not seen.numel():
@@ -71,13 +80,13 @@ def png_bytes(picture: Picture) -> bytes:
 
 
 def write_png(picture: Picture, path: str | Path) -> None:
-    """Write a picture as PNG."""
+    """Write a picture to `path` as PNG."""
     with replacing(path) as temporary:
         temporary.write_bytes(png_bytes(picture))
 
 
 def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:
-    """Write pictures of one size as an endless animated GIF with one palette."""
+    """Write pictures of equal size as a looping GIF. All frames share one palette."""
     # One palette for all: others would make still pixels flicker.
     sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
     palette = sample.quantize(256, method=Image.Quantize.MEDIANCUT)
@@ -93,9 +102,9 @@ def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: fl
 
 
 def finer(cameras: Cameras, side: int) -> Cameras:
-    """Return the same cameras for larger images, with a longer side of about `side` pixels.
+    """Return `cameras` with larger images, whose longer side is about `side` pixels.
 
-    Both sides grow by the same whole factor.
+    Both sides grow by the same whole factor; images are never made smaller.
     """
     height, width = cameras.size
     factor = max(1, round(side / max(height, width)))

@@ -1,1 +1,1 @@
-"""Evaluation of a model: which views are scored, the protocol, the scores and their tables."""
+"""Evaluation of a model: the views to score, the evaluation protocol, scores and their tables."""

@@ -1,4 +1,7 @@
-"""Scores of a model, and of two baselines without a model, on the test views of a recipe."""
+"""Scores of a model on the test views of a recipe, beside those of two baselines.
+
+The baselines are images that are made from the input views without a model.
+"""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -35,10 +38,12 @@ def evaluate(
 ) -> Evaluation:
     """Score `model` with the metrics of `recipe` on the recipe's test views.
 
-    The device and the mode of the model stay. A scene that fails gets a reason in place of a score.
-    step: optimiser steps after which the weights were saved. observe: called after each scene with
-    the numbers of finished and of all scenes. views_of: see `EvaluationPlan`. sampler: view
-    sampler, by default the recipe's. show: called with each sample and its rendered targets.
+    The model stays on its device and in its mode (training or evaluation). If a scene fails, the
+    result has the reason in place of a score.
+    step: number of optimiser steps after which the weights were saved. observe: called after each
+        scene with the numbers of finished scenes and of all scenes. views_of: see `EvaluationPlan`.
+        sampler: view sampler, by default the recipe's. show: called with each sample and its
+        rendered targets.
 
     Raises the errors of the data source, of `read_index` and of `Measures`, and ValueError if no
     scene could be scored.
@@ -89,7 +94,7 @@ def evaluate(
 def _remarks(
     evaluation: Evaluation, model: QueryGaussianModel, recipe: Recipe, seen: Domain
 ) -> list[str]:
-    """Return remarks: test views unlike the training views, and scores below a baseline."""
+    """Return remarks on test views unlike the training views, and on scores below a baseline."""
     remarks: list[str] = []
     if model.trained_on is not None:
         remarks.append(verdict(model.trained_on, seen))
@@ -107,7 +112,7 @@ def _remarks(
 class Measures:
     """All metrics of a recipe, called together.
 
-    columns: how each value is displayed, by name of the value.
+    columns: display of each value in tables, by name of the value.
     The constructor raises ValueError if two metrics have a value of the same name.
     """
 
@@ -127,9 +132,11 @@ class Measures:
                 self._owners[name] = metric
 
     def __call__(self, method: str, given: MetricInput) -> dict[str, float]:
-        """Return the metrics of a sample, named METHOD_NAME. Skips metrics whose input is missing.
+        """Return the metric values of a sample by name, such as model_psnr.
 
-        method: "model" or a baseline. Raises ValueError that names a metric which fails.
+        method: "model" or the name of a baseline, which is the first part of each name. Metrics
+            whose input is None are left out. Raises ValueError with the name of a metric that
+            fails.
         """
         values: dict[str, float] = {}
         for label, metric in self.metrics.items():
@@ -147,7 +154,7 @@ class Measures:
         return values
 
     def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
-        """Return the reason for each value that scenes in `scores` lack, by name of the value."""
+        """Return why scenes in `scores` lack a value, by name of the value."""
         found: dict[str, str] = {}
         for name, metric in self._owners.items():
             if metric.unavailable:
@@ -164,9 +171,10 @@ def _name(metric: str, key: str) -> str:
 
 @dataclass
 class _Scorer:
-    """Scorer of samples.
+    """Scores samples of scenes, and collects facts about all of them.
 
-    seen: ranges of all cameras so far. gaussians: largest number of Gaussians of a scene so far.
+    seen: measurements of all cameras so far. gaussians: largest number of Gaussians per scene so
+        far.
     """
 
     model: QueryGaussianModel
@@ -183,7 +191,7 @@ class _Scorer:
 
     @torch.no_grad()
     def score(self, scene: str, samples: Iterable[Sample]) -> SceneScore:
-        """Return the mean score of a scene over its samples. Raises ValueError if it is NaN."""
+        """Return the mean score of a scene over its samples; raise ValueError if it is not finite."""
         found: list[dict[str, float]] = []
         views: list[Window] = []
         names: dict[int, str] = {}

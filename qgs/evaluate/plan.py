@@ -1,4 +1,4 @@
-"""Views that an evaluation scores: drawn with a seed, or named by an index file."""
+"""Views that an evaluation scores: chosen at random with a seed, or listed in an index file."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field
 class IndexEntry(BaseModel):
     """Frames of one scene in an index file, as positions in the scene's list of frames.
 
-    Unknown keys in the file are ignored.
+    Other keys in the file are ignored.
     """
 
     model_config = ConfigDict(frozen=True)
 
     context: FrameList
-    """Input frames. The camera of the first one defines the model's coordinate frame."""
+    """Input frames. The camera of the first input frame defines the model's coordinate frame."""
     target: FrameList
     """Target frames, which are rendered and scored."""
 
@@ -41,9 +41,10 @@ _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
 
 
 def read_index(path: str | None) -> EvaluationIndex | None:
-    """Read the index file `path`: JSON, local or at a URL of fsspec. None if `path` is None.
+    """Read the JSON file `path`, a local path or a URL of fsspec; return None if `path` is None.
 
-    Raises FileNotFoundError; ValueError if the file has another form or names no scene to score.
+    Raises FileNotFoundError for a missing file, and ValueError for a file that has another form or
+    names no scene to score.
     """
     if path is None:
         return None
@@ -69,21 +70,22 @@ def read_index(path: str | None) -> EvaluationIndex | None:
 class EvaluationPlan:
     """Samples that an evaluation scores: scenes of the test split and their views.
 
-    With `evaluation.index`, the index names scenes and frames. Without one, the first
-    `evaluation.scenes` scenes are scored. Their samples are, in this order of preference:
+    With `evaluation.index`, the index file names scenes and frames. Without an index, the first
+    `evaluation.scenes` scenes are scored. The samples of a scene are the first of these that exist:
 
-    1. the windows of `sampler`, if it has any,
+    1. the windows of `sampler`,
     2. `held_out_windows`, if the scene has held-out frames,
-    3. `evaluation.samples` samples, drawn by `sampler` with `evaluation.seed` as at the end of
-       training. Targets are all frames of the span that are not inputs; in a scene with times, the
-       sampler's targets.
+    3. `evaluation.samples` samples, which `sampler` chooses at random with `evaluation.seed`, as at
+    the end of training. Targets are all frames from the first to the last input that are not
+    inputs; in a scene with times, the sampler's targets.
 
-    1 and 2 are thinned evenly to `evaluation.scenes` windows. Targets at several times become one
-    sample for each time. No sample is mirrored.
+    Windows of 1 and 2 are thinned evenly to `evaluation.scenes` windows. Targets at several times
+    become one sample for each time. No sample is mirrored.
 
     views_of: function that returns the view settings of a sample, such as its scale; None uses
-    `views`. depths: load true depth for targets if the scene has it. wanted: names of the scenes.
-    Raises ValueError if the data has no test scenes, and the errors of `read_index`.
+        `views`. depths: load true depth for targets if the scene has it. wanted: names of the
+        scenes to score. Raises ValueError if the data has no test scenes, and the errors of
+        `read_index`.
     """
 
     source: SceneSource
@@ -105,12 +107,12 @@ class EvaluationPlan:
             self.wanted = tuple(name for name, entry in self.index.items() if entry)
 
     def samples(self, name: str) -> Iterator[Sample]:
-        """Yield the samples of the scene `name`; images are decoded for one sample at a time.
+        """Yield the samples of the scene `name`, decoding the images of one sample at a time.
 
         Raises ValueError for an unknown scene, and the errors of the scene's reader.
         """
         if name not in self._places:
-            raise ValueError("this is not one of the test scenes of the data")
+            raise ValueError("the data has no test scene of this name")
         place = self._places[name]
         scene = self._scenes[place]
         # a generator for each scene: a failing one changes no noise of the others
@@ -121,7 +123,10 @@ class EvaluationPlan:
                 yield make_sample(scene, inputs, part, views, False, noise, self.depths)
 
     def _choices(self, scene: Scene, place: int) -> Iterator[Window]:
-        """Yield input and target frames of each sample. place: number of the scene in the split."""
+        """Yield input and target frames of each sample.
+
+        place: number of the scene in the test split.
+        """
         sampler = self.sampler
         # What somebody chose comes first: an index, then windows of the sampler's own. Held-out
         # photos are scarce, so all of them are compared before any frame is drawn by chance.
@@ -143,10 +148,11 @@ class EvaluationPlan:
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[Window]:
     """Return windows (input frames, target frames) in which each held-out frame is a target once.
 
-    Each window is as long as the largest `views.gap`, counted in training frames or, in a scene
-    with times, in times. It is centred on the first held-out frame that no window has yet, and
-    shifted to lie inside the scene. Its inputs are evenly spaced training frames; its targets are
-    all remaining held-out frames between the first and the last input.
+    The length of a window is the largest `views.gap`, counted in training frames or, in a scene
+    with times, in times. The window is centred on the first held-out frame that is in no earlier
+    window, and shifted to lie inside the scene. Its inputs are evenly spaced training frames. Its
+    targets are all held-out frames between the first and the last input that are in no earlier
+    window.
     """
     usable = moments(scene)
     gap = gap_range(len(usable), views, scene)[1]
@@ -171,7 +177,10 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[Window]:
 
 
 def _named(scene: Scene, index: EvaluationIndex) -> Window:
-    """Return input and target frames of `scene` from `index`; ValueError if frames are missing."""
+    """Return input and target frames of `scene` from `index`.
+
+    Raises ValueError if the scene lacks some of these frames, or images that it lists.
+    """
     entry = index[scene.name]
     assert entry is not None
     # frames are positions, which a missing image moves

@@ -19,8 +19,8 @@ class Protocol:
     """Settings of an evaluation. Results are comparable if the hashes of their protocols are equal.
 
     name: title for people, not hashed. content: all settings that influence the scores of given
-    Gaussians. Paths, device and the renderer's type are left out: all renderers give the same
-    image.
+        Gaussians. Paths, the device and the renderer's type are left out, because all renderers
+        give the same image.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Protocol:
 
     @property
     def canonical(self) -> str:
-        """`content` as JSON with sorted keys and no spaces, the text that is hashed."""
+        """The text that is hashed: `content` as JSON with sorted keys and without spaces."""
         # Sorted and without spaces: the hash must not depend on who wrote the mapping.
         return json.dumps(
             self.content, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
@@ -36,7 +36,7 @@ class Protocol:
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of `canonical` in UTF-8, as hexadecimal digits."""
+        """SHA-256 hash of `canonical` in UTF-8, as hexadecimal digits."""
         return hashlib.sha256(self.canonical.encode()).hexdigest()
 
 
@@ -46,9 +46,10 @@ def protocol_of(
     scenes: Sequence[str] = (),
     step: int = END,
 ) -> Protocol:
-    """Return the protocol of `recipe` on the views of `index`; None draws views from `scenes`.
+    """Return the protocol of evaluating `recipe` on the views that `index` lists.
 
-    step: optimiser steps at which scheduled options of the renderer are read.
+    Without an index (None), the views are chosen at random from `scenes`, names of scenes. step:
+    number of optimiser steps after which scheduled options of the renderer are read.
     """
     evaluation = recipe.evaluation
     data, views = _data_and_views(recipe, index, scenes)
@@ -95,7 +96,7 @@ def protocol_of(
 def _data_and_views(
     recipe: Recipe, index: EvaluationIndex | None, scenes: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the settings of the data, and those of the views that are scored.
+    """Return two parts of a protocol: settings of the data, and settings of the scored views.
 
     With an index, the type of the data source, its split, and options at their defaults are left
     out, so that a data set stored in two formats has the same protocol.

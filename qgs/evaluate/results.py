@@ -1,4 +1,4 @@
-"""Scores of an evaluation: scores of scenes, their means, and the files and tables of both."""
+"""Results of an evaluation: scores of scenes, their means, and the files and tables of both."""
 
 import csv
 import io
@@ -27,9 +27,9 @@ METHODS = ("model", *BASELINES)
 class SceneScore:
     """Scores of one scene.
 
-    views: input and target frames of each sample. values: means over the samples, by
-    METHOD_METRIC, and "gaussians_used"; without metrics that need something that the method or the
-    scene lacks. names: names of frames, see `Sample`.
+    views: input and target frames of each sample. values: means over the samples by METHOD_METRIC,
+        such as "model_psnr", and "gaussians_used". A value is absent if the method or the scene
+        lacks an input of the metric. names: names of photos by frame number.
     """
 
     scene: str
@@ -39,7 +39,7 @@ class SceneScore:
 
     @property
     def given(self) -> list[int]:
-        """Frames that are input and target of the same sample.
+        """Frames that are both input and target of one sample.
 
         Their scores mean nothing, because the model has seen the target.
         """
@@ -51,11 +51,12 @@ class SceneScore:
 class Evaluation:
     """Scores of all scenes and their means. The same weights and recipe give the same numbers.
 
-    columns: how each value is displayed, by name of the value. scores: scores of the scenes.
-    gaussians: largest number of Gaussians of a scene. missing: reason for each scene of the
-    protocol without a score. incomplete: reason for each value that scenes lack, by name. step:
-    optimiser steps after which the weights were saved; None if unknown. remarks: sentences on the
-    views and on the scores.
+    columns: display of each value in tables, by name of the value. scores: scores of the scenes.
+    gaussians: largest number of Gaussians of a scene. missing: scenes of the protocol without a
+        score, each with the reason. incomplete: values that some scenes lack, by name, each with
+        the reason.
+    step: number of optimiser steps after which the weights were saved; None if unknown. remarks:
+        sentences on the views and on the scores.
     """
 
     protocol: Protocol
@@ -76,11 +77,14 @@ class Evaluation:
         return fmean(found) if found else None
 
     def means(self, method: str = "model") -> dict[str, float | None]:
-        """Return the mean over scenes of each value in `columns`. method: "model" or a baseline."""
+        """Return the mean over scenes of each value in `columns`, by name.
+
+        method: "model" or the name of a baseline.
+        """
         return {name: self.mean(f"{method}_{name}") for name in self.columns}
 
     def summary(self) -> dict[str, Any]:
-        """Return everything but the scores of single scenes, as plain values for JSON.
+        """Return all results except the scores of single scenes, as plain values for JSON.
 
         The entry "over_scenes" has mean, population variance and median of the model's values.
         """
@@ -115,7 +119,7 @@ class Evaluation:
     def write(self, folder: str | Path) -> None:
         """Write scenes.csv, summary.json, table.md and protocol.json, each atomically.
 
-        protocol.json holds `Protocol.canonical`; the SHA-256 of the file is the protocol's hash.
+        protocol.json holds `Protocol.canonical`; the SHA-256 of this file is the protocol's hash.
         """
         table = io.StringIO()
         # As wide as the lines are; without the colours that the environment may ask for.
@@ -146,7 +150,7 @@ class Evaluation:
         return len(self.scores) + len(self.missing)
 
     def _rows(self) -> list[list[str]]:
-        """Return the rows of the table: means of all methods, and the number of scenes."""
+        """Return the rows of the table; each has a method's means and the number of scenes."""
         judged = f"{len(self.scores)} of {self._wanted}" if self.missing else str(self._wanted)
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
@@ -179,7 +183,7 @@ class Evaluation:
         return text.getvalue()
 
     def _notes(self) -> Iterator[str]:
-        """Yield the notes below the table: protocol, missing scores, Gaussians, tuning, remarks."""
+        """Yield notes to print below the table, such as missing scores and the protocol."""
         content = self.protocol.content
         height, width = content["image_size"]
         counts = set[int]()
@@ -214,5 +218,5 @@ class Evaluation:
 
 
 def as_json(value: Mapping[str, Any]) -> str:
-    """Return JSON text for a file. Raises ValueError for NaN and infinity."""
+    """Return indented JSON text that ends with a newline; raise ValueError for NaN and infinity."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -1,4 +1,4 @@
-"""Tuning at test time: fit queries or latents of a scene to its input views (TokenGS)."""
+"""Test-time tuning: fit the queries or the image memory of a scene to its input views (TokenGS)."""
 
 import re
 from typing import Any
@@ -16,20 +16,22 @@ from qgs.types import Gaussians, Views
 def tuning_settings(tune: str | None) -> list[str]:
     """Return recipe overrides for the value of --tune: "STEPS", "WHAT:STEPS" or "WHAT".
 
-    WHAT: queries or latents, for 50 steps by default (TokenGS). Raises ValueError for other text.
+    WHAT is queries or latents. STEPS is 50 by default (TokenGS). None gives no overrides. Raises
+    ValueError for any other text.
     """
     if tune is None:
         return []
     match = re.fullmatch(r"(?:(queries|latents)(?::|$))?(\d*)", tune)
     if match is None or not tune:
-        raise ValueError(f"tuning must be STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
+        raise ValueError(f"--tune must be STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
     what = [f"evaluation.tuning={match[1]}"] if match[1] else []
     return [f"evaluation.tuning_steps={match[2] or 50}", *what]
 
 
 def tuning_loss(recipe: Recipe) -> Photometric:
-    """Return the loss that tuning minimises: the first `qgs/photometric` of `recipe`, or a default.
+    """Return the loss that test-time tuning minimises.
 
+    It is the first `qgs/photometric` among the losses of `recipe`, or one with default options.
     Scheduled weights have their values at the end of training, so that equal protocols mean the
     same loss.
     """
@@ -47,8 +49,8 @@ def tune(
 ) -> tuple[Gaussians, dict[str, Any]]:
     """Fit queries or latents of scenes to their input `views` (B, V). The weights do not change.
 
-    `evaluation.tuning` of the recipe decides what is fitted: "queries" are all features and
-    floating-point fields of the initial state, including LocusGS's anchors; "latents" are the
+    The option `evaluation.tuning` decides what is fitted. "queries" are all features and
+    floating-point fields of the initial state, including LocusGS's anchors. "latents" are the
     features of the image memory, from which the encoder recomputes keys and values in every step.
     Adam minimises `tuning_loss` between renderings of the last layer and the photos. TokenGS takes
     50 steps, with a learning rate of 1e-4 for queries and 1e-2 for latents.
