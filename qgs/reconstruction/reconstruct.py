@@ -1,4 +1,4 @@
-"""Reconstruction of a scene in one call: choice of photos, scale, forward pass, remarks."""
+"""Reconstruction of a scene in one call: it chooses photos, searches the scale, runs the model."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,14 +38,14 @@ def reconstruct(
     """Reconstruct one scene from photos, as the command `qgs reconstruct` does.
 
     Cameras are moved to the frame and scale of the model's recipe. If the recipe's scale is
-    constant and the photos are not training data, `find_scale` searches the scale.
+    constant and the photos are not training data, `find_scale` searches for the scale.
 
     photos: a folder of photos and cameras, or its URL. Or Views (1, V) with OpenCV cameras in any
         world; all of them are inputs unless `inputs` or `frames` is given.
     inputs: number of input photos; None uses the recipe's number.
     frames: input photos, by number or file name; None chooses them, see `qgs.data.inputs`.
     compare: photos to score, or "none". None scores held-out photos (every eighth) near the inputs.
-    size, scene: for a folder: (H, W) of images, see `chosen_scene`; name of one of its scenes.
+    size: (H, W) of images of a folder, see `chosen_scene`. scene: name, for a folder of scenes.
     overrides: changes of the recipe's `views`, such as "views.scale=auto".
     tune: part to fit to the inputs first, see `tuning_settings`; None fits nothing.
 
@@ -90,7 +90,7 @@ def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | Non
     if model.recipe is None:
         raise ValueError(
             "this model was built by hand and has no recipe, so the frame and scale of its world "
-            "are not known; build it with qgs.compose, or move cameras to its world and call it"
+            "are not known; build it with qgs.compose, or call it on cameras in its own world"
         )
     # The weights fit only the model options of the recipe.
     if foreign := [text for text in overrides if not text.startswith("views.")]:
@@ -108,11 +108,12 @@ def choose_frames(
 ) -> Window:
     """Return the input frames of `scene` and the frames to compare the result with.
 
-    inputs: number of inputs; None uses `views.inputs`. frames, compare: inputs and compared frames
-    that the user chose. None chooses them: the best window of `ranked_windows`, or in scenes with
-    times inputs spread over time, and compared frames of one time between them. trained_on: the
-    model's trained range. Raises ValueError for frames that do not exist or repeat, and for too few
-    frames.
+    inputs: number of inputs; None uses `views.inputs`.
+    frames, compare: input frames and compared frames that the user chose; None chooses them here.
+        In scenes with times, inputs are spread over time, and compared frames between them share
+        one time. In other scenes, the best window of `ranked_windows` is used.
+    trained_on: ranges of cameras in the model's training; None allows any.
+    Raises ValueError for frames that do not exist or repeat, and for too few frames.
     """
     views = views.model_copy(update={"inputs": inputs or views.inputs})
     # A model whose checkpoint records no range takes any views.
@@ -136,11 +137,11 @@ def choose_frames(
 def checked_window(total: int, frames: Sequence[int], compare: Sequence[int] = ()) -> Window:
     """Return input and compared frames; raise ValueError if a frame repeats or does not exist.
 
-    total: number of frames of the scene.
+    frames: the inputs. total: number of frames of the scene.
     """
     every = [*frames, *compare]
     if missing := [frame for frame in every if not 0 <= frame < total]:
-        raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
+        raise ValueError(f"frames {listed(missing)} do not exist; choose from 0..{total - 1}")
     if twice := sorted({frame for frame in every if every.count(frame) > 1}):
         raise ValueError(
             f"these frames are named twice: {listed(twice)}; inputs and compared frames must differ"
@@ -151,9 +152,10 @@ def checked_window(total: int, frames: Sequence[int], compare: Sequence[int] = (
 def _over_time(
     scene: Scene, times: Tensor, views: ViewsConfig, frames: Sequence[int] | None
 ) -> Window:
-    """Return inputs spread over time, and at most NOVEL compared frames of one time between them.
+    """Return inputs spread over time, and at most NOVEL frames between them to compare with.
 
-    Compared frames are held-out frames if there are any. frames: inputs that the user chose.
+    Compared frames all have one time. They are held-out frames if any lie between the inputs,
+    otherwise any frames. frames: inputs that the user chose; None chooses `views.inputs` frames.
     """
     if frames is None:
         usable = moments(scene)
@@ -184,7 +186,7 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
 
 
 def choice(sample: Sample, scene: Scene) -> str:
-    """Return a text that names inputs and compared photos, and counts the held-out photos."""
+    """Return text that names inputs and compared photos, and counts the held-out photos."""
     text = f"inputs {listed(map(scene.frame_name, sample.input_frames))}"
     if sample.target_frames:
         text += f", compared with {listed(map(scene.frame_name, sample.target_frames))}"

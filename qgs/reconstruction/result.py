@@ -27,7 +27,8 @@ KINDS = ("input", "novel", "seen in training")
 class ViewScore:
     """Quality of a rendered view, compared with its photo.
 
-    kind: one of KINDS. psnr: in dB. baselines: PSNR of each baseline by name; empty for an input.
+    kind: one of KINDS. psnr: in dB. baselines: PSNR in dB of each baseline method, by its name;
+        empty for an input.
     """
 
     frame: int
@@ -40,10 +41,10 @@ class ViewScore:
 class Reconstruction:
     """Gaussians (1, G) that `model` made of a sample, in the model's world, and their quality.
 
-    rendering: from all views of the sample, inputs first. scores: one for each of these views.
-    tuning, refinement: settings with which the Gaussians were fitted to photos; None if they were
-    not. remarks: sentences for the user. scale: result of the search for the scale; None without a
-    search.
+    rendering: images of all views of the sample, inputs first. scores: one for each of these views.
+    tuning, refinement: settings with which the Gaussians were fitted to photos; None if not fitted.
+        remarks: sentences for the user. scale: result of the search for the scale; None without a
+        search.
     """
 
     model: QueryGaussianModel
@@ -58,7 +59,7 @@ class Reconstruction:
 
     @property
     def worse_than_nearest(self) -> str:
-        """Remark if a copy of the nearest input has a higher PSNR on compared views, else ""."""
+        """Remark if, on compared views, copies of the nearest input have a higher PSNR; else ""."""
         compared = [score for score in self.scores if score.baselines]
         if not compared:
             return ""
@@ -82,7 +83,7 @@ class Reconstruction:
         return replace(seen, depth=seen.depth / float(scale))
 
     def save(self, out: AnyPath) -> list[Path]:
-        """Write the files of `qgs reconstruct` and return their paths."""
+        """Write the files that `qgs reconstruct` writes to `out`, and return their paths."""
         # Matplotlib is slow to import.
         from qgs.reconstruction.saving import write_reconstruction
 
@@ -114,7 +115,7 @@ def reconstruct_sample(
     """Reconstruct `sample` on the model's device, render its views and score them.
 
     seen: frames that the model was trained on. changed: Gaussians to use in place of those from a
-    forward pass.
+        forward pass; None runs the model.
     """
     device = next(model.parameters()).device
     # Views come from the data on the CPU.
@@ -131,7 +132,7 @@ def reconstruct_sample(
 
 
 def _scores(sample: Sample, rendering: Rendering, seen: Collection[int]) -> list[ViewScore]:
-    """Score each rendered view against its photo, and the baselines at the target views."""
+    """Return the PSNR of each rendered view, and at target views also that of the baselines."""
     inputs = sample.inputs
     targets = sample.targets
     photos = torch.cat([inputs.images, targets.images], 1)

@@ -54,8 +54,8 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
     """Write gaussians.ply, overview.png, views/, depth/, orbit.gif and cameras.json into `out`.
 
     These files are in the model's world; cameras.json has the transform to the photos' world. The
-    files of an earlier result are replaced together when all are complete. Raises FileExistsError
-    if `out` holds files of these names that are no earlier result.
+    files of an earlier result are replaced together, once all new files are complete. Raises
+    FileExistsError if `out` holds files of these names that are no earlier result.
     If `out` has the suffix of a scene format (.ply, .splat, ...), only this file is written, with
     the Gaussians in the photos' world.
     """
@@ -84,7 +84,7 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
 
 
 def _pictures(result: Reconstruction) -> dict[str, list[Picture]]:
-    """Return pictures of the photo, the rendering and the depth of every view, by kind."""
+    """Return the pictures of all views by kind: "photo", "render" and "depth"."""
     sample = result.sample
     rendering = result.rendering
     near, far = depth_range(rendering.depth)

@@ -1,9 +1,9 @@
 """Search for the scale of a scene: the factor of camera positions at which a model renders best.
 
 Camera positions of photos may be in any unit, but a model needs the unit of its training. So the
-model runs on the inputs at several factors, and the PSNR of rendered photos decides. Inputs alone
-mislead: at a factor that is too small, surfaces close to the cameras reproduce them well. So a few
-photos that are no inputs are scored too.
+model runs on the inputs at several factors, and the factor with the best PSNR of rendered photos is
+chosen. Inputs alone mislead: at a factor that is too small, surfaces close to the cameras reproduce
+them well. So a few photos that are not inputs are scored too.
 """
 
 import math
@@ -51,9 +51,9 @@ POOR = 14.0
 class FoundScale:
     """Result of the search: the best factor of camera positions, and its quality.
 
-    further: scored photos that are no inputs. names: the names of their files. psnr: mean PSNR in
-    dB of inputs and further photos, where further photos have twice the weight. tried: all tried
-    factors, each with its `psnr`.
+    further: scored photos that are not inputs. names: file names of these photos.
+    psnr: mean PSNR in dB of inputs and further photos, where further photos have twice the weight.
+    tried: all tried factors, each with its `psnr`.
     """
 
     factor: float
@@ -64,7 +64,7 @@ class FoundScale:
 
     @property
     def poor(self) -> str:
-        """Remark if no factor gave a good result or only inputs were scored, else ""."""
+        """Remark if no factor gave a good result, or if only inputs were scored; else ""."""
         # NaN is poor too.
         if not self.psnr >= POOR:
             return (
@@ -80,7 +80,7 @@ class FoundScale:
 
     @property
     def text(self) -> str:
-        """Sentence on the factor, the scored photos and their PSNR."""
+        """Sentence that gives the factor, the scored photos and their PSNR."""
         judged = f"the inputs and {listed(self.names)}" if self.names else "the inputs"
         return f"scale {self.factor:.3g}, found on {judged}: {self.psnr:.1f} dB"
 
@@ -88,8 +88,8 @@ class FoundScale:
 def photo_settings(views: ViewsConfig, own: bool, overrides: Sequence[str] = ()) -> ViewsConfig:
     """Return `views` with the scale "search" in place of "constant", for photos in unknown units.
 
-    The constant scale stays if the model was trained on these photos (`own`), or if `overrides`,
-    changes of the recipe by the user, set the scale.
+    A constant scale stays if the model was trained on these photos (`own`), or if the user's
+    `overrides` of the recipe set the scale.
     """
     known = own or any(text.startswith("views.scale") for text in overrides)
     search = views.scale == "constant" and not known
@@ -105,15 +105,17 @@ def constant_scale(views: ViewsConfig, factor: float) -> ViewsConfig:
 def find_scale(
     model: QueryGaussianModel, scene: Scene, inputs: Frames, compared: Frames, views: ViewsConfig
 ) -> FoundScale:
-    """Search the factor at which `model` renders inputs and `further_photos` of `scene` best.
+    """Search for the factor at which `model` renders photos of `scene` best.
 
-    The coarse search tries factors with ratio STEP over `search_range`, and more factors while the
-    best one is at an end. The fine search tries thirds of a step around the best, and then the
-    vertex of a parabola through the three best scores in log scale.
+    The inputs and `further_photos` are scored. The coarse search tries factors with ratio STEP over
+    `search_range`, and goes on past an end of the range while the best factor is there. The fine
+    search tries thirds of a step around the best factor, then the vertex of a parabola through the
+    three best scores in log scale.
 
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
     given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
-    model: must be in evaluation mode; the search runs on its device.
+    model: must be in evaluation mode; the search runs on its device. compared: frames that will
+        score the result, so the search does not use them.
     """
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
@@ -153,10 +155,10 @@ def find_scale(
 
 
 def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
-    """Return at most FURTHER photos from the middle of the inputs, to score factors with.
+    """Return at most FURTHER photos that lie amid the inputs, to score factors with.
 
     These are the photos whose largest `pose_distance` to an input is smallest. Inputs, compared
-    photos and held-out photos are left out. Scenes with times have no such photos.
+    photos and held-out photos are left out. A scene with times gives no photos.
     """
     left = [f for f in range(len(scene)) if f not in {*inputs, *compared, *scene.held_out}]
     if scene.times is not None or not left:
@@ -169,8 +171,9 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
 def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
     """Return the least and largest factor to try, and the factor below which scores are lowered.
 
-    Below the third number, depths are smaller than in training; it is 0 if the depth at which the
-    cameras look is unknown. trained: the model's trained range. frames: the inputs.
+    At smaller factors than the third, depths are smaller than in training. It is 0 if the depth at
+    which the cameras look is unknown. trained: ranges of cameras in the model's training. frames:
+    the inputs.
     """
     depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
@@ -192,11 +195,11 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
 
 @dataclass
 class _Trial:
-    """Scores of factors of camera positions; the factor of a place is low * step ** place.
+    """Scores of factors of camera positions; place p stands for the factor low * step ** p.
 
     views: (1, V), whose cameras have the factor 1; the first `inputs` of them are given to the
-    model. weights: weights of the views in the mean PSNR. nearest: factor below which PENALTY
-    lowers the score. tried: mean PSNR by place.
+        model. weights: weights of the views in the mean PSNR. nearest: factor below which PENALTY
+        lowers the score. tried: mean PSNR in dB by place.
     """
 
     model: QueryGaussianModel
@@ -217,7 +220,7 @@ class _Trial:
         return -math.inf if math.isnan(found) else found
 
     def best(self, places: Iterable[float]) -> float:
-        """Score these places; return the best place of all that were scored so far."""
+        """Score the factors at `places`; return the place with the best score of all so far."""
         for place in places:
             if place in self.tried:
                 continue
@@ -228,13 +231,16 @@ class _Trial:
         return max(self.tried, key=self.score)
 
     def past(self, place: float) -> Sequence[float]:
-        """Return two places beyond `place` if it is the first or last tried place, else none."""
+        """Return two places beyond `place` if it is the first or last tried place; else none."""
         if place == min(self.tried):
             return [place - 6, place - 3]
         return [place + 3, place + 6] if place == max(self.tried) else []
 
     def vertex(self, place: float) -> float:
-        """Return the offset from `place` to the best place, by a parabola through three scores."""
+        """Return the offset from `place` to the vertex of a parabola through it and its neighbours.
+
+        Returns 0 if a neighbour was not tried or the parabola has no maximum.
+        """
         if not {place - 1, place + 1} <= self.tried.keys():
             return 0.0
         left, middle, right = (self.score(place + side) for side in (-1, 0, 1))

@@ -1,7 +1,7 @@
-"""Gaussians as files: PLY of the 3DGS release, .splat, and formats that distributions add.
+"""Gaussians as files: PLY of the 3DGS release, .splat, and formats that other packages add.
 
-Files hold float32. Worlds that are too far from zero for it are written about a local origin, which
-PLY files name in a comment; read again, Gaussians are in their world, their means in float64.
+Files hold float32. Gaussians too far from zero for float32 are written relative to a local origin,
+which a PLY file names in a comment. Reading such a PLY adds the origin and gives means in float64.
 """
 
 import re
@@ -46,7 +46,7 @@ _HEADER = 2**16
 
 
 def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
-    """Write one scene, (G, ...) or (1, G, ...), in the format of the suffix of `path`.
+    """Write one scene, (G, ...) or (1, G, ...), in the format that the suffix of `path` names.
 
     Raises ValueError for a suffix without a writer (see `scene_writers`), for several scenes, and
     for numbers that are not finite.
@@ -62,9 +62,10 @@ def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def scene_writers() -> Mapping[str, Callable[[], Callable[[Gaussians, str | Path], None]]]:
-    """Return by suffix a function that finds the writer of such files.
+    """Map each suffix of a file to a function that returns the writer of such files.
 
-    Finding one of WRITER_GROUP raises ExtensionError where its distribution cannot be imported.
+    For a writer of another package (entry points WRITER_GROUP), the function raises ExtensionError
+    if the package cannot be imported.
     """
     added = {
         f".{entry.name.lower()}": partial(imported, entry) for entry in installed(WRITER_GROUP)
@@ -76,9 +77,9 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), as binary little-endian float32.
 
     Colours become f_dc, spherical harmonics f_rest, opacities logits, scales logarithms;
-    quaternions stay w x y z; normals are zero. Warns that `features` are left out, and of a local
-    origin, which the comment `local origin X Y Z` names. Raises ValueError for several scenes or
-    for numbers that are not finite.
+    quaternions stay w x y z; normals are zero. Warns if `features` are left out, and if means are
+    written relative to a local origin, which the comment `local origin X Y Z` names. Raises
+    ValueError for several scenes or for numbers that are not finite.
     """
     scene, origin = one_scene(gaussians, "PLY", "features")
     sh = scene.means.new_zeros(scene.count, SH_COUNTS[-1], 3) if scene.sh is None else scene.sh
@@ -102,8 +103,9 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
 def save_splat(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), the largest and most opaque Gaussians first.
 
-    Colours, opacities and quaternions, w x y z, get 8 bits. Warns that spherical harmonics and
-    `features` are left out, and of a local origin. Raises as `save_ply`.
+    Colours, opacities and quaternions, w x y z, get 8 bits. Warns if spherical harmonics or
+    `features` are left out, and if means are written relative to a local origin. Raises the errors
+    of `save_ply`.
     """
     scene, _ = one_scene(gaussians, ".splat", "sh", "features")
     # Viewers draw a file while it loads, so what covers most comes first.
@@ -120,12 +122,12 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Return the Gaussians (1, G) of a PLY file in the layout of the 3DGS release, in its world.
+    """Return the Gaussians (1, G) of a PLY file, in the layout of the 3DGS release, or of a .splat.
 
-    A .splat file is read, too. Gaussians that are not finite are left out, with a warning. The
-    3D filter of Mip-Splatting is applied. `sh` ends with the last degree that is not all zeros; it
-    is None without one. Means are float64 if float32 would lose them. Raises FileNotFoundError, and
-    ValueError for another kind of file.
+    They are in the world of the file. Gaussians that are not finite are left out, with a warning.
+    The 3D filter of Mip-Splatting is applied. `sh` has all degrees up to the last that is not all
+    zeros; None if all are. Means are float64 if float32 would lose digits. Raises
+    FileNotFoundError, and ValueError for another kind of file.
     """
     path = Path(path)
     if not path.is_file():
@@ -145,7 +147,7 @@ def load_ply(path: str | Path) -> Gaussians:
     whole = _finite(scene)
     count = int(whole.sum())
     if not count:
-        raise ValueError(f"{path} holds no Gaussians, or none with finite numbers")
+        raise ValueError(f"{path} holds no Gaussians, or none whose numbers are all finite")
     if count < scene.count:
         warn_once(
             f"{path}: left out {scene.count - count} of {scene.count} Gaussians, which are not "
@@ -155,7 +157,7 @@ def load_ply(path: str | Path) -> Gaussians:
 
 
 def _finite(scene: Gaussians) -> Tensor:
-    """Return which of Gaussians (G,) have numbers whose squares are finite in float32."""
+    """Return a mask (G,), True for Gaussians whose numbers all have finite squares in float32."""
     squares = [part.float().square()[..., None].flatten(1) for _, part in named_tensors(scene)]
     return torch.cat(squares, -1).isfinite().all(-1)
 
@@ -172,7 +174,9 @@ def _of_ply(path: Path) -> Gaussians:
     counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))
     # plyfile takes the memory that a header promises.
     if not end or max(counts, default=0) > path.stat().st_size:
-        raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
+        raise ValueError(
+            f"its header does not end in {_HEADER:,} bytes, or counts more than the file holds"
+        )
     elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
     vertices = elements["vertex"]
     names = vertices.dtype.names or ()
@@ -203,10 +207,11 @@ def _of_ply(path: Path) -> Gaussians:
 
 
 def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, str]:
-    """Return the Gaussians (G, ...) of (G, ...) or (1, G, ...), float32 on the CPU, for a file.
+    """Return one scene of Gaussians (G, ...) in float32 on the CPU, and its origin, for a file.
 
-    And the origin that they are about, see `about_origin`. Warns about the parts in `lost`. Raises
-    ValueError for several scenes or for numbers whose squares are not finite. kind: of the file.
+    gaussians: (G, ...) or (1, G, ...). origin: see `about_origin`. kind: file type for messages.
+        lost: parts that the file cannot hold; they cause a warning.
+    Raises ValueError for several scenes or for numbers whose squares are not finite.
     """
     batch = gaussians.means.shape[:-2]
     if batch not in ((), (1,)):
@@ -219,14 +224,16 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, s
     scene = gaussians[0] if batch else gaussians
     scene = map_tensors(Tensor.detach, scene).to("cpu")
     if broken := int((~_finite(scene)).sum()):
-        raise ValueError(f"{broken} of {scene.count} Gaussians are not finite, or too large")
+        raise ValueError(
+            f"{broken} of {scene.count} Gaussians have numbers not finite or too large"
+        )
     return about_origin(replace(scene.to(torch.float32), means=scene.means))
 
 
 def about_origin(gaussians: Gaussians) -> tuple[Gaussians, str]:
-    """Return Gaussians (..., G) with float32 means about a local origin, and this origin, "X Y Z".
+    """Return Gaussians (..., G) with float32 means relative to a local origin, and this "X Y Z".
 
-    It is empty where float32 holds the world. Warns of another origin.
+    The origin is "" if float32 can hold the means as they are; another origin causes a warning.
     """
     scene = narrowed(gaussians)
     if scene.means.dtype == scene.scales.dtype:

@@ -1,4 +1,4 @@
-"""One scene from photos of a user: from a folder, from its URL or from Views."""
+"""A scene made of a user's photos: from a folder, from a URL, or from Views."""
 
 from collections.abc import Sequence
 from os import fspath
@@ -32,9 +32,9 @@ def read_photos(
     """Read the photos and cameras of a folder or URL as Views (1, V), in the photos' own world.
 
     size: (H, W) to which photos are cropped and resized; None uses the size of the first photo.
-    frames: numbers or file names of photos; None reads all. scene: name of the scene, for a folder
-    of several. Raises FileNotFoundError, ValueError, and TooLargeError for more photos than fit
-    into memory.
+    frames: numbers or file names of photos; None reads all photos.
+    scene: name of the scene, for a folder of several scenes.
+    Raises FileNotFoundError, ValueError, and TooLargeError for more photos than fit into memory.
     """
     found = photo_scene(fspath(folder), size, scene)
     wanted = range(len(found)) if frames is None else frame_list(frames, "frames", found)
@@ -61,9 +61,10 @@ def chosen_scene(
     """Open a scene for a model of `recipe`; return it and the frames that the model was trained on.
 
     The frames are None if `path` is not part of the model's training data.
-    name: name of the scene; None stands for the only one.
+    name: name of the scene; None stands for the only scene.
     size: (H, W) of images; None uses the recipe's size for training data, else `whole_size`.
-    holdout: hold out every HOLDOUT-th photo if `path` is no training data and has no own split.
+    holdout: hold out every HOLDOUT-th photo if `path` is no training data and has no split of its
+        own.
     Raises ValueError if neither `size` nor the recipe gives a size.
     """
     if recipe.data_config is None and size is None:
@@ -91,8 +92,8 @@ def _resized(source: SceneSource, config: SceneSourceConfig, size: Size) -> Scen
 def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
     """Return `config` with every HOLDOUT-th photo held out.
 
-    It is returned unchanged if the scene or the options already hold out photos, or if the options
-    have no `holdout`.
+    `config` is returned unchanged if it or the scene already holds out photos, or if it has no
+    option `holdout`.
     """
     # A listing's own split, or one in the options, is somebody's decision.
     split = scene.held_out or getattr(config, "holdout", None) != 0
@@ -102,9 +103,9 @@ def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
 def whole_size(scene: Scene, multiple: int | None) -> Size:
     """Return the image size (H, W) at which photos of a user are resized without cropping.
 
-    The shorter side is about that of the trained size, the aspect ratio that of the first photo,
-    and both sides are multiples of `multiple`. If `multiple` is None or images are generated, the
-    result is the trained size. scene: must be opened at the trained size.
+    Its shorter side is about that of the trained size. Its aspect ratio is about that of the first
+    photo. Both sides are multiples of `multiple`. If `multiple` is None or images are generated,
+    the trained size is returned. scene: must be opened at the trained size.
     """
     trained = scene.cameras.size
     stored = scene.stored_size(0)
@@ -154,7 +155,7 @@ def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
     """Convert photos named by the user, "0,8,x.jpg" or [0, 8, "x.jpg"], to frame numbers.
 
     File names may lack leading folders. Raises ValueError for text that is neither a number nor the
-    name of exactly one photo of `scene`. option: name of the option that the message names.
+    name of exactly one photo of `scene`. option: name of the user's option, for the message.
     """
     names = [scene.frame_name(frame) for frame in range(len(scene))]
     numbers: list[int] = []
@@ -199,15 +200,15 @@ class GivenScene(Scene):
             )
         if views.target_time is not None:
             raise ValueError(
-                "these Views have a target_time, but the result is compared at the time of photos: "
-                "remove it and name the photos by `compare`"
+                "these Views have a target_time, but results are compared at the time of photos: "
+                "remove target_time, and name photos of the wanted time by `compare`"
             )
         self.views = views = views.to("cpu")
         self.times = None if views.times is None else views.times[0].double()
 
     @property
     def cameras(self) -> Cameras:
-        """Cameras (F,) of the views, in float64."""
+        """Cameras of all frames, in float64."""
         return self.views.cameras[0].to(torch.float64)
 
     def images(self, frames: Sequence[int]) -> Tensor:

@@ -2,7 +2,7 @@
 
 with qgs.trace(model, layers=[1, 4], queries=[3, 17]) as trace:
     prediction = model(views)
-trace.layers[4].cross_attention.weights         # (B, h, Q, M)
+trace.layers[4].cross_attention.weights         # (scenes, heads, chosen queries, image tokens)
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -24,8 +24,9 @@ from qgs.types import ImageMemory, QueryState
 class LayerTrace(TensorContainer):
     """Record of one layer, for the Q chosen queries of B scenes.
 
-    before, after: states (B, Q, ...) before the layer and after its refinement. The attention
-    weights are None if the layer has no attention of this kind or does not explain it.
+    before, after: states (B, Q, ...) before the layer and after its refinement.
+    cross_attention, self_attention: attention weights; None if the layer has no such sublayer, or
+        if the sublayer's `explain` returns None.
     """
 
     before: QueryState
@@ -35,10 +36,10 @@ class LayerTrace(TensorContainer):
 
 
 class Trace:
-    """Record of the last forward pass.
+    """Record of a model's last forward pass.
 
     queries: indices (Q,) of the recorded queries. layers: records by number; 1 is the first layer.
-    grid: (V, H/P, W/P), grid of image tokens; None if tokens are no patches.
+    grid: numbers of views, rows and columns of image tokens; None if tokens are not patches.
     """
 
     def __init__(self, wanted: Sequence[int], queries: Sequence[int] | None) -> None:
@@ -69,7 +70,7 @@ class Trace:
 
     @torch.no_grad()
     def _explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:
-        """Record the attention weights of a sublayer, named `part`, when the sublayer starts."""
+        """Record the attention weights of the sublayer called `part` when the sublayer starts."""
         if self._current in self._wanted:
             weights = module.explain(*args, self.queries.to(args[0].features.device))
             setattr(self.layers[self._current], part, weights)
@@ -92,9 +93,10 @@ def trace(
 ) -> Iterator[Trace]:
     """Record states and attention weights in forward passes within the `with` block.
 
-    layers: numbers of layers; None records all. 1 is the first layer. Layers repeated in rounds of
-    feedback get the following numbers: if a decoder of 4 layers repeats two, the first round has
-    layers 5 and 6. queries: indices of queries; None records all.
+    layers: numbers of layers; None records all. 1 is the first layer. Feedback repeats layers,
+        which then get the following numbers: if a decoder of 4 layers repeats two, the first
+        repetition has layers 5 and 6.
+    queries: indices of queries; None records all.
     Recorded tensors have no gradients. Raises ValueError for layers or queries that do not exist.
     """
     numbers = _checked(layers, range(1, model.depth + 1), "layers")

@@ -21,16 +21,16 @@ class AutoRenderer(Renderer):
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Return the problems of options that gsplat lacks.
+        """Return a problem for each option that gsplat does not support.
 
-        They are refused on the CPU too, so that results do not depend on the device.
+        Such options are refused on the CPU too, so that results do not depend on the device.
         """
         return GsplatRenderer.problems(config, context)
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render, see `Renderer`; raise RuntimeError if gsplat is needed and not installed."""
+        """Render as `Renderer` says; raise RuntimeError if gsplat is needed and not installed."""
         kind = GsplatRenderer if gaussians.means.is_cuda else CpuRenderer
         # Created in each call, because options may follow a schedule.
         return kind(self.config)(gaussians, cameras, background)

@@ -37,7 +37,7 @@ class CpuRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render, see `Renderer`; raise ValueError for tensors that are not on the CPU."""
+        """Render as `Renderer` says; raise ValueError for tensors that are not on the CPU."""
         check_inputs(gaussians, cameras)
         if gaussians.means.device.type != "cpu":
             raise ValueError(
@@ -67,10 +67,11 @@ class CpuRenderer(Renderer):
 
 
 class _Splat(torch.autograd.Function):
-    """Function that sums r, g, b, depth and 1 over splats, weighted by w -> (B, V, 5, H, W).
+    """Autograd function that projects Gaussians and sums their values at each pixel, with weights.
 
-    w is the weight of a splat at a pixel. Inputs: colors (B, V, G, 3) or (B, 1, G, 3), means,
-    scales, quats, opacities, c2w, intrinsics; image size and options of the renderer.
+    Returns sums (B, V, 5, H, W) of r, g, b, depth and 1, each multiplied by the blending weight of
+    the Gaussian at the pixel. Inputs: colors (B, V, G, 3) or (B, 1, G, 3), means, scales, quats,
+    opacities, c2w, intrinsics; image size and options of the renderer.
     """
 
     @staticmethod
@@ -161,7 +162,7 @@ class _Splat(torch.autograd.Function):
 
 
 def _limits(config: RendererConfig, size: Size) -> list[tuple[Any, ...]]:
-    """Return the kernels' options for the projection and for the blending."""
+    """Return the options that the kernels of projection and of blending take, as float32."""
     projection = (config.near, config.far, config.dilation, config.alpha_min, CLAMP_MARGIN, *size)
     blending = (config.alpha_min, config.alpha_cap, config.transmittance_min)
     return [tuple(map(np.float32, options)) for options in (projection, blending)]
@@ -172,7 +173,10 @@ def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
 
 
 def _parts(splats: Any, size: Size) -> tuple[list[_Part], list[_Part]]:
-    """Return numbered ranges of Gaussians, and of tile rows (several if images are few)."""
+    """Return the units of work: numbered ranges of Gaussians, and of rows of tiles in an image.
+
+    The rows of an image are divided only if there are few images.
+    """
     batch, views, count, _ = splats.shape
     chunks = pairwise([*range(0, count, _CHUNK), count])
     rows = -(-size[0] // _TILE)

@@ -18,8 +18,8 @@ from qgs.types import Cameras, Gaussians, Rendering
 class GsplatRenderer(Renderer):
     """Renderer for float32 tensors on CUDA.
 
-    gsplat has no gradient for intrinsics, so intrinsics that require a gradient are refused. In its
-    kernels alpha_min, alpha_cap and transmittance_min are fixed to the defaults of these options.
+    gsplat has no gradient for intrinsics, so intrinsics that require a gradient are refused. Its
+    kernels fix alpha_min, alpha_cap and transmittance_min at the defaults of these options.
     """
 
     name = "gsplat"
@@ -33,15 +33,15 @@ class GsplatRenderer(Renderer):
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Return the problems of options that differ from the fixed values of gsplat's kernels."""
+        """Return a problem for each option that differs from its fixed value in the kernels."""
         return _unsupported(config)
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render, see `Renderer`.
+        """Render as `Renderer` says.
 
-        Raises ValueError for tensors that are not on CUDA, RuntimeError if gsplat is missing.
+        Raises ValueError for tensors that are not on CUDA, and RuntimeError if gsplat is missing.
         """
         check_inputs(gaussians, cameras)
         _check_supported(gaussians, cameras)

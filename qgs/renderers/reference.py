@@ -25,10 +25,10 @@ def project(
     """Project Gaussians (B, G) to cameras (B, V) of the same dtype; autocast must be off.
 
     Returns pixels (B, V, G, 2); entries xx, xy, yy (B, V, G, 3) of inverse covariances, pixel^-2;
-    depths (B, V, G), camera-frame z; and visibility (B, V, G), bool. A Gaussian is invisible beyond
-    near or far, or if its covariance overflows; its pixel, covariance and depth are then finite
-    placeholders with zero gradients. Differentiable in means, scales, quats (normalised here), c2w
-    and intrinsics.
+    depths (B, V, G), camera-frame z; and visibility (B, V, G), bool. A Gaussian is invisible if it
+    is nearer than `near` or farther than `far`, or if its covariance overflows; its pixel,
+    covariance and depth are then finite placeholders with zero gradients. Differentiable in means,
+    scales, quats (normalised here), c2w and intrinsics.
     """
     centres = to_camera(gaussians.means, cameras)  # (B, V, G, 3)
     in_range = (centres[..., 2] >= near) & (centres[..., 2] <= far)
@@ -65,7 +65,7 @@ def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor
 
 
 def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
-    """Return the inverses (..., 3) of 2D covariances, entries xx, xy, yy, and if they exist.
+    """Return the entries xx, xy, yy (..., 3) of inverse 2D covariances, and whether they exist.
 
     The covariance is F F^T + dilation * I, with F from `factors` (..., 2, 3).
     """
@@ -82,10 +82,10 @@ def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
 
 
 class TorchRenderer(Renderer):
-    """Reference renderer for tests, for any device and in float32 or float64.
+    """Reference renderer for tests, on any device, in float32 or float64.
 
-    Time and memory grow with G x H x W. Gaussians at the same depth are blended in the order in
-    which they are given.
+    Time and memory grow with G x H x W, Gaussians times pixels. Gaussians at the same depth are
+    blended in the order in which they are given.
     """
 
     name = "torch"
@@ -93,7 +93,7 @@ class TorchRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render, see `Renderer`; half-precision inputs are rendered in float32."""
+        """Render as `Renderer` says; half-precision inputs are rendered in float32."""
         check_inputs(gaussians, cameras)
         config = self.config
         with torch.autocast(gaussians.means.device.type, enabled=False):
@@ -122,9 +122,9 @@ class TorchRenderer(Renderer):
 
 
 def resolve(sums: Tensor, background: Tensor) -> Rendering:
-    """Convert sums (B, V, C, H, W) over Gaussians to a Rendering.
+    """Convert sums (B, V, C, H, W) over Gaussians to a Rendering over `background`.
 
-    The channels are r, g, b, features, z and 1, each multiplied by the weight of the Gaussian.
+    The C channels are r, g, b, features, z and 1, each multiplied by the weight of the Gaussian.
     """
     rgb, features, depth, alpha = sums.tensor_split([3, sums.shape[2] - 2, sums.shape[2] - 1], 2)
     # Depth is 0, not NaN, where nothing was hit.
