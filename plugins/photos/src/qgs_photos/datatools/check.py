@@ -35,7 +35,7 @@ class Options:
     geometry: number of scenes whose poses are checked by matching photos. headers_only: read only
     the headers of images. threads: number of threads that decode images. format: name of a format,
     PLUGIN/NAME of a data source, or auto. images: folder of photos inside each scene; None takes
-    the format's.
+    the format's default.
     """
 
     geometry: int = 20
@@ -69,7 +69,8 @@ def check(
         # raises: what is missing for a photo folder
         read_listing(path, _photo_format(options))
         raise FileNotFoundError(
-            f"{path} holds no {options.format}: leave --format out to check any format"
+            f"{path} holds no data of the format {options.format}: leave --format out to check any "
+            "format"
         )
     count = len(candidates)
     # over the whole data set: faults come in batches of scenes
@@ -100,9 +101,10 @@ def check(
 
 
 def faults_of_poses(path: UPath, scene: str | None, most_photos: int) -> list[Finding]:
-    """Return errors of one scene's cameras, judged by `most_photos` photos, in seconds.
+    """Return the errors that a quick check of the cameras of one scene finds.
 
-    scene: its name, where `path` holds several. Raises as `check`.
+    scene: name of the scene if `path` holds several; None takes the first. most_photos: largest
+    number of photos to match. Raises the errors of `check`.
     """
     options = Options(headers_only=True)
     for item in _items(path, options):
@@ -194,7 +196,7 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
 
 
 def _absent(name: str, photos: Sequence[Photo], missing: Sequence[str]) -> Iterator[Finding]:
-    """Yield findings for photos that are listed but missing, and for fewer than two photos."""
+    """Yield findings if photos are listed but missing, or if fewer than two photos exist."""
     if missing:
         names = listed(missing, 3)
         reason = (

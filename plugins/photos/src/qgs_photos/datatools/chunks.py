@@ -48,7 +48,7 @@ def _folder_scenes(
 ) -> Iterator[Candidate | Finding]:
     """Yield the scenes and faults of one folder of chunks, or of one chunk.
 
-    found: receives the chunk's file name by scene name.
+    found: mapping to which the file name of each scene's chunk is added, by the scene's name.
     """
     if folder.is_file():
         files = [folder]

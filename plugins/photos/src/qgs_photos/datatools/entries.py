@@ -26,8 +26,8 @@ _KEPT_FORMATS = {"JPEG", "MPO", "PNG"}
 class Encoding:
     """Settings for images that are encoded again.
 
-    resized: encode all images again, in the size in which the source returns them. jpeg: quality of
-    JPEG files, from 1 to 100; None writes PNG.
+    resized: encode all images again, in the size in which the source returns them; False copies
+    files unchanged where possible. jpeg: quality of JPEG files, from 1 to 100; None writes PNG.
     """
 
     resized: bool = False
@@ -88,7 +88,7 @@ def _stored(
 
 
 def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -> EncodedFrame:
-    """Undistort a frame to that of a pinhole camera, and crop the black border."""
+    """Undistort a frame as a pinhole camera would show it, and crop the black border."""
     assert frame.lens is not None
     lens = frame.lens
     zoom = lens.whole_zoom(frame.intrinsics, frame.size, frame.size)
@@ -128,8 +128,8 @@ def chunk_entry(
 ) -> ChunkEntry:
     """Return the entry of a scene in a chunk; `qgs_photos.datasets.chunk_files` explains its keys.
 
-    key: name of the scene. held_out: indices of frames that are left out of training. times: of the
-    frames, (V,); None for a scene that does not move.
+    key: name of the scene. held_out: indices of frames that are left out of training. times: time
+    of each of the V frames, (V,); None for a scene that does not move.
     """
     names = [frame.name for frame in frames]
     entry = {

@@ -62,7 +62,7 @@ def pose_findings(scene: DecodedScene) -> Iterator[Finding]:
 def sharing_findings(scene: DecodedScene, usable: Sequence[int]) -> Iterator[Finding]:
     """Yield findings for frames with the pose or the position of another frame.
 
-    usable: frames that are compared, those without other faults.
+    usable: indices of the frames to compare, which have no other faults.
     """
     if len(usable) < 2:
         return

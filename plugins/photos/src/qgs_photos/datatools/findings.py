@@ -18,10 +18,10 @@ _FEW = 3
 class Finding:
     """A fault of a scene or a file, and its remedy.
 
-    scene: name of the scene or of the file. frames, names: indices and file names of the photos
-    with this fault, in the data set's list; empty if the whole scene is meant. severity: an error
-    makes results wrong, a warning may. numbers: numbers of the photos as messages show them, see
-    `DecodedScene.numbers`.
+    scene: name of the scene or of the file. frames, names: indices in the data set's list, and file
+    names, of the photos with this fault; empty if the whole scene has it. severity: an error makes
+    results wrong, a warning may make them wrong. numbers: frame numbers of the photos as messages
+    show them, see `DecodedScene.numbers`.
     """
 
     scene: str
@@ -34,7 +34,7 @@ class Finding:
 
     @property
     def place(self) -> str:
-        """The photos as text, such as "frames 0-3 (a.jpg to d.jpg)"; empty for the whole scene."""
+        """Text that names the photos, such as "frames 0-3 (a.jpg to d.jpg)"; "" for a scene."""
         names = [name for name in self.names if name]
         numbers = [number for number in self.numbers if number is not None]
         if not numbers:
@@ -96,7 +96,7 @@ def _joined(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> list[
 class SceneReport:
     """Findings and measurements of one scene.
 
-    kind: format. split: train, test, or empty for a format without splits. listed, decodable,
+    kind: its format. split: train, test, or empty for a format without splits. listed, decodable,
     missing: numbers of photos. numbered: number of photos that readers return as frames.
     pose_problems: number of frames with a wrong pose. epipolar: median distance of matches from
     epipolar lines in pixels, as text; "-" or a reason if it was not measured. depth: median
@@ -119,9 +119,10 @@ class SceneReport:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Result of a check.
+    """Result of checking a data set.
 
-    general: findings about files of the data set, not about a scene. notes: further sentences.
+    general: findings about files of the data set, not about a scene. notes: further sentences for
+    the user.
     """
 
     scenes: Sequence[SceneReport]
@@ -130,6 +131,6 @@ class CheckReport:
 
     @property
     def findings(self) -> list[Finding]:
-        """All findings: errors, then warnings; in both first those about files, then by scene."""
+        """All findings: first errors, then warnings; files come before scenes in both groups."""
         found = [*self.general, *(f for scene in self.scenes for f in scene.findings)]
         return sorted(found, key=lambda finding: finding.severity != "error")

@@ -19,8 +19,8 @@ from qgs_photos.datatools.photos import Candidate, Photo
 def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
     """Yield the scenes in `root`: `root` itself, its subfolders, or those in train/ and test/.
 
-    wanted: format, or auto. images: folder of photos inside each scene; None takes the format's. A
-    subfolder beside scenes that lists no cameras yields a warning.
+    wanted: name of a format, or auto. images: folder of photos inside each scene; None takes the
+    format's default. A subfolder that lists no cameras, beside others that do, yields a warning.
     """
     if formats_of(root):
         yield from _listed(root, folder_name(root), wanted, images)
@@ -41,9 +41,9 @@ def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Cand
 
 
 def _listed(folder: UPath, name: str, wanted: str, images: str | None) -> Iterator[Candidate]:
-    """Yield the scene of a folder in the format `wanted`; auto takes the first that it holds.
+    """Yield the scene of a folder in the format `wanted`, or nothing if it has another format.
 
-    Yields nothing if the folder does not hold this format.
+    With "auto", the first format that the folder has is read.
     """
     held = formats_of(folder)
     kind = held[0] if wanted == "auto" else wanted

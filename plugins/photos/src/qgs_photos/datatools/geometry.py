@@ -1,4 +1,4 @@
-"""Check cameras against photos by features that are matched in pairs of neighbouring photos."""
+"""Check the cameras of photos by matching features in pairs of neighbouring photos."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -52,8 +52,8 @@ that the poses predict, as a share of the photo's diagonal."""
 class Geometry:
     """Measurement of how well the poses of a scene fit its photos.
 
-    unjudged: why nothing could be measured; empty if there are `pairs`. diagonal: length of a
-    photo's diagonal in pixels of the file.
+    unjudged: why nothing could be measured; empty if there are `pairs`. pairs: distances of matches
+    from epipolar lines, see `Pairs`. diagonal: length of a photo's diagonal in pixels of the file.
     """
 
     unjudged: str = ""
@@ -62,17 +62,20 @@ class Geometry:
 
     @property
     def fraction(self) -> float:
-        """Median of the pairs' distances, as a share of the diagonal; 0 without pairs."""
+        """Median distance of matches from epipolar lines over all pairs; 0 without pairs.
+
+        Unit: the photo's diagonal.
+        """
         return float(np.median([distance for _, distance in self.pairs])) if self.pairs else 0.0
 
     @property
     def pixels(self) -> float:
-        """Median distance of matches over all pairs, in pixels of the stored photos."""
+        """Median distance of matches from epipolar lines, in pixels of the stored photos."""
         return self.fraction * self.diagonal
 
 
 def detect(picture: np.ndarray) -> Features:
-    """Find SIFT features of a photo (H, W, 3), uint8; none if it shows no structure."""
+    """Find SIFT features of a photo (H, W, 3), uint8; empty arrays if it shows no structure."""
     # kornia's SIFT finds as much, and takes one and a half times as long or more
     sift: Any = SIFT()
     try:
@@ -85,9 +88,10 @@ def detect(picture: np.ndarray) -> Features:
 
 
 def match(first: Features, second: Features) -> np.ndarray | None:
-    """Match two photos without using their poses; return points (2, P, 2) in pixels.
+    """Match the features of two photos; return P pairs of points, (2, P, 2) in pixels.
 
-    RANSAC keeps matches that fit one fundamental matrix. None for fewer than MIN_MATCHES.
+    Poses are not used. RANSAC keeps matches that fit one fundamental matrix. Returns None if fewer
+    than MIN_MATCHES remain.
     """
     one, two = (torch.from_numpy(descriptors).float() for _, descriptors in (first, second))
     _, found = match_smnn(one, two, _RATIO)
@@ -132,7 +136,8 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
     """Measure how well the poses of a scene fit its photos.
 
     Each frame is matched with the next and with one that is farther away. usable: frames that may
-    be matched. most: largest number of frames to match; of more, some runs of neighbours are taken.
+    be matched. most: largest number of frames to match; if more are usable, only some runs of
+    neighbours are matched.
     """
     if len(usable) < 2:
         return Geometry("fewer than 2 usable frames")
@@ -159,9 +164,9 @@ def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
 
 
 class _Matcher:
-    """Match pairs of a scene's frames.
+    """Matcher of pairs of a scene's frames.
 
-    Methods take indices into `frames`. Features of a photo are detected once.
+    Methods take indices into `frames`. Features of each photo are detected once.
     """
 
     def __init__(self, scene: DecodedScene, frames: Sequence[int]) -> None:
@@ -191,9 +196,9 @@ class _Matcher:
         ]
 
     def distance(self, first: int, second: int) -> float | None:
-        """Return the median distance of two photos' matches as a share of the diagonal.
+        """Return the median distance of two photos' matches from their epipolar lines.
 
-        None if the photos have too few matches.
+        Unit: the photo's diagonal. None if the photos have too few matches.
         """
         one, lens_of_one, diagonal = self._features(first)
         two, lens_of_two, _ = self._features(second)
@@ -215,7 +220,7 @@ class _Matcher:
         return self._known[place]
 
     def partners(self, start: int) -> Iterator[int]:
-        """Yield frames that may see the same: first near in the list, then near in space."""
+        """Yield frames that may show what `start` shows: near in the list, then near in space."""
         along = [place for gap in _GAPS for place in (start + gap, start - gap)]
         along = [place for place in along if 0 <= place < len(self.frames)]
         forward = [place for place in along if place > start] or along
@@ -263,10 +268,10 @@ def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Findi
 
 
 def frames_above(values: Pairs, limit: float) -> dict[int, float]:
-    """Return the frames whose pairs all have values above `limit`, with the least of these values.
+    """Return the frames whose pairs all have values above `limit`, each with its least value.
 
     Frames in fewer than two pairs are left out. The worst frame is found first and its pairs are
-    removed, so that they do not count against the frames paired with it.
+    removed, so that they do not count against the frames paired with the worst one.
     """
     found = dict[int, float]()
     while True:

@@ -27,7 +27,7 @@ def _is_index(file: UPath) -> bool:
 def index_findings(file: UPath, held: Mapping[str, Sequence[SceneReport]]) -> Iterator[Finding]:
     """Yield findings for scenes and frames of an index that the data set does not hold.
 
-    file: the index. held: reports on the scenes of the data set by name; a name may have several.
+    file: the index. held: reports on the scenes of the data set by name; scenes may share a name.
     """
     try:
         index = read_index(str(file)) or {}

@@ -34,9 +34,9 @@ def chosen_splits(
 ) -> Splits:
     """Divide the scenes of `source` into train and test.
 
-    test: names of the test scenes. every: make every Nth of all scenes a test scene, beginning with
-    index N - 1. Without both, the splits of the source are kept, and a scene in both is packed only
-    for training. Raises ValueError if no scene has a name in `test`.
+    test: names of the test scenes. every: N, to make every Nth of all scenes a test scene,
+    beginning with index N - 1. If both are None, the splits of the source are kept, and a scene in
+    both splits is packed only for training. Raises ValueError if a name in `test` is not a scene.
     """
     train = _places(source, "train")
     # train comes first for the order, and last because it wins for a scene in both splits
@@ -84,7 +84,7 @@ def _begin(folder: UPath, settings: Mapping[str, Any]) -> None:
         if before != settings:
             raise ValueError(
                 f"{folder} holds an unfinished packing with other settings ({before}): repeat "
-                "these settings to finish it, or give a new folder"
+                "these settings to finish that packing, or give a new folder"
             )
         return
     inside = folder.iterdir() if folder.is_dir() else ()
@@ -102,7 +102,7 @@ def _is_unfinished(path: UPath) -> bool:
 
 
 def _packed_before(folder: UPath) -> dict[str, str]:
-    """Return the chunk file of each scene that is packed in a folder; delete unfinished files."""
+    """Return the chunk file of each scene packed in a folder, by name; delete unfinished files."""
     files: dict[str, str] = {}
     for item in sorted(folder.iterdir(), key=str) if folder.is_dir() else ():
         if _is_unfinished(item):
@@ -114,7 +114,7 @@ def _packed_before(folder: UPath) -> dict[str, str]:
 
 @dataclass
 class Packed:
-    """Result of a packing.
+    """Result of `pack`.
 
     scenes: number of scenes by split. resumed: how many of these scenes an earlier, interrupted run
     had packed. frames: images written in this run. kept: how many of these images were copied
@@ -144,10 +144,11 @@ def pack(
     A chunk has at most `chunk_bytes` bytes, or holds one larger scene. index.json is written last.
     An interrupted packing continues after its last complete chunk if its settings are the same.
 
-    settings: all that decides which scenes the source has. leave_out_broken: leave out scenes that
-    cannot be read and name them in the result; False raises their error. progress: called with the
-    name of each finished scene. Raises FileExistsError for a folder with other content, ValueError
-    for an unfinished packing with other settings, and ValueError and OSError from reading scenes.
+    settings: options that decide which scenes the source has. leave_out_broken: leave out scenes
+    that cannot be read and name them in the result; False raises their error. progress: called with
+    the name of each finished scene. Raises FileExistsError for a folder with other content,
+    ValueError for an unfinished packing with other settings, and ValueError and OSError from
+    reading scenes.
     """
     encoding = encoding or Encoding()
     # chunks of two settings in one folder would be a data set that nobody asked for
@@ -178,7 +179,10 @@ def pack(
             files |= {entry["key"]: file for entry in chunk}
     if not any(written.values()):
         reasons = listed((f"{n}: {why}" for n, why in packed.left_out.items()), 3, "; ")
-        raise ValueError(f"there is no scene to pack{': ' if reasons else ''}{reasons}")
+        raise ValueError(
+            "there is no scene to pack, give a data set with readable scenes"
+            f"{': ' if reasons else ''}{reasons}"
+        )
     for split, files in written.items():
         packed.scenes[split] = len(files)
         if files:
@@ -213,8 +217,8 @@ def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEnt
 def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
     """Open a temporary file that replaces `path` if the block ends without an error.
 
-    Makes missing parent folders. On a local disk the replacement is atomic; an object store shows
-    an object only when it is complete.
+    Missing parent folders are made. On a local disk the replacement is atomic; an object store
+    shows an object only when it is complete.
     """
     if is_local(path):
         with replacing(Path(str(path))) as temporary, temporary.open("wb") as file:

@@ -27,9 +27,9 @@ _BLACK = 4
 class Photo:
     """A photo to check.
 
-    listed: its entry in the data set: name, camera, size. read: returns the bytes of its file.
-    maps: functions that return its mask and its depth map, (H, W), by name; they return None if
-    there is no such map. exists: whether the file exists.
+    listed: entry of the photo in the data set: name, camera, size. read: returns the bytes of the
+    photo's file. maps: functions by name that return the mask and the depth map of the photo,
+    (H, W), or None if it has no such map. exists: whether the photo's file exists.
     """
 
     listed: PhotoFrame
@@ -40,8 +40,8 @@ class Photo:
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the undistorted photo, (H, W, 3) uint8, and its intrinsics fx, fy, cx, cy.
 
-        size: (H, W) of the file, used if the data set lists none. side: pixels to which a longer
-        side is reduced. Raises OSError if the file cannot be read.
+        size: (H, W) of the file, used if the data set lists no size. side: largest length of the
+        result's longer side in pixels. Raises OSError if the file cannot be read.
         """
         frame = self.listed if self.listed.size else replace(self.listed, size=size)
         image = turned(decode_rgb(io.BytesIO(self.read())), frame)
@@ -58,8 +58,9 @@ class Photo:
 class Candidate:
     """A scene to check, whose photos are listed only when its turn comes.
 
-    kind: format. photos: returns the photos. missing: returns the names of listed images that do
-    not exist and that `photos` leaves out. Both raise ValueError or OSError for unreadable scenes.
+    kind: format of the scene. photos: function that returns the photos. missing: function that
+    returns the names of listed images that do not exist and that `photos` leaves out. Both
+    functions raise ValueError or OSError for an unreadable scene.
     """
 
     name: str
@@ -131,7 +132,7 @@ def _is_read(photo: Photo) -> bool:
 def decode(photo: Photo, headers_only: bool) -> Decoded:
     """Decode a photo, its mask and its depth map, and report what fails.
 
-    headers_only: read only the header of the photo, and no maps.
+    headers_only: read only the header of the photo, and neither its mask nor its depth map.
     """
     if not photo.listed.name:
         return Decoded()
@@ -177,5 +178,5 @@ def _is_black(image: Image.Image) -> bool:
 
 
 def error_text(error: Exception) -> str:
-    """Return the message of an exception; unless it is an error of reading files, with its type."""
+    """Return an exception's message, after its type unless it is an error of reading files."""
     return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)

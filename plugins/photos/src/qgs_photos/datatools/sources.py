@@ -23,9 +23,10 @@ _SIZE = (256, 256)
 
 @cache
 def _imported(format: str) -> tuple[Registry, list[str]]:
-    """Import the plugins in OF_FILES and the one that `format` names; all plugins for "auto".
+    """Import plugins; return their components, and a note on each that cannot be imported.
 
-    Returns their components, and a note on each plugin that cannot be imported.
+    format: "auto" imports all plugins; another format imports those in OF_FILES, and PLUGIN if it
+    has the form PLUGIN/NAME.
     """
     if format == "auto":
         return load_usable_plugins()
@@ -36,8 +37,8 @@ def _imported(format: str) -> tuple[Registry, list[str]]:
 def sources(format: str = "auto") -> dict[str, type[Component]]:
     """Return the data sources that have an option `path`, by PLUGIN/NAME.
 
-    format: "auto" for those of all plugins; PLUGIN/NAME for those of OF_FILES and of PLUGIN.
-    Raises PluginError if that plugin cannot be imported.
+    format: "auto" for the sources of all plugins; PLUGIN/NAME for those of OF_FILES and of PLUGIN.
+    Raises PluginError if PLUGIN cannot be imported.
     """
     found = _imported(format)[0].components("data")
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}

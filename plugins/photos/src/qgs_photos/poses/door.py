@@ -22,9 +22,9 @@ class ColmapOrPhotos(Colmap):
 
     @classmethod
     def posed(cls, path: UPath) -> UPath | None:
-        """Return the folder NAME_poses beside `path` with its poses, computed if they are missing.
+        """Return the folder NAME_poses beside `path` with the poses of its photos or its video.
 
-        None if `path` is neither a video nor a folder with photos.
+        Missing poses are computed. None if `path` is neither a video nor a folder with photos.
         """
         # anything else is left to the readers of listings, whose errors say what it lacks
         is_video = path.suffix.lower() in VIDEOS and path.is_file()
@@ -36,8 +36,9 @@ class ColmapOrPhotos(Colmap):
 def posed_folder(source: Path) -> Path:
     """Return the folder NAME_poses with the camera poses of `source`, photos or a video.
 
-    The folder lies beside `source`. Missing poses are computed. Raises PosesError if the folder has
-    poses of other photos, OSError if it cannot be written, and what `make_poses` raises.
+    The folder lies beside `source`. Missing poses are computed. Raises PosesError if the folder
+    holds poses of other photos, OSError if the folder cannot be written, and the errors of
+    `make_poses`.
     """
     out = beside(source)
     lock = out.with_name(f".{out.name}.lock")
@@ -63,9 +64,9 @@ def posed_folder(source: Path) -> Path:
 
 
 def is_made(source: Path, out: Path) -> bool:
-    """Return whether `out` has the poses of `source`; False if it has no poses.
+    """Return whether the folder `out` has the poses of `source`; False if it has no poses.
 
-    Raises PosesError if it has poses of other photos.
+    Raises PosesError if `out` has poses of other photos.
     """
     held = fingerprint(source)
     with suppress(OSError, json.JSONDecodeError):

@@ -47,7 +47,7 @@ class FilmScene(NamedTuple):
 
 
 def film(scene: FilmScene, path: Cameras, file: Path, rate: int, console: Console) -> None:
-    """Render a scene from the cameras (1, T) of a path, and write a video.
+    """Render a scene from the cameras (1, T) of the path's T frames, and write a video.
 
     rate: frames per second.
     """
@@ -107,11 +107,12 @@ def _write_webp(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
 def cameras_of(
     scene: FilmScene, path: str, size: tuple[int, int] | None, frames: int, fov: float | None
 ) -> Cameras:
-    """Return the cameras (1, T) of a path.
+    """Return the cameras (1, T) of a camera path of T frames.
 
-    path: one of KINDS, or a file. size: (H, W) of the video in pixels; None takes that of the
-    photos. frames: length of a path of KINDS. fov: vertical angle of view in degrees; None takes
-    that of the photos or the file. Raises ValueError for a file that is not a camera path.
+    path: one of KINDS, or the name of a file. size: (H, W) of the video in pixels; None takes that
+    of the photos. frames: number of frames of a path in KINDS. fov: vertical angle of view in
+    degrees; None takes that of the photos or the file. Raises ValueError for a file that is not a
+    camera path.
     """
     size = size or _film_size(scene.cameras.size)
     if path in KINDS:
@@ -122,7 +123,7 @@ def cameras_of(
 
 
 def _film_size(photos: tuple[int, int]) -> tuple[int, int]:
-    """Return (H, W) of a video for photos of (H, W): even, as H.264 needs, and at least _HEIGHT."""
+    """Return (H, W) of a video of `photos` (H, W): even, as H.264 needs, and at least _HEIGHT."""
     factor = max(_HEIGHT / min(photos), 1.0)
     height, width = (round(side * factor / 2) * 2 for side in photos)
     return height, width
@@ -152,7 +153,7 @@ def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
 def seen_depth(scene: FilmScene) -> float:
     """Return the median rendered depth in the first, the middle and the last camera.
 
-    1 if they show nothing.
+    The result is 1 if these cameras show no Gaussians.
     """
     # three views say enough, and each is rendered whole
     count = scene.cameras.shape[1]
@@ -162,11 +163,11 @@ def seen_depth(scene: FilmScene) -> float:
 
 
 def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmScene:
-    """Open a folder of `qgs reconstruct` or `qgs scene`, or a PLY file.
+    """Open Gaussians and cameras: a folder of `qgs reconstruct` or `qgs scene`, or a PLY file.
 
-    photos: the scene's photos, for their cameras; a folder of `qgs reconstruct` does not need them.
-    name: scene among several in `photos`. Raises ValueError if photos are needed and missing,
-    FileNotFoundError for another `source`.
+    photos: photos of the scene, for their cameras; a folder of `qgs reconstruct` does not need
+    them. name: name of the scene if `photos` holds several. Raises ValueError if photos are needed
+    and missing, FileNotFoundError if `source` is none of these.
     """
     if has_record(source):
         record = read_record(source)
@@ -189,7 +190,7 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
 
 
 def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
-    """Return the median depth of Gaussians before the camera `c2w` (4, 4); 1 if none is there."""
+    """Return the median depth of Gaussians in front of the camera `c2w` (4, 4); 1 if none is."""
     w2c = torch.linalg.inv(c2w)
     depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
     ahead = depths[depths > 0]

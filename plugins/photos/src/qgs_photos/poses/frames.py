@@ -38,9 +38,10 @@ def extract(
     count: int | None = None,
     progress: Show = lambda stage, done, total: None,
 ) -> list[str]:
-    """Write the sharpest frame of each interval of a video into `folder`; return remarks.
+    """Write the sharpest frame of each interval of a video into `folder`.
 
-    Files are upright JPEGs, numbered from 0. Frames that cannot be decoded are left out.
+    Files are upright JPEGs, numbered from 0. Frames that cannot be decoded are left out. Returns
+    remarks for the user, about a damaged video.
 
     count: number of intervals, all of the same duration. None makes intervals that are shorter in
     fast motion, and keeps at most MOST frames (see `thinned`). progress: called with the stage, the
@@ -95,9 +96,9 @@ def extract(
 
 
 def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
-    """Return at most `most` frames, evenly spread: the best of each group of neighbours.
+    """Return at most `most` frames, evenly spread: the sharpest of each group of neighbours.
 
-    scores: sharpness by file of the frame; more is better.
+    scores: sharpness of each frame, by the frame's file.
     """
     best = dict[int, Path]()
     for number, path in enumerate(sorted(scores)):
@@ -108,12 +109,12 @@ def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
 
 
 class Intervals:
-    """Division of a video into intervals, of each of which one frame is taken.
+    """Division of a video into intervals; one frame is taken from each.
 
-    An interval ends after 1 / `rate` seconds, or before, when the picture has moved by STEP.
+    An interval ends after 1 / `rate` seconds, or earlier, when the picture has moved by STEP.
 
-    start, length: first time and duration of the video in seconds. count: number of intervals of
-    the same duration, whatever the motion; None ends intervals by motion too.
+    start, length: first time and duration of the video in seconds. count: number of intervals, all
+    of the same duration whatever the motion; None lets motion end intervals earlier.
     """
 
     def __init__(self, start: float, length: float, count: int | None) -> None:
@@ -169,14 +170,14 @@ def _opened(video: Path) -> Any:
         ) from error
     if not container.streams.video:
         container.close()
-        raise PosesError(f"{video} has no video stream: give a video")
+        raise PosesError(f"{video} has no video stream: give a file that holds a video")
     return container
 
 
 def _times(video: Path) -> tuple[list[Fraction], float, bool]:
-    """Return the times of all frames in seconds, ascending, a pixel's aspect, and if it is damaged.
+    """Return a video's ascending frame times in seconds, its pixel aspect, and if it is damaged.
 
-    The aspect is the width of a pixel over its height. Packets are read, but not decoded.
+    The pixel aspect is the width of a pixel over its height. Packets are read, but not decoded.
     """
     times = list[Fraction]()
     broken = False
@@ -194,7 +195,7 @@ def _times(video: Path) -> tuple[list[Fraction], float, bool]:
 
 
 def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
-    """Yield the time in seconds and the frame; (0, None) for a packet that cannot be decoded."""
+    """Yield each frame of a video with its time in seconds; (0, None) for an undecodable packet."""
     with _opened(video) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"

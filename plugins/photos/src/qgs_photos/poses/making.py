@@ -46,10 +46,11 @@ neighbours in time are matched."""
 class Options:
     """Options of `qgs poses`.
 
-    frames: number of frames taken from a video; None chooses it. side: longer side in pixels of the
-    photos for COLMAP. matching: "exhaustive" matches all pairs, "sequential" neighbours; "auto"
-    chooses. features: largest number of features in a photo. threads: number of CPU threads; with 1
-    the same seed gives the same poses.
+    frames: number of frames taken from a video; None lets the camera's motion decide. side: longer
+    side in pixels of the photos for COLMAP. matching: "exhaustive" matches all pairs, "sequential"
+    neighbours; "auto" takes "sequential" for a video and for more than EXHAUSTIVE photos. features:
+    largest number of features in a photo. threads: number of CPU threads; with 1, equal seeds give
+    equal poses.
     """
 
     frames: int | None = None
@@ -91,9 +92,9 @@ class Poses:
 
 
 def fingerprint(source: Path) -> dict[str, Any]:
-    """Return the size in bytes and the time (ns) of the video or of every photo, by file name.
+    """Return the size (bytes) and time of change (ns) of a video or of each photo, by file name.
 
-    Poses belong to a source as long as its fingerprint stays the same.
+    Poses belong to `source` as long as its fingerprint stays the same.
     """
     files = [source] if source.is_file() else photo_files(source)
     stats = [file.stat() for file in files]
@@ -105,7 +106,8 @@ def make_poses(source: Path, out: Path, options: Options, console: Console) -> P
     """Compute the poses of `source`, photos or a video, and write them to the new folder `out`.
 
     `out` gets sparse/0 (a COLMAP model), images/ and poses.json; any reader of COLMAP opens it.
-    Raises PosesError if no poses are found, FileExistsError if `out` is not empty, and OSError.
+    Raises PosesError if no poses are found, FileExistsError if `out` is not empty, and OSError if
+    files cannot be read or written.
     """
     # too few photos raise before anything is written
     record = {"made_by": "qgs poses", "source": fingerprint(source), "options": asdict(options)}
@@ -127,7 +129,7 @@ def make_poses(source: Path, out: Path, options: Options, console: Console) -> P
 def _bars(console: Console) -> Iterator[Show]:
     """Yield a function that shows progress, with one bar for each stage.
 
-    Without a terminal it prints only the names of stages.
+    Without a terminal, this function prints only the names of stages.
     """
     tasks = dict[str, TaskID]()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()

@@ -94,7 +94,7 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
 
 
 def _keyframe(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """Return camera-to-world (4, 4), OpenCV axes, and fy in pixels of a keyframe of nerfstudio."""
+    """Return the OpenCV camera-to-world pose (4, 4) and fy in pixels of nerfstudio's keyframe."""
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
     return pose * _OPENGL, _focal(float(entry.get("fov") or 50.0), size[0])
 
@@ -102,7 +102,9 @@ def _keyframe(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[np.ndarr
 def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]:
     """Return the pose (4, 4) of a photo of a transforms file, and its fy in pixels of `size`."""
     if frame.problems or frame.size is None:
-        raise ValueError(f"{frame.name}: {next(iter(frame.problems), 'add its h and w')}")
+        raise ValueError(
+            f"{frame.name}: {next(iter(frame.problems), 'it has no size, add its h and w')}"
+        )
     return frame.c2w, frame.intrinsics[1] * size[0] / frame.size[0]
 
 

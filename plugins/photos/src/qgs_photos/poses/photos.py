@@ -51,11 +51,10 @@ class Photo:
 
 
 def photo_files(folder: Path) -> list[Path]:
-    """Return the photos in `folder`, else in its images/, else in all of its subfolders.
+    """Return the photos in `folder`; if it has none, those in images/, or in all subfolders.
 
-    They are sorted so that 2 precedes 10.
-
-    Raises PosesError for fewer than LEAST photos.
+    Photos are sorted by the numbers in their names, so that 2 precedes 10. Raises PosesError for
+    fewer than LEAST photos.
     """
     found = next((f for f in (folder, folder / "images") if image_files(UPath(f))), folder)
     inside = sorted(item for item in found.iterdir() if item.is_dir() and item.name[0] != ".")
@@ -71,7 +70,7 @@ def photo_files(folder: Path) -> list[Path]:
 
 
 def names_of(files: Sequence[Path]) -> list[str]:
-    """Return the names of files, with their folders where these differ."""
+    """Return the names of `files`, relative to the deepest folder that holds all of them."""
     top = os.path.commonpath([file.parent for file in files])
     return [file.relative_to(top).as_posix() for file in files]
 
@@ -99,8 +98,8 @@ def prepare(
     A file that needs no change is linked, or copied to another file system. If the order of `files`
     is not the alphabetical order of names, which COLMAP uses, names get a number in front.
 
-    Returns the prepared photos in the order of `files`, and for each photo that cannot be read its
-    name and the reason. progress: called with the stage, the number of photos done, and of all.
+    Returns the prepared photos in the order of `files`, and by name the reason why a photo cannot
+    be read. progress: called with the stage, the number of photos done, and the number of all.
     """
     ready = list[Photo]()
     faulty = dict[str, str]()
@@ -124,7 +123,9 @@ def prepare(
 def _prepared(file: Path, name: str, kept: Path, working: Path, side: int) -> Photo:
     with file.open("rb") as opened, opened_image(opened) as image:
         if min(image.size) < SMALLEST:
-            raise ValueError(f"{image.width} x {image.height} pixels are too few")
+            raise ValueError(
+                f"{image.width} x {image.height} pixels are too few: take larger photos"
+            )
         image.load()
         turned = orientation(image) != 1
         stays = image.format in _PLAIN

@@ -161,8 +161,8 @@ def _centred(model: Any, threads: int) -> Any:
     """Refine the principal points of `model` if many photos share a camera and the error decreases.
 
     COLMAP keeps principal points in the middle of the image, so poses of cropped photos are turned.
-    With long lenses a principal point cannot be measured: on `mary_rose` (19 degrees) refinement
-    would leave the error unchanged and turn the cameras by half a degree.
+    With long lenses a principal point cannot be measured: for photos with an angle of view of 19
+    degrees, refinement would leave the error unchanged and turn the cameras by half a degree.
     """
     counts = dict.fromkeys(model.cameras, 0)
     for image in model.images.values():
