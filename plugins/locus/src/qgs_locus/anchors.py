@@ -41,12 +41,12 @@ class NormalCenters(ComponentConfig):
     """Standard deviation of each coordinate, world units."""
 
     def sample(self, count: int) -> Tensor:
-        """Draw `count` centres (count, 3), world frame."""
+        """Return `count` random anchor centres (count, 3), world frame."""
         return torch.randn(count, 3) * self.std + torch.tensor(self.mean)
 
 
 class FrustumCenters(ComponentConfig):
-    """Initial anchor centres in the first camera's frustum, uniform in log depth and image."""
+    """Random anchor centres in the first camera's frustum, uniform over its image and log depth."""
 
     kind: Literal["frustum"]
     """Draw the initial anchor centres in the frustum of the first camera. They are uniformly
@@ -69,7 +69,7 @@ class FrustumCenters(ComponentConfig):
         return depth
 
     def sample(self, count: int) -> Tensor:
-        """Draw `count` centres (count, 3), world frame."""
+        """Return `count` random anchor centres (count, 3), world frame."""
         near, far = self.depth
         # Equal steps of parallax, not of depth.
         z = near * (far / near) ** torch.rand(count, 1)
@@ -77,7 +77,10 @@ class FrustumCenters(ComponentConfig):
 
 
 class AnchoredQueries(LearnedQueries):
-    """N learned queries for all scenes: features, anchor centres mu and raw radii rho."""
+    """N learned queries: features, anchor centres mu and raw radii rho.
+
+    Every scene starts with the same N queries.
+    """
 
     name = "anchored"
 
@@ -89,7 +92,8 @@ class AnchoredQueries(LearnedQueries):
         radius: bool = True
         """Give anchors a support radius. With false, they have a centre only."""
         init_radius: float = Field(default=1.0, gt=0)
-        """Initial radius of each anchor, world units, before `radius_min` changes it."""
+        """Initial radius of each anchor, world units. Then `radius_min` bounds it, or is added to
+        it, as `radius_bound` says."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
@@ -109,7 +113,6 @@ class AnchoredQueries(LearnedQueries):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the field of anchor centres, and the field of raw radii if `radius` is true."""
         return {**CENTER_FIELD, **(radius_field(config) if config.radius else {})}
 
     @classmethod

@@ -57,7 +57,8 @@ class RayBiasedCrossAttention(CrossAttention):
         bias_min: float = Field(default=-20.0, lt=0)
         """Lower bound of the bias b, before it is multiplied by gamma."""
         direction_eps: float = Field(default=1e-6, gt=0)
-        """Least length by which the mean ray direction of a patch is divided to normalise it."""
+        """Least number by which the mean ray direction of a patch is divided to normalise it, even
+        if the direction is shorter."""
         gamma_init: float = -2.25
         """Initial value of the learned g of each layer. The bias is multiplied by
         gamma = softplus(g)."""
@@ -74,12 +75,11 @@ class RayBiasedCrossAttention(CrossAttention):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields in `reads`, and those in `bandwidth_fields`."""
         return {**cls.reads, **cls.bandwidth_fields(config)}
 
     @classmethod
     def bandwidth_fields(cls, config: Config) -> Fields:
-        """Return the fields that the bandwidth depends on, or no field if it is fixed."""
+        """Return the state fields that the bandwidth depends on; no field if it is fixed."""
         return radius_field(config) if config.bandwidth == "radius" else {}
 
     @classmethod
@@ -103,7 +103,7 @@ class RayBiasedCrossAttention(CrossAttention):
         return (self.config.sigma0 * r_BN1).square().clamp_min(self.config.sigma_sq_min)
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
-        """Return the bias gamma b from the anchors in `state` and the patch rays in `memory`."""
+        """Return the bias of attention logits, from anchors in `state` and rays in `memory`."""
         config = self.config
         eps = config.direction_eps
         # The rays of a scene are the same in all layers.

@@ -42,7 +42,7 @@ class OffsetOptions(ComponentConfig):
 class AnchorOffsetCenters(Centers):
     """Gaussian means at mu + posact(offset), with mu the anchor's centre.
 
-    posact(t) is sign(t) (exp|t| - 1).
+    `offset` is an output of the head. posact(t) is sign(t) (exp|t| - 1).
     """
 
     name = "anchor_offset"
@@ -67,7 +67,8 @@ class AnchorOffsetCenters(Centers):
 class RadiusScaledCenters(AnchorOffsetCenters):
     """Gaussian means at mu + r posact(offset), with centre mu and radius r of the anchor.
 
-    posact(t) is sign(t) (exp|t| - 1). This is equation (7) of the plugin's README.
+    `offset` is an output of the head. posact(t) is sign(t) (exp|t| - 1). This is equation (7) of
+    the plugin's README.
     """
 
     name = "radius_scaled"
@@ -79,7 +80,6 @@ class RadiusScaledCenters(AnchorOffsetCenters):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields of anchor centres and raw radii."""
         return {**CENTER_FIELD, **radius_field(config)}
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:

@@ -26,16 +26,19 @@ class RadiusOptions(ComponentConfig):
     """Options of the map from the raw radius rho to the support radius r of an anchor."""
 
     radius_bound: Literal["floor", "offset"] = "floor"
-    """Support radius r = max(softplus(rho), radius_min) ("floor", LocusGS release) or
-    r = softplus(rho) + radius_min ("offset", paper). All components must have the same value."""
+    """Support radius r = max(softplus(rho), radius_min) ("floor", LocusGS release) or r =
+    softplus(rho) + radius_min ("offset", paper). All components with this option must have the same
+    value."""
     radius_min: float = Field(default=1e-3, ge=0)
-    """Least support radius, world units. All components must have the same value."""
+    """Least support radius, world units. All components with this option must have the same
+    value."""
 
 
 def radius_field(options: RadiusOptions) -> Fields:
-    """Return the field of raw radii rho (B, N, 1).
+    """Return the state field of raw radii rho (B, N, 1).
 
-    Its encoding states the options. So a recipe is refused if the options of its components differ.
+    The `encoding` of the field names the options, so a recipe is refused if two of its components
+    have different options.
     """
     reading = {
         "floor": f"radius = max(softplus(x), {options.radius_min:g})",

@@ -50,7 +50,7 @@ def dense_bias(
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
     """Normalise rays (B, M, 6), and return moments and directions as rows (B, 6, M).
 
-    direction_eps: least length |d| of a direction by which its ray is divided.
+    Each ray is divided by the length of its direction, or by `direction_eps` if the length is less.
     """
     return torch.cat(normalised_rays(rays_BM6, direction_eps), -1).mT.contiguous()
 
@@ -59,8 +59,8 @@ class RayBias(AttentionBias):
     """Attention bias max(-factor D^2, lower), with D the distance of anchor centre and ray.
 
     Each query has five numbers: the anchor's centre mu, factor = gamma / (2 sigma^2) and
-    lower = gamma bias_min. Each token has six: moment m and direction d of its ray. So kernels
-    compute only D for each pair of query and token.
+    lower = gamma * bias_min. Each token has six numbers: moment m and direction d of its ray. So
+    kernels compute only D for each pair of query and token.
     """
 
     in_triton = True
@@ -77,7 +77,7 @@ class RayBias(AttentionBias):
     ) -> Self:
         """Make the bias of a layer.
 
-        center: anchor centres, world. sigma_sq: squared bandwidths (B, N, 1), or one number.
+        center: anchor centres, world frame. sigma_sq: squared bandwidths (B, N, 1), or one number.
         tokens: result of `ray_tokens`. bias_min: lower bound of b. gamma: positive weight, 0-d.
         """
         # Kernels read one row per query, even if all queries share a number.

@@ -69,13 +69,11 @@ class AnchorRefinement(Refinement):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields that are refined."""
         center = CENTER_FIELD if config.center else {}
         return {**center, **(cls.radius_field(config) if config.radius else {})}
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the fields that are refined."""
         return cls.fields_read(config)
 
     @classmethod

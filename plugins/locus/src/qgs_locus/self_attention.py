@@ -20,9 +20,9 @@ def sine_embedding(
 ) -> Tensor:
     """Embed positions (..., 3) in [-1, 1] as sines and cosines (..., 3 * features).
 
-    Each coordinate is mapped to [0, 2 pi]. For frequency i it is divided by
-    temperature^(2i / features) + divisor_eps. Its sine and cosine follow each other, frequency by
-    frequency and axis by axis (LocusGS release).
+    Each coordinate is mapped to an angle in [0, 2 pi]. For each frequency i, the angle is divided
+    by temperature^(2i / features) + divisor_eps. Results are ordered by axis, then by frequency,
+    with the sine before the cosine (LocusGS release).
     """
     # Each sine shares its frequency with a cosine.
     half = torch.arange(features // 2, dtype=position.dtype, device=position.device)

@@ -1,4 +1,4 @@
-"""`locus/anchor_visibility`: loss that moves unseen anchors towards the nearest target view."""
+"""`locus/anchor_visibility`: loss that moves anchors outside of all target views to the nearest."""
 
 from collections.abc import Iterable
 
@@ -14,7 +14,7 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 class AnchorVisibility(Loss):
     """Mean distance of anchor centres to the image of the nearest target view.
 
-    A centre that a target view sees has distance 0. The distance is that of
+    An anchor centre inside the image of a target view has distance 0. Distances are computed by
     `qgs.losses.view_visibility`, equation (8) of the plugin's README.
     """
 
@@ -26,7 +26,8 @@ class AnchorVisibility(Loss):
         weight: float = Field(default=0.1, ge=0)
         """Weight of this loss in the objective."""
         z_guard: float = Field(default=1e-3, gt=0)
-        """Least |z| in the perspective division, world units. A z closer to 0 is replaced by it."""
+        """World units: a z between -z_guard and z_guard is replaced by z_guard in the perspective
+        division."""
 
     config: Config
 

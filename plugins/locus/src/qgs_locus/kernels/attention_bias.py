@@ -45,10 +45,10 @@ _PART = 2**21
 
 
 class AttentionBias(ABC):
-    """Bias of attention logits that is computed from numbers of query and token.
+    """Bias of attention logits, computed from F numbers of a query and G numbers of a token.
 
-    It is the same for all heads. queries: F numbers of each query (B, N, F). tokens: G numbers of
-    each token (B, G, M). Both are float32 or float64, and only they get gradients.
+    The bias is the same for all heads. queries: numbers of all queries (B, N, F). tokens: numbers
+    of all tokens (B, G, M). Both are float32 or float64, and only these two tensors get gradients.
     """
 
     in_triton = False
@@ -67,8 +67,8 @@ class AttentionBias(ABC):
 
         The first takes arrays (queries, tokens, out) and writes `value` to `out`. The second takes
         (queries, tokens, gradient, out). From the gradient of the bias (n, M) it computes the
-        gradient of the queries (n, F) and writes it to `out`. Several threads may run a kernel,
-        each for other queries.
+        gradient of the queries (n, F) and writes it to `out`. Several threads may run a kernel at
+        the same time, each on a part of the queries.
         """
         return None
 
@@ -86,10 +86,11 @@ class AttentionBias(ABC):
     def gradients(
         self, queries_nF: Tensor, tokens_GM: Tensor, gradient_nM: Tensor
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Return the gradients of `queries_nF` and `tokens_GM`; None for one that needs none.
+        """Return the gradients of the loss with respect to `queries_nF` and `tokens_GM`.
 
-        gradient_nM: gradient of the loss with respect to the bias. `self.queries` and `self.tokens`
-        say by `requires_grad` which gradients are needed: at least one.
+        Instead of a gradient that is not needed, return None. `requires_grad` of `self.queries` and
+        `self.tokens` tells which are needed: at least one. gradient_nM: gradient of the loss with
+        respect to the bias.
         """
         of_queries = self.queries.requires_grad
         of_tokens = self.tokens.requires_grad
@@ -117,7 +118,10 @@ class AttentionBias(ABC):
         return self.compiled() if usable else None
 
     def dense(self, chosen: Tensor | None = None) -> Tensor:
-        """Return the bias (B, N, M) of all queries, or (B, Q, M) of the Q indices `chosen`."""
+        """Return the bias (B, N, M) of all queries, or (B, Q, M) of the Q queries `chosen`.
+
+        chosen: indices (Q,).
+        """
         bias = self
         if chosen is not None:
             bias = copy(self)
@@ -146,7 +150,7 @@ def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...],
 
 
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
-    """Call a kernel on several threads, each with all tokens and some rows of other arrays."""
+    """Call a kernel on several threads, each with all tokens and some rows of `of_rows`."""
     tokens = tokens_GM.numpy()
     queries, *others = (x.numpy() for x in of_rows)
     pairs = len(queries) * tokens.shape[1]
@@ -181,7 +185,7 @@ def biased_attention(
 ) -> Tensor:
     """Return attention softmax(q k / sqrt(d) + b) v, (B, h, N, d), with the bias b.
 
-    Raises ValueError if `kernel` cannot compute it.
+    Raises ValueError if `kernel` cannot compute this attention.
     """
     qkv = (q_BhNd, k_BhMd, v_BhMd)
     of_bias = (bias.queries, bias.tokens)
@@ -317,12 +321,12 @@ def _attend_anywhere(
 def _attention_gradients(
     saved: tuple[Tensor, ...], gradient: Tensor, bias: AttentionBias, needs: tuple[bool, ...]
 ) -> tuple[Tensor | None, ...]:
-    """Return gradients of q, k, v (each (B, h, ., d)) and of the bias's queries and tokens.
+    """Return gradients of q, k, v (each (B, h, N or M, d)) and of the bias's queries and tokens.
 
-    Gradients that are not needed are None. For a head with attention weights P, output O and its
-    gradient dO: dV = P' dO, dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d),
-    dK = dS' Q / sqrt(d). ' transposes, * multiplies entries. The gradient of the bias is the sum of
-    dS over heads.
+    Gradients that are not needed are None. For a head with logits S, attention weights
+    P = softmax(S), output O and its gradient dO: dV = P' dO, dS = P * (dO V' - rowsum(dO * O)),
+    dQ = dS K / sqrt(d), dK = dS' Q / sqrt(d). ' transposes, * multiplies entries. The gradient of
+    the bias is the sum of dS over heads.
     """
     q, k, v, queries, tokens, out, lse = saved
     scale = q.shape[-1] ** -0.5

@@ -1,10 +1,10 @@
 """Choice of the code that computes attention with a bias that depends on query and token.
 
-On a CPU this is the code of blocks. On a GPU it is plain attention if one layer needs at most
-1 / SHARE of the GPU's memory for the bias of all pairs, which every layer keeps for the backward
-pass. For larger sizes it is Triton kernels, or blocks if Triton cannot be used. Their speeds have
-not been compared on a GPU. The choice depends on sizes only, so all layers, steps and processes
-make the same one.
+On a CPU, attention is computed block by block. On a GPU, torch's attention is used if one layer
+needs at most 1 / SHARE of the GPU's memory for the bias of all pairs of query and token, which
+every layer keeps for the backward pass. For larger sizes, Triton kernels are used, or blocks if
+Triton cannot be used. The speeds of these ways have not been compared on a GPU. The choice depends
+on sizes only, so all layers, steps and processes make the same choice.
 """
 
 import logging
@@ -33,7 +33,7 @@ SHARE = 16
 def chosen_kernel(
     q_BhNd: Tensor, bias: "AttentionBias", kernel: AttentionKernel
 ) -> AttentionKernel:
-    """Return the kernel to use, which is never "auto".
+    """Return `kernel`, or the kernel chosen by size if `kernel` is "auto".
 
     Raises ValueError for "triton" if Triton cannot compute this attention.
     """
@@ -54,7 +54,7 @@ def chosen_kernel(
 
 
 def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
-    """Return the bytes that plain attention needs for the bias, and for its gradient per head."""
+    """Return the bytes that plain attention needs for the bias and its gradients of all heads."""
     scenes, heads, queries, _ = q_BhNd.shape
     read = q_BhNd.element_size()
     each = bias.queries.element_size()

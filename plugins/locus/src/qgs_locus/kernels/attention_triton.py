@@ -28,10 +28,10 @@ G = tl.constexpr(6)
 
 @jit
 def _moment(queries, tokens, step):
-    """Return the coordinates of vectors whose length is the distance of anchor and ray.
+    """Return mu x d - m, whose length is the distance of anchor and ray, as three tensors (n, m).
 
-    They are three tensors (n, m). The vector is mu x d - m, with mu the anchor's centre, and m and
-    d the moment and direction of the ray.
+    mu is the anchor's centre, m and d are moment and direction of the ray. The three tensors hold
+    the coordinates.
     """
     x = tl.load(queries)
     y = tl.load(queries + 1)
@@ -58,8 +58,8 @@ def _bias(queries, tokens, step):
 def _bias_gradients(queries, tokens, step, gradient, sums):
     """Return `sums`, five tensors (n,), plus the gradients of the queries' five numbers.
 
-    gradient: that of the bias (n, m). With e = mu x d - m, the result of `_moment`, the gradient of
-    |e|^2 to mu is 2 d x e.
+    gradient: gradient of the loss with respect to the bias (n, m). With e = mu x d - m, the result
+    of `_moment`, the gradient of |e|^2 with respect to mu is 2 d x e.
     """
     e0, e1, e2 = _moment(queries, tokens, step)
     d0 = tl.load(tokens + 3 * step)
@@ -111,7 +111,7 @@ def _at(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
 
 @jit
 def _logits(q, k, queries, tokens, m, M, scale):
-    """Return logits q k / sqrt(d) + b (n, m), with -inf for tokens from number M on."""
+    """Return logits q k / sqrt(d) + b (n, m), with -inf for tokens of index M or more."""
     products = tl.dot(q, tl.trans(k), input_precision="ieee") * scale
     return tl.where((m < M)[None, :], products + _bias(queries, tokens, M), float("-inf"))
 
@@ -154,9 +154,10 @@ def _backward_queries(
     q, k, v, read_q, read_k, g, lse, rowsum, dq, of_bias, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Write gradients of q to `dq`, of the bias's queries per head (B, h, N, F) to `of_bias`.
+    """Write the gradient of q to `dq`, and that of each head's bias to `of_bias` (B, h, N, F).
 
-    If `dq` or `of_bias` is None, its gradient is not computed.
+    The latter is with respect to the F numbers of each query. If `dq` or `of_bias` is None, its
+    gradient is not computed.
     """
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
@@ -193,7 +194,7 @@ def _backward_tokens(
     q, k, v, read_q, read_k, g, lse, rowsum, dk, dv, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Write gradients of k and v to `dk` and `dv`. If one is None, its gradient is not computed.
+    """Write the gradient of k to `dk` and that of v to `dv`, unless `dk` or `dv` is None.
 
     Rows beyond the last query get log-sum-exp inf, so their attention weights are 0.
     """
@@ -263,7 +264,7 @@ class TritonAttention(torch.autograd.Function):
 
 
 def _launch(kernel: Any, *tensors: Any) -> None:
-    """Run a kernel for each head and block; tensors with four axes are passed with strides."""
+    """Run a kernel for each head and block. Tensors with four axes come with their strides."""
     q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)
@@ -278,8 +279,8 @@ def _launch(kernel: Any, *tensors: Any) -> None:
 def _blocks(q: Tensor) -> dict[str, int]:
     """Return block sizes and numbers of warps that nearly fit into 255 registers per thread.
 
-    Products in float32 do not use the GPU's matrix units, so loading ahead would only cost
-    registers.
+    Products in float32 do not use the GPU's matrix units, so loading blocks in advance (num_stages
+    above 1) would only cost registers.
     """
     # `tl.dot` needs at least 16.
     width = max(triton.next_power_of_2(q.shape[-1]), 16)

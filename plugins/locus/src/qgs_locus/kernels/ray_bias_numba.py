@@ -1,7 +1,8 @@
 """Numba kernels of `RayBias`, which pass once over all rays for each query.
 
-Each query is a row (x, y, z, factor, lower): the anchor's centre mu, gamma / (2 sigma^2) and
-gamma * bias_min. Tokens are six rows: moments m and directions d of the rays.
+A query is a row of five numbers (x, y, z, factor, lower): the anchor's centre mu = (x, y, z),
+factor = gamma / (2 sigma^2) and lower = gamma * bias_min. A token is a column of six numbers:
+moment m and direction d of its ray.
 """
 
 import numpy as np
@@ -42,10 +43,10 @@ def write(queries, tokens, out):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Write gradients of the queries' five numbers to `out`.
+    """Write the gradient of the loss with respect to each query's five numbers to `out`, (n, 5).
 
-    gradient: that of the bias. The bias depends on |e|^2 with e = mu x d - m, whose gradient to the
-    anchor's centre mu is 2 d x e.
+    gradient: gradient of the loss with respect to the bias (n, M). The bias depends on |e|^2 with
+    e = mu x d - m. The gradient of |e|^2 with respect to the anchor's centre mu is 2 d x e.
     """
     m0 = tokens[0]
     m1 = tokens[1]

@@ -4,9 +4,12 @@ from pathlib import Path
 
 
 def refuse_filled(out: Path) -> None:
-    """Raise FileExistsError if `out` is a file or a folder that is not empty."""
+    """Raise FileExistsError if `out` is a file, or a folder that is not empty."""
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise FileExistsError(f"{out} is not empty: choose another --out, or delete it yourself")
+        raise FileExistsError(
+            f"{out} is a file or a folder that is not empty: choose another --out, or delete it "
+            "yourself"
+        )
 
 
 def refuse_no_time(option: str, value: float | None) -> None:

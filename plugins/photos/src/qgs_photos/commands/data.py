@@ -26,7 +26,7 @@ _ROWS = 40
 Quality: TypeAlias = Annotated[
     int | None,
     typer.Option(
-        help="JPEG quality of images that must be encoded again. Default: PNG, without loss.",
+        help="JPEG quality of images that must be encoded again. Default: encode them as PNG.",
         min=1,
         max=100,
     ),
@@ -46,7 +46,9 @@ Format: TypeAlias = Annotated[
 ]
 SourceOptions: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Option of the data source, such as images=images_4. Repeatable."),
+    typer.Option(
+        "--set", help="Option of the reader of the data set, such as images=images_4. Repeatable."
+    ),
 ]
 ImageSize: TypeAlias = Annotated[
     tuple[int, int] | None,
@@ -78,24 +80,27 @@ def check(
     ],
     index: Annotated[
         list[str] | None,
-        typer.Option(help="Evaluation index to compare with the scenes. Repeatable."),
+        typer.Option(
+            help="Evaluation index whose scenes and frames must be in the data set. Repeatable."
+        ),
     ] = None,
     format: Format = "auto",
     images: Annotated[
         str | None,
         typer.Option(
-            help="Folder of photos inside each scene, such as images_4. Default: the format's."
+            help="Folder of photos inside each scene, such as images_4. Default: set by format."
         ),
     ] = None,
     quick: Quick = False,
     geometry: Geometry = 20,
-    threads: Annotated[int, typer.Option(help="Threads that decode images.", min=1)] = 8,
+    threads: Annotated[int, typer.Option(help="Number of threads that decode images.", min=1)] = 8,
 ) -> None:
     """Find faults of a data set: one line for each fault, with scene, frame and remedy.
 
     Every image is decoded. Poses are checked by points that neighbouring photos share. The exit
     code is 1 for errors, and 0 for no faults or only warnings. The command imports every installed
-    plugin to find the reader of PATH. --format PLUGIN/NAME imports only PLUGIN, other formats none.
+    plugin to find the reader of PATH. With --format PLUGIN/NAME it imports only PLUGIN, and with
+    --format NAME no plugin.
     """
     from qgs.paths import opened_path
     from qgs_photos.datatools.check import Options, check
