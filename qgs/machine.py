@@ -1,4 +1,4 @@
-"""Memory and cores of this machine: available memory, errors for lack of it, work in threads."""
+"""Memory and cores of this machine: available bytes, errors for lack of memory, work in threads."""
 
 import os
 import sys
@@ -20,7 +20,7 @@ class TooLargeError(ValueError):
 def refuse_more_than_memory(what: str, needed: int, advice: str) -> None:
     """Raise TooLargeError if `needed` bytes, a lower bound, exceed the available memory.
 
-    what: the request, as the subject of the message. advice: a sentence at the end.
+    what: name of the request, the subject of the message. advice: sentence that ends the message.
     """
     limit = available_bytes()
     if needed > limit:
@@ -31,9 +31,10 @@ def refuse_more_than_memory(what: str, needed: int, advice: str) -> None:
 
 
 def available_bytes() -> int:
-    """Return the bytes of memory that this process can still use.
+    """Return the number of bytes of memory that this process can still use.
 
-    The memory of the machine and the limit of the process's control group (container) count.
+    This is the lower of two limits: that of the machine, and that of the process's control group
+    (container).
     """
     limits = [sys.maxsize]
     with suppress(OSError, ValueError, KeyError):  # not on Linux
@@ -54,7 +55,7 @@ def _numbers(table: Path) -> dict[str, int]:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return True if Python, NumPy or torch ran out of memory, on any device."""
+    """Return whether `error` says that Python, NumPy or torch ran out of memory, on any device."""
     words = str(error).lower()
     from_torch = "can't allocate memory" in words or "out of memory" in words
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and from_torch)
@@ -63,8 +64,8 @@ def is_out_of_memory(error: BaseException) -> bool:
 def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> None:
     """Call `unit(*item)` for every item of `work` in threads, and wait for all calls.
 
-    Every call must write to its own memory, because their order is undefined. `unit` must not call
-    `in_threads` itself: it could wait forever for threads that are in use.
+    The order of the calls is undefined, so every call must write to memory of its own. `unit` must
+    not call `in_threads`: it could wait forever for threads that are in use.
     """
     futures = [_threads(torch.get_num_threads()).submit(unit, *item) for item in work]
     # Waits for all even if one fails: no thread writes after this returns.

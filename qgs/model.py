@@ -1,4 +1,4 @@
-"""The model: an encoder of views, decoder layers that update queries, and a head for Gaussians."""
+"""The model: an encoder of photos, decoder layers that update queries, and a head for Gaussians."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, cast
@@ -36,10 +36,10 @@ from qgs.types import (
 class QueryGaussianModel(nn.Module):
     """A model that turns photos into the Gaussians of its queries, in one forward pass.
 
-    refinements: the distinct refinement modules; layers may share one. `refinement_of` has the
+    refinements: the distinct refinement modules; layers may share a module. `refinement_of` has the
         index of the refinement for each decoder layer.
     recipe: the complete recipe of this model; None for a model built by hand.
-    releases: distribution and version of the recipe's plugins when the model was built.
+    releases: distribution and version of each plugin of the recipe when the model was built.
     trained_on: range of the training's cameras, from the checkpoint; None if it is unknown.
     loaded_from: absolute path of the checkpoint that `qgs.load` read; "" for other models.
     """
@@ -81,7 +81,7 @@ class QueryGaussianModel(nn.Module):
 
     @property
     def depth(self) -> int:
-        """Number of decoder layers that an evaluation runs, with those repeated by feedback."""
+        """Number of decoder layers that an evaluation runs, including repetitions by feedback."""
         return len(self.decoder) + self.feedback.rounds * self.feedback.layers
 
     def forward(
@@ -90,10 +90,11 @@ class QueryGaussianModel(nn.Module):
         layers: Collection[int] | None = None,
         state: QueryState | None = None,
     ) -> Prediction:
-        """Reconstruct every scene of `views`, whose cameras are in the model's world.
+        """Reconstruct every scene of `views`, whose cameras are in the model's frame.
 
-        layers: see `predict`. state: the initial query state; None computes it by `queries`.
-        Raises ValueError for `Photos` if encoder, queries or feedback read cameras.
+        layers: layers to decode besides the last, see `predict`. state: the initial query state;
+            None computes it by the model's `queries`. Raises ValueError for `Photos` if encoder,
+            queries or feedback read cameras.
         """
         # NumPy's cameras are float64, the weights hardly ever.
         views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))
@@ -105,7 +106,7 @@ class QueryGaussianModel(nn.Module):
         return self.predict(views, memory, initial, layers)
 
     def _without_cameras(self, photos: Photos) -> Views:
-        """Return `photos` typed as Views; raise ValueError if a part of the model reads cameras."""
+        """Return `photos` typed as Views; raise ValueError if the model needs cameras."""
         readers = [
             type(part).__name__
             for part in (self.encoder, self.queries, self.feedback)
@@ -114,8 +115,7 @@ class QueryGaussianModel(nn.Module):
         if readers:
             raise ValueError(
                 f"{' and '.join(readers)} of this model need cameras, but these photos have none; "
-                "give Views with cameras, or use an encoder that does not read them "
-                "(reads_cameras)"
+                "give Views with cameras, or use components with `reads_cameras = False`"
             )
         # Photos have all other fields that are read.
         return cast(Views, photos)
@@ -127,14 +127,15 @@ class QueryGaussianModel(nn.Module):
         state: QueryState,
         layers: Collection[int] | None = None,
     ) -> Prediction:
-        """Run all decoder layers and decode Gaussians after the chosen ones.
+        """Run all decoder layers, and decode Gaussians after the last layer and after `layers`.
 
         views, memory: the encoder's input and output.
         state: the queries before the first layer, for the same scenes.
         layers: numbers of layers to decode, in addition to the last layer of the decoder and of
-            each feedback round. 1 is the first layer; layers that rounds repeat get the following
-            numbers. 0 is the initial state, only in a decoder of depth 0. None stands for the
-            supervised layers in training, and for no additional layers in evaluation.
+            each feedback round. The first layer has number 1; layers that feedback repeats get the
+            numbers after the decoder's. 0 is the initial state, only in a decoder of depth 0. None
+            stands for the supervised layers in training, and for no additional layers in
+            evaluation.
         Raises ValueError for a layer that does not exist, and if `memory` and `state` have
         different numbers of scenes.
         """
@@ -154,7 +155,10 @@ class QueryGaussianModel(nn.Module):
         scenes = memory.features.shape[0]
         given = state.features.shape[0]
         if scenes != given:
-            raise ValueError(f"the memory has {scenes} scenes, but the initial state has {given}")
+            raise ValueError(
+                f"the memory has {scenes} scenes, but the initial state has {given}; both need the "
+                "same scenes"
+            )
         decoded = {} if last else {0: LayerPrediction(self.decode(state), state)}
         first = memory
         for number, index in enumerate(order, start=1):
@@ -175,7 +179,7 @@ class QueryGaussianModel(nn.Module):
         return Prediction(decoded[len(order)].gaussians, state, decoded)
 
     def decode(self, state: QueryState) -> Gaussians:
-        """Decode the Gaussians of a state, ordered query by query."""
+        """Decode a query state into its Gaussians, ordered query by query."""
         attributes = self.head(state)
         parts = attributes.replace(offsets=self.centers(attributes.offsets, state))
         # Places without a query decode Gaussians that nobody sees.
@@ -187,5 +191,5 @@ class QueryGaussianModel(nn.Module):
     def render(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render Gaussians (B, G) from cameras (B, V), see `qgs.contracts.Renderer`."""
+        """Render Gaussians (B, G) from cameras (B, V), as `qgs.contracts.Renderer.forward` does."""
         return self.renderer(gaussians, cameras, background)

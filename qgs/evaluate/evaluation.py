@@ -191,7 +191,10 @@ class _Scorer:
 
     @torch.no_grad()
     def score(self, scene: str, samples: Iterable[Sample]) -> SceneScore:
-        """Return the mean score of a scene over its samples; raise ValueError if it is not finite."""
+        """Return the mean score of a scene over its samples.
+
+        Raises ValueError for a score that is NaN or infinite.
+        """
         found: list[dict[str, float]] = []
         views: list[Window] = []
         names: dict[int, str] = {}

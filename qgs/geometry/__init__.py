@@ -1,1 +1,1 @@
-"""Functions on cameras, rays and rotations. All compute in float32 or float64."""
+"""Functions on cameras, rays and rotations. All of them compute in float32 or float64."""

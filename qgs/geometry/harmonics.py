@@ -23,7 +23,7 @@ _C3 = (
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
-    """Evaluate the first `count` (3, 8 or 15) harmonics, from degree 1 on, -> (..., count).
+    """Evaluate `count` (3, 8 or 15) real spherical harmonics, from degree 1 on, -> (..., count).
 
     directions: unit vectors (..., 3).
     """
@@ -45,11 +45,11 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
 
 @full_precision
 def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return the colours (B, V, G, 3), at least 0, of Gaussians (B, G) seen by cameras (B, V).
+    """Return the colours (B, V, G, 3), at least 0, of Gaussians (B, G) from cameras (B, V).
 
-    Gaussians without `sh` look the same from all cameras: the result is `colors` as (B, 1, G, 3).
-    View directions point from the camera's centre to the mean of the Gaussian. Differentiable in
-    colors, sh, means and c2w.
+    B, G and V are scenes, Gaussians and views. The colour of Gaussians without `sh` does not depend
+    on the camera: the result is `colors` as (B, 1, G, 3). View directions point from the camera's
+    centre to the mean of the Gaussian. The result is differentiable in colors, sh, means and c2w.
     """
     if gaussians.sh is None:
         return gaussians.colors[:, None]
@@ -62,10 +62,10 @@ def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
 
 @full_precision
 def rotated(sh: Tensor, rotation: Tensor) -> Tensor:
-    """Rotate coefficients (..., C, 3), and thus the colours they describe, by `rotation` (3, 3).
+    """Rotate coefficients `sh` (..., C, 3), and thus their colours, by `rotation` (3, 3).
 
-    A rotated harmonic is a linear combination of the harmonics of its degree. The factors are
-    fitted in float64 to values at random directions.
+    C is the number of harmonics. A rotated harmonic is a linear combination of the harmonics of its
+    degree. The factors are fitted in float64 to values at random directions.
     """
     directions = torch.randn(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     directions = F.normalize(directions, dim=-1)

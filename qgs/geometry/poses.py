@@ -1,4 +1,7 @@
-"""Transforms of camera poses to the coordinate frame and scale of the model (TokenGS release)."""
+"""Transforms of camera poses to the coordinate frame and scale of the model (TokenGS release).
+
+V is the number of cameras; poses are camera-to-world, with OpenCV axes.
+"""
 
 import math
 
@@ -17,7 +20,8 @@ _PARALLEL = 3e-4
 def reference_pose(frame: str, c2w: Tensor) -> Tensor:
     """Return the pose (..., 4, 4) that becomes the identity in the model's frame.
 
-    frame: value of the recipe's `views.frame`. c2w: input poses (..., V, 4, 4).
+    frame: value of the recipe's option `views.frame`. c2w: poses (..., V, 4, 4) of the input
+        cameras.
     """
     if frame == "given":
         return torch.eye(4).to(c2w).expand_as(c2w[..., 0, :, :])
@@ -26,9 +30,9 @@ def reference_pose(frame: str, c2w: Tensor) -> Tensor:
 
 @full_precision
 def mean_camera(c2w: Tensor) -> Tensor:
-    """Compute the mean pose of cameras: mean position, mean forward axis and mean down axis.
+    """Compute the mean pose (..., 4, 4) of poses c2w (..., V, 4, 4).
 
-    The mean axes are orthonormalised by Gram-Schmidt. c2w (..., V, 4, 4) -> (..., 4, 4).
+    It has the mean position, and the mean forward and down axes, orthonormalised by Gram-Schmidt.
     """
     _, down, forward, position = c2w.mean(dim=-3)[..., :3, :].unbind(-1)
     return look_at(position, forward, down)
@@ -38,7 +42,8 @@ def mean_camera(c2w: Tensor) -> Tensor:
 def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
     """Return OpenCV poses (..., 4, 4) at position `eye` (..., 3) that look along `forward`.
 
-    down: a vector that points down in the image; it need not be orthogonal to `forward`.
+    forward: a vector (..., 3). down: a vector (..., 3) that points down in the image; it need not
+        be orthogonal to `forward`.
     """
     forward = F.normalize(forward, dim=-1)
     down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
@@ -57,7 +62,7 @@ def relative_to(reference: Tensor, c2w: Tensor) -> Tensor:
 
 @full_precision
 def scaled(c2w: Tensor, scale: Tensor | float) -> Tensor:
-    """Return poses whose translations are multiplied by `scale`, a number or one per pose."""
+    """Return poses with translations multiplied by `scale`, a number or one for each pose."""
     factor = torch.as_tensor(scale, dtype=c2w.dtype, device=c2w.device)
     translation = c2w[..., :3, 3] * factor[..., None]
     top = torch.cat([c2w[..., :3, :3], translation[..., None]], -1)
@@ -66,18 +71,18 @@ def scaled(c2w: Tensor, scale: Tensor | float) -> Tensor:
 
 @full_precision
 def largest_distance(c2w: Tensor) -> Tensor:
-    """Return the largest distance from the first camera to any other: (..., V, 4, 4) -> (...)."""
+    """Return the largest distance (...) from the first camera of (..., V, 4, 4) to any other."""
     centres = c2w[..., :3, 3]
     return (centres - centres[..., :1, :]).norm(dim=-1).amax(-1)
 
 
 @full_precision
 def look_at_depth(c2w: Tensor) -> Tensor:
-    """Return the depth (0-d) of the point that cameras c2w (V, 4, 4) look at, median over cameras.
+    """Return the depth (0-d) of the point that cameras c2w (V, 4, 4) look at: median over cameras.
 
-    The point has the least sum of squared distances to the optical axes. The result is 0 if there
-    is no such point: the axes are parallel within about a degree, or the point lies behind the
-    camera or more than 30 degrees off its axis for more than a quarter of the cameras.
+    The point has the least sum of squared distances to the optical axes. The result is 0 if the
+    axes are parallel within about a degree. It is also 0 if, for more than a quarter of the
+    cameras, the point lies behind the camera or more than 30 degrees off its optical axis.
     """
     axes = c2w[:, :3, 2]
     centres = c2w[:, :3, 3]
@@ -97,9 +102,9 @@ def look_at_depth(c2w: Tensor) -> Tensor:
 
 @full_precision
 def mirrored(c2w: Tensor) -> Tensor:
-    """Return the poses of cameras in a scene mirrored in x.
+    """Return the poses of cameras after mirroring the scene in x.
 
-    Rotations become F R F and translations F t, with F = diag(-1, 1, 1).
+    Rotations R become F R F and translations t become F t, with F = diag(-1, 1, 1).
     """
     # On both sides, because a matrix mirrored once is not a rotation.
     flip = torch.diag(constant([-1.0, 1.0, 1.0, 1.0], c2w))

@@ -12,7 +12,8 @@ from qgs.types import Cameras, Size
 def pixel_directions(intrinsics: Tensor, size: Size) -> Tensor:
     """Return camera-frame directions with z = 1 through the pixel centres.
 
-    intrinsics (..., 4) -> (..., H, W, 3). The centre of the first pixel is (0.5, 0.5).
+    intrinsics (..., 4): fx, fy, cx, cy -> (..., H, W, 3). The centre of the first pixel is (0.5,
+    0.5).
     """
     height, width = size
     options = {"dtype": intrinsics.dtype, "device": intrinsics.device}
@@ -28,7 +29,7 @@ def pixel_directions(intrinsics: Tensor, size: Size) -> Tensor:
 
 @full_precision
 def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return world-frame origins and unit directions of pixel rays, both (..., H, W, 3)."""
+    """Return world-frame origins and unit directions of the pixels' rays, both (..., H, W, 3)."""
     c2w = cameras.c2w
     directions = F.normalize(pixel_directions(cameras.intrinsics, cameras.size), dim=-1)
     directions = torch.einsum("...ij,...hwj->...hwi", c2w[..., :3, :3], directions)
@@ -38,7 +39,7 @@ def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
 def plucker_rays(cameras: Cameras) -> Tensor:
     """Return maps (..., 6, H, W) of Plücker rays: moment o x d, then direction d.
 
-    o is the camera's centre. This order is that of the TokenGS release.
+    o is the camera's centre. The order of o x d and d is that of the TokenGS release.
     """
     origins, directions = camera_rays(cameras)
     moments = torch.linalg.cross(origins, directions)
@@ -49,7 +50,8 @@ def plucker_rays(cameras: Cameras) -> Tensor:
 def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
     """Return the mean Plücker ray of each patch, not renormalised.
 
-    plucker (B, V, 6, H, W) -> (B, V*H/P*W/P, 6), ordered by view, row, column; P is the patch size.
+    plucker (B, V, 6, H, W): scenes, views -> (B, V*H/P*W/P, 6) for patches of P pixels a side,
+    ordered by view, row, column.
     """
     # The mean of moments and directions is a ray through the middle, a little too short.
     pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
@@ -58,9 +60,10 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
 
 @full_precision
 def camera_centers(rays: Tensor, grid: tuple[int, int, int]) -> Tensor:
-    """Return world-frame camera centres (B, V, 3) from `patch_rays` and `grid` of a memory.
+    """Return world-frame camera centres (B, V, 3) from `patch_rays` and `grid` of an image memory.
 
-    rays (B, M, 6). Each centre is the point where the rays of its view meet, by least squares.
+    rays: Plücker rays (B, M, 6) of M patches. Each centre is the point where the rays of its view
+        meet, by least squares.
     """
     moments, directions = rays.unflatten(1, (grid[0], -1)).chunk(2, -1)
     # A moment o x d is the sum over axes of o_i (e_i x d).

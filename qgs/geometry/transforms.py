@@ -1,4 +1,4 @@
-"""Transforms of points to camera frames and pixels, of quaternions, and of Gaussians."""
+"""Transforms of points to camera frames and pixels; operations on quaternions and on Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,7 +30,10 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 @full_precision
 def unit(vectors: Tensor, otherwise: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> Tensor:
-    """Normalise vectors (..., C); zeros become `otherwise` (default: the identity quaternion)."""
+    """Normalise vectors (..., C); zero vectors become `otherwise`, by default the identity.
+
+    This default is a quaternion w x y z.
+    """
     length = vectors.norm(dim=-1, keepdim=True)
     divisor = torch.where(length > 0, length, 1)
     return torch.where(length > 0, vectors / divisor, constant(otherwise, vectors))
@@ -38,7 +41,7 @@ def unit(vectors: Tensor, otherwise: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> 
 
 @full_precision
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
-    """Return Hamilton products (..., 4), w x y z; they rotate by `right` first, then by `left`."""
+    """Return Hamilton products (..., 4), w x y z: rotation by `right`, then rotation by `left`."""
     w, v = left.split((1, 3), -1)
     w2, v2 = right.split((1, 3), -1)
     real = w * w2 - (v * v2).sum(-1, keepdim=True)
@@ -47,7 +50,7 @@ def quat_product(left: Tensor, right: Tensor) -> Tensor:
 
 @full_precision
 def to_camera(points: Tensor, cameras: Cameras) -> Tensor:
-    """Transform world points (B, P, 3) to the frames of cameras (B, V) -> (B, V, P, 3)."""
+    """Transform P world points (B, P, 3) to the frames of cameras (B, V) -> (B, V, P, 3)."""
     w2c = cameras.w2c
     return points[:, None] @ w2c[..., :3, :3].mT + w2c[..., None, :3, 3]
 
@@ -67,7 +70,7 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
 def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
     """Scale Gaussians by `factor` about the origin, then move them by the rigid `pose` (4, 4).
 
-    The result is computed in float64; its means stay so where `narrowed` leaves them.
+    Means are computed in float64, and returned in the dtype that `narrowed` chooses.
     """
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
@@ -85,9 +88,10 @@ def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
 
 
 def narrowed(gaussians: Gaussians) -> Gaussians:
-    """Return `gaussians` with means in the dtype of scales, or as they are if that moves them.
+    """Return `gaussians` with means in the dtype of the scales, unless this moves them much.
 
-    It must move most of them by more than MOVED of their size: as in coordinates of maps.
+    If more than half of the means move by more than MOVED of their Gaussian's size, as in map
+    coordinates, the Gaussians are returned unchanged.
     """
     means = gaussians.means.to(gaussians.scales.dtype)
     off = (means - gaussians.means).norm(dim=-1) > MOVED * gaussians.scales.norm(dim=-1)

@@ -1,7 +1,7 @@
 """Loops compiled by numba, for the renderer `qgs/cpu` and SSIM.
 
-They only save time and memory: each kernel computes the same as a few lines of torch in another
-module, without tensors over all pairs of Gaussian and pixel. Tests compare both versions.
+Kernels only save time and memory: each kernel computes the same as a few lines of torch in another
+module, but without tensors over all pairs of Gaussian and pixel. Tests compare both versions.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from typing import Any
 def kernel(function: Callable[..., Any], **more: Any) -> Any:
     """Compile `function` with numba on first use; cache the result on disk if possible.
 
-    more: further options of `numba.njit`.
+    more: options of `numba.njit` that extend or replace the project's options.
     """
     from numba import njit
 

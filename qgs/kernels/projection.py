@@ -4,9 +4,10 @@ The formulas are those of `qgs.renderers.reference.project`; tests compare value
 that function. A unit of work is a range of one scene's Gaussians in all views of the scene, so that
 gradients are summed over views in a fixed order. Vectors are tuples; a matrix is a tuple of rows.
 
-Symbols: m mean, R rotation and S scales (diagonal) of a Gaussian, F = R S the factor of its
-covariance F F^T. C rotation and p position of c2w, W = C^T. The mean in the camera's frame is
-W (m - p), the factor W F. J is the Jacobian of the projection to pixels, L the loss.
+Symbols: m, R and S are the mean, rotation and diagonal scales of a Gaussian; F = R S is the factor
+of its covariance F F^T. C and p are the rotation and position of the camera's c2w, and W = C^T. In
+the camera's frame, the mean is W (m - p) and the factor is W F. J is the Jacobian of the projection
+to pixels, L the loss.
 """
 
 import numpy as np
@@ -52,7 +53,7 @@ def _times(s, a):
 
 @kernel
 def _combine(a, rows):
-    """Return the sum of `rows`, weighted by the entries of the vector a."""
+    """Return the sum of `rows`, weighted by the entries of the vector `a`."""
     return _plus(_plus(_times(a[0], rows[0]), a[1], rows[1]), a[2], rows[2])
 
 
@@ -75,7 +76,7 @@ def _four(row):
 
 @kernel
 def _rotation(quat):
-    """Return the rotation matrix of a raw quaternion, the unit quaternion and the raw norm."""
+    """Return a quaternion's rotation matrix, the normalised quaternion, and its former norm."""
     w, x, y, z = _four(quat)
     norm = max(np.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
     w = w / norm
@@ -92,7 +93,7 @@ def _rotation(quat):
 
 @kernel
 def _scaled_columns(rows, scale):
-    """Return the columns of R S from the rows of R and the three scales."""
+    """Return the columns of R S from the rows of the rotation R and the three scales S."""
     columns = _columns(rows)
     return (
         _times(scale[0], columns[0]), _times(scale[1], columns[1]), _times(scale[2], columns[2]),
@@ -108,8 +109,9 @@ def _dots(a, rows):
 def _axis(axis, seen, turned, focal, principal, size, margin):
     """Return x/z of the mean, x/z clamped, and the row of J W R S of an image axis (0: x, 1: y).
 
-    For the y axis read y/z. seen: mean in the camera's frame. turned: rows of W R S. margin: part
-    of the image size by which x/z may lie outside of the image before it is clamped.
+    For the y axis, x stands for y. seen: mean (x, y, z) in the camera's frame. turned: rows of W R
+    S. margin: part of the image size by which x/z may lie outside of the image before it is
+    clamped.
     """
     slope = seen[axis] / seen[2]
     low = (-margin * size - principal) / focal
@@ -120,9 +122,10 @@ def _axis(axis, seen, turned, focal, principal, size, margin):
 
 @kernel
 def _view(c2w, lens, mean, factor, margin, height, width):
-    """Return a camera's view of a Gaussian: (C, m - p, W (m - p), W R S, x axis, y axis).
+    """Return a Gaussian in a camera's frame: (C, m - p, W (m - p), W R S, x axis, y axis).
 
-    lens: fx, fy, cx, cy. mean: m. factor: columns of R S. The two axes are results of `_axis`.
+    The module explains the symbols. lens: fx, fy, cx, cy. mean: m. factor: columns of R S. The two
+    axes are results of `_axis`.
     """
     pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
     offset = _plus(_vector(mean), -_ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
@@ -138,13 +141,13 @@ def _view(c2w, lens, mean, factor, margin, height, width):
 
 @kernel
 def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, splats):
-    """Fill splats (V, G, 9) for a range of Gaussians of one scene.
+    """Fill `splats` (V, G, 9), views by Gaussians, for a range of Gaussians of one scene.
 
     means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4): fx, fy,
     cx, cy. bounds: (first, last) index of the range, `last` excluded. limits: near, far, dilation,
-    alpha_min, margin of `_axis`, height, width. `qgs.kernels.rasterisation` lists splat fields.
-    A splat ends at the Mahalanobis distance sqrt(2 ln(opacity / alpha_min)), where its alpha falls
-    to alpha_min. Its extents get half a pixel more, against rounding.
+    alpha_min, margin of `_axis`, height, width. `qgs.kernels.rasterisation` lists the 9 fields of a
+    splat. A splat ends at the Mahalanobis distance sqrt(2 ln(opacity / alpha_min)), where its alpha
+    falls to alpha_min. Half a pixel is added to its extents, against rounding.
     """
     near, far, dilation, alpha_min, margin, height, width = limits
     for g in range(bounds[0], bounds[1]):
@@ -188,9 +191,10 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
 
 @kernel
 def _covariance_slopes(row_x, row_y, splat, given, dilation):
-    """Return the gradients of the rows x and y of J W R S, from those of the conic, given[2:5].
+    """Return the gradients of row_x and row_y, two rows of J W R S, from those of the conic.
 
-    splat: the fields of the splat, of which 2 to 4 are the conic (inverse 2D covariance).
+    splat: the fields of the splat; fields 2 to 4 are the conic (inverse 2D covariance). given:
+        gradients of the splat's fields.
     """
     xx = _dot(row_x, row_x)
     yy = _dot(row_y, row_y)
@@ -210,9 +214,9 @@ def _covariance_slopes(row_x, row_y, splat, given, dilation):
 def _axis_slopes(axis, focal, z, of_row, turned_z, of_pixel):
     """Return the gradients of the inputs of `_axis`, for one image axis.
 
-    They are the gradients of x (or y) and z of the camera-frame mean, of focal length and principal
-    point, and of the rows x (or y) and z of W R S. axis: the result of `_axis`. of_row, of_pixel:
-    gradients of the row of J W R S and of the pixel coordinate. turned_z: row z of W R S.
+    The gradients are those of x (or y) and z of the camera-frame mean, of focal length and
+    principal point, and of the rows x (or y) and z of W R S. axis: the result of `_axis`. of_row,
+    of_pixel: gradients of the row of J W R S and of the pixel coordinate. turned_z: row z of W R S.
     """
     slope, held, row = axis
     gain = focal / z
@@ -236,9 +240,10 @@ def _axis_slopes(axis, focal, z, of_row, turned_z, of_pixel):
 
 @kernel
 def _quat_slopes(quat, norm, m, out):
-    """Write the gradient of a raw quaternion to `out` (4,).
+    """Write the gradient of a quaternion before its normalisation to `out` (4,).
 
-    quat: unit quaternion. norm: norm of the raw one. m: gradient of the rotation matrix.
+    quat: normalised quaternion. norm: norm before the normalisation. m: gradient of the rotation
+        matrix.
     """
     w, x, y, z = quat
     yz = m[2][1] - m[1][2]
@@ -260,9 +265,10 @@ def _quat_slopes(quat, norm, m, out):
 
 @kernel
 def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
-    """Add one splat's gradients of camera parameters to `out` (16,): C by rows, p, fx, fy, cx, cy.
+    """Add one splat's gradients of camera parameters to `out` (16,).
 
-    Arguments `of_...` are gradients of the splat's values.
+    Order of `out`: rotation C by rows, position p, fx, fy, cx, cy. Arguments `of_...` are gradients
+    of the splat's values.
     """
     for i in range(3):
         for j in range(3):
@@ -274,9 +280,9 @@ def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
 
 @kernel
 def _sum_parts(given, g, slopes):
-    """Sum the gradients given[:, g] of splat number g over the P parts, to `slopes` (10,).
+    """Write the gradients of splat `g`, summed over P parts of an image, to `slopes` (10,).
 
-    given: (P, G, 10).
+    given: gradients (P, G, 10) of G splats in each part.
     """
     slopes[:] = given[0, g]
     for part in range(1, given.shape[0]):
@@ -289,11 +295,12 @@ def project_backward_unit(
     means, scales, quats, c2w, lenses, bounds, limits, splats, given, wants_cameras,
     of_means, of_scales, of_quats, of_opacities, of_cameras,
 ):  # fmt: skip
-    """Compute the gradients of `project_unit` from `given`, the rasteriser's gradients.
+    """Compute the gradients of the inputs of `project_unit` from those of its splats.
 
-    given: (V, P, G, 10), summed over the P stripes of an image first. Writes the gradients of_means
-    (G, 3), of_scales (G, 3), of_quats (G, 4) and of_opacities (G,). If `wants_cameras` is true, it
-    adds the gradients of cameras to of_cameras (V, 16).
+    given: gradients (V, P, G, 10) of the rasteriser: views, stripes of an image, Gaussians. They
+        are first summed over stripes. Writes the gradients of_means (G, 3), of_scales (G, 3),
+        of_quats (G, 4) and of_opacities (G,). If `wants_cameras` is true, it adds the gradients of
+        cameras to of_cameras (V, 16), in the order of `_add_camera`.
     """
     _, _, dilation, _, margin, height, width = limits
     zeros = (_ZERO, _ZERO, _ZERO)

@@ -1,9 +1,9 @@
 """Numba kernels of `qgs/cpu` that blend splats into sums of features, and their gradients.
 
-A unit of work is a stripe of one image, several rows of tiles. It sorts the splats that touch the
-stripe by depth. Then it blends the splats of each tile of 16 x 16 pixels, front to back. A row of a
-tile is 16 lanes (pixels) without branches, in a flat float32 buffer at constant offsets, so that
-LLVM can vectorise the lanes.
+A unit of work is a stripe of one image: several rows of tiles. First the splats that touch the
+stripe are sorted by depth. Then the splats of each tile of 16 x 16 pixels are blended, front to
+back. A row of a tile is 16 lanes (pixels) without branches, in a flat float32 buffer at constant
+offsets, so that LLVM can vectorise the lanes.
 
 A splat has 9 float32 fields: pixel u, v; conic (inverse 2D covariance) xx, xy, yy; depth; half
 extents in x and y (pixels; not positive for invisible splats); and the power of 2 below which alpha
@@ -11,7 +11,7 @@ cannot reach alpha_min. An image has 5 sums over splats, w r, w g, w b, w z and 
 weight of a splat at a pixel, r, g, b its colour and z its depth.
 
 For each row of a tile the buffer has 9 blocks of 16 lanes. Block 0 is the transmittance. Block 1 is
-1 until the pixel takes no more splats, then 0. The other blocks are the sums (forward pass) or the
+1 while the pixel still takes splats, then 0. The other blocks are the sums (forward pass) or the
 values from `_load_gradients` (backward pass).
 
 The backward pass repeats the forward pass with the same skips. Let L be the loss, w_i the weight of
@@ -64,7 +64,7 @@ def _exp2(x):
 def _by_depth(splats, top, bottom, width):
     """Return the indices of splats that touch image rows [top, bottom), by ascending depth.
 
-    width: image width in pixels. Splats at the same depth keep their order.
+    Splats of equal depth keep their order. width: image width in pixels.
     """
     count = splats.shape[0]
     order = np.empty(count, np.int32)
@@ -83,7 +83,7 @@ def _by_depth(splats, top, bottom, width):
 
 @kernel
 def _touching_rows(order, splats, top, bottom, out):
-    """Copy indices in `order` of splats that touch rows [top, bottom) to `out`; return how many."""
+    """Write those indices of `order` whose splats touch rows [top, bottom) to `out`; count them."""
     n = 0
     for i in range(order.shape[0]):
         g = order[i]
@@ -97,9 +97,11 @@ def _touching_rows(order, splats, top, bottom, out):
 
 @kernel
 def _open(state, live, rows, columns):
-    """Initialise the buffer `state` of a tile: block 0 to 1, block 1 to 1 inside the image, rest 0.
+    """Initialise `state`, the buffer of a tile (see the module), and `live`, its rows.
 
-    live: becomes True for each tile row in the image. rows, columns: part of the tile in the image.
+    Block 0 becomes 1, block 1 becomes 1 inside the image, all else 0. live: becomes True for each
+    tile row inside the image. rows, columns: numbers of the tile's rows and columns inside the
+    image.
     """
     state[:] = _ZERO
     state.reshape(TILE, _ROW)[:rows, : TILE + columns] = _ONE
@@ -109,7 +111,7 @@ def _open(state, live, rows, columns):
 
 @kernel
 def _close_rows(state, live):
-    """Set live[row] to False for rows in which no pixel takes more splats; return `live.any()`."""
+    """Set live[row] to False if no pixel of the row takes more splats; return `live.any()`."""
     for row in range(TILE):
         live[row] = state[row * _ROW + TILE :][:TILE].any()
     return live.any()
@@ -117,11 +119,12 @@ def _close_rows(state, live):
 
 @kernel
 def _take(state, i, dx, power_of, opacity, options):
-    """Let a splat cover the pixel at offset `i` of the buffer `state`, at distance dx from it.
+    """Blend a splat into the pixel at offset `i` of the buffer `state`.
 
-    Alpha is opacity * 2^power with power = (quadratic dx + linear) dx + constant. Returns alpha
-    before its limits, alpha, the transmittance before the splat, and the splat's weight. options:
-    alpha_min, alpha_cap, transmittance_min.
+    Alpha is opacity * 2^power with power = (quadratic dx + linear) dx + constant, where dx is the
+    distance of the pixel from the splat in x. power_of: (linear, quadratic, constant). Returns
+    alpha before its limits, alpha, the transmittance before the splat, and the splat's weight.
+    options: alpha_min, alpha_cap, transmittance_min.
     """
     linear, quadratic, constant = power_of
     alpha_min, alpha_cap, transmittance_min = options
@@ -142,7 +145,7 @@ def _take(state, i, dx, power_of, opacity, options):
 def _blend_row(state, base, dx0, power_of, look, options):
     """Blend a splat into one row of a tile, at offset `base` of the buffer `state`.
 
-    dx0: distance of the first lane from the splat. look: opacity, r, g, b, depth.
+    dx0: distance of the row's first pixel from the splat in x. look: opacity, r, g, b, depth.
     """
     opacity, r, g, b, z = look
     for lane in range(_LANES):
@@ -157,7 +160,7 @@ def _blend_row(state, base, dx0, power_of, look, options):
 
 @kernel
 def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
-    """Repeat `_blend_row` and add the splat's gradients to the 10 blocks of lanes in `totals`.
+    """Repeat `_blend_row` and add the splat's gradients to `totals`, 10 blocks of 16 pixels.
 
     The blocks are h, h dx, h dy, h dx dx, h dx dy, h dy dy, where h is the gradient of the power to
     base e; then the gradients of depth, r, g, b. dx, dy: distance of the pixel from the splat.
@@ -193,7 +196,7 @@ def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
 
 @kernel
 def _add_gradients(totals, xx, xy, yy, opacity, out):
-    """Sum `totals` of `_backward_row` over lanes and add one splat's gradients to `out` (10,).
+    """Sum `totals` of `_backward_row` over its pixels and add the splat's gradients to `out` (10,).
 
     Order of `out`: u, v, conic xx, xy, yy, depth, opacity, r, g, b.
     """
@@ -218,10 +221,10 @@ def _add_gradients(totals, xx, xy, yy, opacity, out):
 def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
     """Write what `_backward_row` needs of a tile to blocks 2 to 8 of the buffer `state`.
 
-    Block 2 gets the sum of w_j v_j over all splats j (symbols: see the module), 3 to 6 the
-    gradients `slopes` of the first four sums, 7 the gradient of the sum of w, 8 the pixel's depth.
-    Depths z enter v as z minus the pixel's depth; this keeps the digits of gradients at nearly
-    transparent pixels, where large terms would otherwise cancel in float32.
+    The module explains the symbols. Block 2 gets the sum of w_j v_j over all splats j, blocks 3 to
+    6 the gradients `slopes` of the first four sums, block 7 the gradient of the sum of w, block 8
+    the pixel's depth. In v, z is replaced by z minus the pixel's depth; this keeps the digits of
+    gradients at nearly transparent pixels, where large terms would otherwise cancel in float32.
     """
     for row in range(rows):
         for lane in range(columns):
@@ -245,7 +248,7 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
 def _rows_within(above, reach):
     """Return the first and last row of a tile whose pixel centres lie within `reach` of a splat.
 
-    above: distance from the first row's pixel centres down to the splat, in pixels.
+    above: distance in pixels from the pixel centres of the tile's first row down to the splat.
     """
     first = max(0, int(np.ceil(above - reach)))
     last = min(TILE - 1, int(np.floor(above + reach)))
@@ -260,10 +263,11 @@ def _store_sums(state, sums, y0, x0, rows, columns):
 
 @kernel
 def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
-    """Blend all splats (G, 9) of one image in the tile rows from tile_rows[0] up to tile_rows[1].
+    """Blend all G splats (G, 9) of one image in the tile rows [tile_rows[0], tile_rows[1]).
 
-    If `backward` is false, it fills sums (5, H, W). If true, it reads them and adds the gradients
-    of the splats to out (G, 10). slopes: gradients of `sums`. options: see `_take`.
+    If `backward` is false, this fills sums (5, H, W). If `backward` is true, it reads the sums and
+    adds the gradients of the splats to out (G, 10). slopes: gradients of `sums`. options: see
+    `_take`.
     """
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)

@@ -1,4 +1,4 @@
-"""Numba kernel of `qgs.similarity` for the sum of SSIM over a plane, and its gradient.
+"""Numba kernel of `qgs.similarity` for the sum of SSIM over an image plane, and its gradient.
 
 The formula is that of `qgs.similarity.similarity_map`; tests compare values and gradients.
 """
@@ -15,10 +15,11 @@ _TWO = np.float32(2)
 
 @kernel
 def _windowed(planes, row, weights, framed, out):
-    """Write the means over windows around each pixel of one row of `planes` to `out` (N, W).
+    """Write weighted means over windows around each pixel of one image row to `out` (N, W).
 
-    planes: (N, H, W), zero outside. weights: weights of pixels at distances 0 to _REACH from the
-    window's centre. framed: working memory (N, W + 2 _REACH).
+    planes: N planes (N, H, W), taken as zero outside. row: number of the image row. weights:
+        weights of pixels at distances 0 to _REACH from the window's centre. framed: working memory
+        (N, W + 2 _REACH).
     """
     parts, height, width = planes.shape
     framed[:] = _ZERO
@@ -39,8 +40,8 @@ def _windowed(planes, row, weights, framed, out):
 def similarity_sum(moments, weights, stabilisers, slope):
     """Return the sum of SSIM of planes x and y over all pixels; write its gradient in x to `slope`.
 
-    moments: (4, H, W) with x, y, x^2 + y^2 and x y. weights: see `_windowed`. stabilisers: the
-    constants C1 and C2 of SSIM. slope: (H, W).
+    moments: (4, H, W) with x, y, x^2 + y^2 and x y. weights: window weights as in `_windowed`.
+        stabilisers: the constants C1 and C2 of SSIM. slope: (H, W).
     """
     (_, height, width), (c1, c2), total = moments.shape, stabilisers, 0.0
     framed = np.empty((4, width + 2 * _REACH), np.float32)

@@ -1,4 +1,4 @@
-"""Losses that training minimises."""
+"""Losses that training minimises: on images, masks, depth, opacity and visibility."""
 
 from qgs.losses.depth import DepthSurface
 from qgs.losses.photometric import Mask, Opacity, Photometric, mean_of_gaussians

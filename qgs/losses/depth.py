@@ -1,4 +1,4 @@
-"""`qgs/depth_surface`, a loss that moves Gaussians to the surface of depth maps."""
+"""The loss `qgs/depth_surface`, which moves Gaussians to the surface that depth maps show."""
 
 import torch
 import torch.nn.functional as F
@@ -16,10 +16,10 @@ class DepthSurface(Loss):
     """Smooth L1 between the camera-frame z of each Gaussian's centre and the depth map.
 
     The loss uses all target views with depth maps (`Views.depths`), and all input views with depth
-    maps if the option `inputs` is true. Each centre counts with its smallest error over the views.
-    So a centre on a surface that any view shows has the loss 0, even if other views do not see this
-    surface. A view that is both target and input (`training.judge_inputs`) counts once. A batch
-    without depth maps has the loss 0; the first such batch logs a warning.
+    maps if the option `inputs` is true. The error of a centre is the smallest of its errors over
+    the views. So a centre on a surface that any view shows has error 0, even if the surface is
+    hidden in other views. A view that is both target and input (`training.judge_inputs`) counts
+    once. A batch without depth maps has loss 0; the first such batch logs a warning.
     """
 
     name = "depth_surface"
@@ -30,9 +30,9 @@ class DepthSurface(Loss):
         beta: float = Field(default=0.05, gt=0)
         """Error in world units at which the loss changes from quadratic to linear."""
         near: float = Field(default=0.025, gt=0)
-        """A view ignores Gaussians whose camera-frame z is at or below this, in world units."""
+        """Camera-frame z, in world units, at or below which a view ignores Gaussians."""
         inputs: bool = True
-        """Use the depth maps of input views in addition to those of target views."""
+        """Use the depth maps of input views, in addition to those of target views."""
 
     config: Config
 
@@ -69,11 +69,12 @@ def surface_errors(
     beta: float,
     near: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return the smooth L1 error in z of each point in each view, and its validity, (B, V, G).
+    """Return smooth L1 errors (B, V, G) in z of points in views, and which of the errors are valid.
 
-    An error is valid if the point lies beyond `near` and inside the image, and the depth of its
-    pixel is known. The gradient treats the pixel as fixed, so it moves the point along the optical
-    axis of the view. beta: error at which the loss changes from quadratic to linear.
+    B, V and G are scenes, views and points. An error is valid if the point lies beyond `near` and
+    inside the image, and the depth of its pixel is known. The gradient treats the pixel as fixed,
+    so it moves the point along the optical axis of the view. beta: error at which the loss changes
+    from quadratic to linear.
     """
     assert views.depths is not None
     local = to_camera(points, views.cameras)  # (B, V, G, 3)

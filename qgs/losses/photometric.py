@@ -13,7 +13,10 @@ from qgs.types import LayerPrediction, Rendering, Views
 
 
 class Photometric(Loss):
-    """Photometric loss: mse_weight * MSE + l1_weight * L1 + ssim_weight * (1 - SSIM) / 2."""
+    """Photometric loss: mse_weight * MSE + l1_weight * L1 + ssim_weight * (1 - SSIM) / 2.
+
+    It compares renderings with the images of the target views.
+    """
 
     name = "photometric"
     scheduled = frozenset({"weight", "mse_weight", "l1_weight", "ssim_weight"})
@@ -21,15 +24,15 @@ class Photometric(Loss):
 
     class Config(Loss.Config):
         mse_weight: float = Field(default=1.0, ge=0)
-        """Factor of the mean squared error. 0 drops the term."""
+        """Factor of the mean squared error. With 0, this term is not computed."""
         l1_weight: float = Field(default=0.0, ge=0)
-        """Factor of the mean absolute error (TokenGS 2026.6: 0.8, without MSE). 0 drops the
-        term."""
+        """Factor of the mean absolute error (TokenGS 2026.6: 0.8, without MSE). With 0, this term
+        is not computed."""
         ssim_weight: float = Field(default=0.2, ge=0)
-        """Factor of (1 - SSIM) / 2. 0 drops the term."""
+        """Factor of (1 - SSIM) / 2. With 0, this term is not computed."""
         padding: Padding = "same"
-        """Treatment of image borders in SSIM. "same" pads images with zeros, as the TokenGS and
-        LocusGS releases do. "valid" uses only windows that lie inside the image."""
+        """How SSIM handles image borders. "same" pads images with zeros, as the TokenGS and LocusGS
+        releases do. "valid" uses only windows that lie inside the image."""
 
     config: Config
 
@@ -46,7 +49,10 @@ class Photometric(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
-        """Return the terms `mse`, `l1`, `ssim`; raise ValueError for images too small for SSIM."""
+        """Return the weighted terms `mse`, `l1` and `ssim`, without those whose factor is 0.
+
+        Raises ValueError for images too small for SSIM.
+        """
         terms = {}
         if self.config.mse_weight:
             terms["mse"] = self.config.mse_weight * mean_squared_error(rendering.rgb, target.images)
@@ -67,7 +73,7 @@ class Opacity(Loss):
 
     class Config(Loss.Config):
         weight: float = Field(default=0.1, ge=0)
-        """Factor of this loss in the objective. 0 skips the loss."""
+        """Factor of this loss in the objective. With 0, the loss is not computed."""
         eps: float = Field(default=1e-6, gt=0)
         """Number added to the opacity, so that the logarithm stays finite (TokenGS release)."""
 
@@ -82,7 +88,7 @@ class Opacity(Loss):
 
 
 class Mask(Loss):
-    """Mask loss, the mean of (alpha - mask)^2 over pixels.
+    """Mask loss, the mean of (alpha - mask)^2 over pixels, with alpha of the rendering.
 
     The TokenGS and LocusGS releases have this loss; their published recipes do not use it.
     """
@@ -92,17 +98,17 @@ class Mask(Loss):
 
     class Config(Loss.Config):
         weight: float = Field(default=0.5, ge=0)
-        """Factor of this loss in the objective. 0 skips the loss."""
+        """Factor of this loss in the objective. With 0, the loss is not computed."""
 
     config: Config
 
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """Return the loss; raise ValueError if the target views have no masks."""
+        """Return the mask loss; raise ValueError if the target views have no masks."""
         if target.masks is None:
             raise ValueError(
-                "the loss qgs/mask needs views with masks, but these have none; "
+                "the loss qgs/mask needs views with masks, but these target views have none; "
                 "choose data with masks, or remove the loss from the recipe"
             )
         return mean_squared_error(rendering.alpha, target.masks)
@@ -111,7 +117,7 @@ class Mask(Loss):
 def too_small(context: RecipeContext, side: int, option: str, measure: str) -> Iterator[Problem]:
     """Yield a problem of `option` if the data's images have a side shorter than `side` pixels.
 
-    measure: what needs such images, as the subject of the message.
+    measure: name of what needs images of this size, the subject of the message.
     """
     if context.image_size and min(context.image_size) < side:
         given = "{} x {} (H x W)".format(*context.image_size)
@@ -126,9 +132,9 @@ def mean_squared_error(images: Tensor, truth: Tensor) -> Tensor:
 
 
 def mean_of_gaussians(values: Tensor, prediction: LayerPrediction) -> Tensor:
-    """Average values (B, G) over the Gaussians of a scene, then over scenes (0-d).
+    """Average values (B, G) over the G Gaussians of a scene, then over B scenes, to a 0-d tensor.
 
-    Gaussians of empty places (`QueryState.mask`) do not count.
+    Gaussians of padding queries (`QueryState.mask`) do not count.
     """
     values = at_least_float32(values)
     mask = prediction.state.mask

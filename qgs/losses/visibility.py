@@ -1,4 +1,4 @@
-"""`qgs/visibility`, a loss that moves Gaussians outside of all target views towards the nearest."""
+"""The loss `qgs/visibility`, which moves Gaussians that no target view shows towards a view."""
 
 from collections.abc import Iterable, Iterator
 from typing import Literal
@@ -24,14 +24,14 @@ class VisibilityOptions(Loss.Config):
     """Options of visibility losses.
 
     With `behind_camera` "invisible", a point behind a camera has no gradient from this camera, like
-    every clamped point. Views that have the point in front of them still move it.
+    every point whose loss is clamped. Views that have the point in front of them still move it.
     """
 
     clamp: float | None = Field(default=1.0, gt=0)
-    """Upper bound of a point's loss. The unit is half an image side (TokenGS, LocusGS releases: 1).
-    null: no bound."""
+    """Upper bound of a point's loss. The unit is half an image side (TokenGS and LocusGS releases:
+    1). null: no bound."""
     near: float = Field(default=0.025, gt=0)
-    """Points whose camera-frame z is at or below this, in world units, are behind the camera."""
+    """Camera-frame z, in world units, at or below which points are behind the camera."""
     behind_camera: Literal["published", "invisible"] = "published"
     """Rule for points behind a camera. "published" projects them like other points, mirrored, so
     they may count as visible, as in the TokenGS and LocusGS releases. "invisible" gives them the
@@ -43,7 +43,7 @@ class VisibilityOptions(Loss.Config):
         return self.near if self.behind_camera == "invisible" else None
 
     def conflicts(self) -> Iterator[Problem]:
-        """Yield the problems of options that contradict each other or have no effect."""
+        """Yield a problem for each option that contradicts another option or has no effect."""
         if self.behind_camera == "published":
             yield from without_effect(self, ("near",), "`behind_camera` is published")
         elif self.clamp is None:
@@ -56,9 +56,9 @@ class VisibilityOptions(Loss.Config):
 
 
 class Visibility(Loss):
-    """Visibility loss: mean over all Gaussians of the distance to the nearest target view's image.
+    """Visibility loss: mean distance of the Gaussians to the image of their nearest target view.
 
-    See `view_visibility` (TokenGS release).
+    A Gaussian that a target view shows has distance 0; see `view_visibility` (TokenGS release).
     """
 
     name = "visibility"
@@ -66,8 +66,8 @@ class Visibility(Loss):
 
     class Config(VisibilityOptions):
         infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
-        """Pixel coordinate of points at depth 0 beside the optical axis, negative on the left or
-        above. It has no effect if `clamp` is set."""
+        """Pixel coordinate of points at depth 0 beside the optical axis, with a minus on the left
+        or above. It has no effect if `clamp` is set."""
 
     config: Config
 
@@ -100,20 +100,21 @@ def view_visibility(
     z_guard: float | None = None,
     infinite_pixel: float = INFINITE_PIXEL,
 ) -> Tensor:
-    """Return the distance (B, P) of each point to the nearest view's image; 0 if a view sees it.
+    """Return the distance (B, P) of each point to the nearest view's image; 0 inside an image.
 
     The distance to a view's image is relu(|u| - 1) + relu(|v| - 1), with the point's pixel u, v
     scaled to [-1, 1] over the image. The result is the minimum over views, at most `clamp`
     (TokenGS, LocusGS releases).
 
-    points: (B, P, 3) world. cameras: (B, V).
+    points: P world points per scene, (B, P, 3). cameras: (B, V).
+    clamp: largest result; None sets no limit.
     behind: camera-frame z at or below which a point is infinitely far from a view's image. None:
         points behind the camera are projected like those in front.
     z_guard: a camera-frame z between -z_guard and z_guard is replaced by z_guard (LocusGS anchors).
         None keeps z; then x / 0 becomes `infinite_pixel`, and 0 / 0 counts as visible (TokenGS).
 
-    The gradient uses only the nearest view (the first one of equally near views), so that memory
-    does not grow with the number of views. Values and gradients are finite, unless `behind` is set
+    The gradient uses only the nearest view (the first of equally near views), so that memory does
+    not grow with the number of views. Values and gradients are finite, unless `behind` is set
     without `clamp`.
     """
     options = (behind, z_guard, infinite_pixel)
@@ -135,10 +136,10 @@ def _image_excess(
     z_guard: float | None,
     infinite_pixel: float,
 ) -> Tensor:
-    """Compute the distance of world points (B, P, 3) to a camera's image, see `view_visibility`.
+    """Compute the distance (B, P) of P world points (B, P, 3) to a camera's image.
 
-    cameras: (B, P), one for each point, or (B, 1), one for all points of a scene; both give bitwise
-    equal results (B, P).
+    `view_visibility` defines the distance. cameras: (B, P), one for each point, or (B, 1), one for
+    all points of a scene; both give bitwise equal results.
     """
     # By sums, not a matrix product: one point and many must give the same bits.
     from_camera = points - cameras.c2w[..., :3, 3]

@@ -1,4 +1,4 @@
-"""Baselines that a model must beat: a copied input view, and the mean colour."""
+"""Baselines that a model must beat: a copy of an input view, and the mean colour."""
 
 import torch
 from torch import Tensor
@@ -9,9 +9,9 @@ from qgs.types import Cameras, Views
 
 
 def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
-    """Return the input image with the least `pose_distance` to each target: (B, T, 3, H, W).
+    """Return for each target the input image whose pose is nearest: (B, T, 3, H, W).
 
-    targets: cameras (B, T).
+    targets: T cameras per scene, (B, T). `pose_distance` defines the distance.
     """
     index = pose_distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
     scene = torch.arange(index.shape[0], device=index.device)[:, None]
@@ -19,7 +19,7 @@ def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
 
 
 def mean_colour(inputs: Views, targets: Cameras) -> Tensor:
-    """Return images (B, T, 3, H, W) filled with the mean RGB of the scene's input views."""
+    """Return T images per scene (B, T, 3, H, W), filled with the mean RGB of its input views."""
     colour = inputs.images.mean((1, 3, 4))
     return colour[:, None, :, None, None].expand(-1, targets.shape[1], -1, *targets.size)
 
@@ -33,8 +33,8 @@ def worse_than_nearest(
 ) -> str:
     """Return a remark if the baseline `nearest_input` scores better than the model, else "".
 
-    model, nearest: values of the metric in `column`, for model and baseline. remedy: advice at the
-    end of the remark.
+    model, nearest: values of the metric of `column`, for the model and for the baseline. remedy:
+        advice at the end of the remark.
     """
     if not column.beats(nearest, model):
         return ""
@@ -46,10 +46,11 @@ def worse_than_nearest(
 
 @full_precision
 def pose_distance(inputs: Tensor, targets: Tensor) -> Tensor:
-    """Return distances (B, T, V) between input poses (B, V, 4, 4) and target poses (B, T, 4, 4).
+    """Return distances (B, T, V) from T target poses to V input poses of each scene.
 
-    A distance is the distance between camera centres, divided by the spread of the inputs' centres,
-    plus the angle between optical axes in radians.
+    A distance is the distance between camera centres, divided by the largest distance between input
+    cameras, plus the angle between optical axes in radians. inputs: (B, V, 4, 4). targets: (B, T,
+    4, 4).
     """
     centres = inputs[..., :3, 3]
     seen_from = targets[..., :3, 3]

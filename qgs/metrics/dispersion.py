@@ -1,4 +1,4 @@
-"""Dispersion, a metric for the spatial scatter of each query's Gaussians."""
+"""The metric `qgs/dispersion`, the spatial scatter of each query's Gaussians."""
 
 from collections.abc import Mapping
 
@@ -13,7 +13,7 @@ OPACITY_USED = 1 / 255
 
 
 class Dispersion(Metric):
-    """Dispersion, the distance of Gaussians to the centroid of their query's Gaussians.
+    """Distance of Gaussians to the centroid of all Gaussians of the same query.
 
     A small value means that each query covers one region. LocusGS publishes the mean. A few far
     Gaussians change the mean much, but not the median.
@@ -24,13 +24,13 @@ class Dispersion(Metric):
     needs = ("gaussians",)
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the columns of mean and median, both in world units."""
+        """Return a column for the mean distance and one for the median, both in world units."""
         # Papers print the mean, which depends on a few far Gaussians; the median shows the rest.
         headings = {"mean": "dispersion mean", "median": "dispersion med."}
         return {key: Column(h, "lower", unit="world units") for key, h in headings.items()}
 
     def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
-        """Return the distances (1, G), whose mean is the first value, and their median (1,)."""
+        """Return the distances (1, G), of which "mean" is the average, and their "median" (1,)."""
         assert given.gaussians is not None
         distances = token_dispersion(given.gaussians.means, given.gaussians_per_query)
         return {"mean": distances, "median": torch.quantile(distances, 0.5, dim=-1)}
@@ -40,12 +40,13 @@ class Dispersion(Metric):
 def token_dispersion(means: Tensor, gaussians_per_query: int) -> Tensor:
     """Return the distance of each Gaussian to its query's centroid, in world units.
 
-    means: (B, N * K, 3) ordered query by query -> (B, N * K).
-    Raises ValueError if K does not divide the number of Gaussians.
+    means: (B, N * K, 3) for B scenes, N queries and K Gaussians per query, ordered query by query
+        -> (B, N * K). Raises ValueError if K does not divide the number of Gaussians.
     """
     if means.shape[-2] % gaussians_per_query:
         raise ValueError(
-            f"{means.shape[-2]} Gaussians cannot be split into {gaussians_per_query} for each query"
+            f"{means.shape[-2]} Gaussians are no multiple of {gaussians_per_query}, the number of "
+            "Gaussians per query"
         )
     tokens = means.unflatten(-2, (-1, gaussians_per_query))
     return (tokens - tokens.mean(-2, keepdim=True)).norm(dim=-1).flatten(-2)

@@ -26,12 +26,12 @@ class Psnr(Metric):
     column = Column("PSNR", "higher", digits=2, unit="dB")
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return the PSNR in dB of each view, (1, T)."""
+        """Return the PSNR in dB of each of the T views, (1, T)."""
         return psnr(given.images, given.targets.images)
 
 
 class Ssim(Metric):
-    """SSIM, the structural similarity of each view and its photo (Wang et al. 2004).
+    """SSIM, the structural similarity of each rendered view to its photo (Wang et al. 2004).
 
     Higher is better; 1 means equal images.
     """
@@ -40,28 +40,32 @@ class Ssim(Metric):
     definition = "scikit-image: Gaussian window of 11, sigma 1.5, data range 1, borders left out"
 
     class Config(ComponentConfig):
-        """Options of SSIM."""
+        """Options of the metric `qgs/ssim`."""
 
         covariance: SsimCovariance = "population"
-        """Kind of variances and covariance. "population" follows Wang et al. 2004. "sample" is
-        scikit-image's default, which the evaluation of pixelSplat and its successors uses."""
+        """Kind of variances and covariance. "population" divides by the number of pixels, as in
+        Wang et al. 2004. "sample" divides by this number less 1; it is scikit-image's default,
+        which the evaluation of pixelSplat and its successors uses."""
 
     config: Config
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the column; its heading names the covariance unless it is the default."""
+        """Return the column; its heading names the kind of covariance unless it is the default."""
         covariance = self.config.covariance
         form = "" if covariance == "population" else f" ({covariance} covariance)"
         return {"": Column(f"SSIM{form}", "higher")}
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return the SSIM of each view, (1, T); raise ValueError if images are below the window."""
+        """Return the SSIM of each of the T views, (1, T).
+
+        Raises ValueError if images are smaller than the window of SSIM.
+        """
         return ssim(given.images, given.targets.images, self.config.covariance)
 
 
 @full_precision
 def psnr(images: Tensor, truth: Tensor) -> Tensor:
-    """Compute the PSNR in dB of images (..., 3, H, W), clipped to [0, 1] first, -> (...)."""
+    """Compute the PSNR in dB of images (..., 3, H, W) after clipping to [0, 1], -> (...)."""
     # Clipped, as a saved picture would be.
     error = (images.clamp(0, 1) - truth.clamp(0, 1)).square().mean((-3, -2, -1))
     return -10 * error.clamp_min(_MSE_FLOOR).log10()
@@ -69,13 +73,13 @@ def psnr(images: Tensor, truth: Tensor) -> Tensor:
 
 @full_precision
 def ssim(images: Tensor, truth: Tensor, covariance: SsimCovariance = "population") -> Tensor:
-    """Compute the structural similarity of images (..., 3, H, W), clipped to [0, 1], -> (...).
+    """Compute the SSIM of images (..., 3, H, W) after clipping to [0, 1], -> (...).
 
-    Equals scikit-image's `structural_similarity` with gaussian_weights, sigma 1.5 and data_range 1,
-    which leaves out the 5 pixels at the border. Covariance "sample" stands for its option
-    use_sample_covariance: variances of the N = 11 * 11 pixels of a window are multiplied by
-    N / (N - 1). The computation is in float64, because variances of flat images are small
-    differences of squares.
+    The result equals scikit-image's `structural_similarity` with gaussian_weights, sigma 1.5 and
+    data_range 1, which leaves out the 5 pixels at the border. Covariance "sample" stands for
+    scikit-image's use_sample_covariance: variances of the N = 11 * 11 pixels of a window are
+    multiplied by N / (N - 1). The computation is in float64, because variances of flat images are
+    small differences of squares.
     Raises ValueError if a side is shorter than the window of 11 pixels.
     """
     x, y = (image.clamp(0, 1).double() for image in (images, truth))
