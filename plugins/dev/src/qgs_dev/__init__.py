@@ -7,7 +7,7 @@
     def test_contract(run):
         run.check()
 
-`qgs check-plugin sightline` runs the same checks and prints a report.
+`qgs check-plugin sightline` runs the same checks of the plugin `sightline` and prints a report.
 """
 
 from importlib import import_module

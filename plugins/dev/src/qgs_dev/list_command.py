@@ -42,7 +42,10 @@ def schema(
         Path | None, typer.Option(help="File to write. Default: print to standard output.")
     ] = None,
 ) -> None:
-    """Write the JSON Schema of recipes with all installed components; imports every plugin."""
+    """Write the JSON Schema of recipes with all installed components.
+
+    The command imports every installed plugin.
+    """
     from qgs.files import write_text
     from qgs.recipe.registry import load_usable_plugins
     from qgs_dev.schema import recipe_schema

@@ -184,7 +184,10 @@ def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float
 
 
 def expect_finite(tree: Any, where: str) -> None:
-    """Raise ContractError if a tensor of `tree` contains NaN or infinity."""
+    """Raise ContractError if a tensor of `tree` contains NaN or infinity.
+
+    where: end of the message.
+    """
     broken = [name for name, tensor in floating(tree).items() if not tensor.isfinite().all()]
     expect_none(broken, f"not finite {where}")
 

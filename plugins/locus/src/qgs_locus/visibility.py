@@ -1,4 +1,4 @@
-"""`locus/anchor_visibility`: loss that moves anchors outside of all target views to the nearest."""
+"""`locus/anchor_visibility`: loss that moves anchors outside of all target views inwards."""
 
 from collections.abc import Iterable
 
@@ -26,8 +26,8 @@ class AnchorVisibility(Loss):
         weight: float = Field(default=0.1, ge=0)
         """Weight of this loss in the objective."""
         z_guard: float = Field(default=1e-3, gt=0)
-        """World units: a z between -z_guard and z_guard is replaced by z_guard in the perspective
-        division."""
+        """A camera-frame z between -z_guard and z_guard, world units, counts as z_guard in the
+        perspective division."""
 
     config: Config
 

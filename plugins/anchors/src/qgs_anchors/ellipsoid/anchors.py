@@ -55,7 +55,10 @@ class EllipsoidQueries(LearnedQueries):
         return {**CENTER_FIELD, **shape_fields(config)}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Leave rotations out of weight decay: the length of a quaternion has no effect."""
+        """Return False for rotations: weight decay would only change the lengths of quaternions.
+
+        Lengths have no effect on the result.
+        """
         return name != "rotation" and super().decays(name, parameter)
 
     def start(self, batch_size: int) -> QueryState:

@@ -29,7 +29,7 @@ class EllipsoidRefinement(AnchorRefinement):
 
     @classmethod
     def radius_field(cls, config: Config) -> Fields:
-        """Return the field of the three raw radii."""
+        """Return the state field of the three raw radii (B, N, 3)."""
         return radii_field(config)
 
     @classmethod

@@ -26,7 +26,7 @@ untrained models with 512 points and 4 photos in 32 validation rooms."""
 def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
     """Return the centres (rows * columns, 2) of a photo's patches, row by row.
 
-    They are x and y, as shares of the photo's width and height.
+    Centres are x and y, as shares of the photo's width and height.
     """
     y, x = ((torch.arange(n, device=device) + 0.5) / n for n in (rows, columns))
     return torch.cartesian_prod(y, x).flip(-1)
@@ -88,7 +88,7 @@ def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tens
 
 
 def side_of(count: int, views: int, size: tuple[int, int]) -> float:
-    """Return the side in pixels of `count` equal squares with the area of all photos together."""
+    """Return the side in pixels of `count` equal squares with the total area of all photos."""
     return math.sqrt(views * math.prod(size) / count)
 
 
@@ -117,7 +117,7 @@ def aspect_of(count: int) -> float:
 def cells(count: int, rows: int | Tensor, like: Tensor) -> Tensor:
     """Return the centres (K, 2) of K = `count` cells of a unit square around the origin.
 
-    They are x and y, in `rows` rows, row by row.
+    Centres are x and y, row by row, in `rows` rows.
     """
     index_K = torch.arange(count, device=like.device)
     # A tensor: torch.compile would make a graph for each number that Python divides.

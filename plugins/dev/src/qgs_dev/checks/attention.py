@@ -59,8 +59,9 @@ def check_masked_queries_are_not_read(case: Case) -> None:
 def check_explanation_is_a_softmax(case: Case) -> None:
     """Require that weights from `explain` are the softmax of content plus geometry over tokens.
 
-    Content must be (B, h, Q, T) for B scenes, h heads, the Q requested queries in their order and T
-    tokens. Geometry must be (B, 1, Q, T) or (B, h, Q, T), with -inf where a token is hidden.
+    Content and geometry are the two parts of the logits. Content must be (B, h, Q, T) for B scenes,
+    h heads, the Q requested queries in their order and T tokens. Geometry must be (B, 1, Q, T) or
+    (B, h, Q, T), with -inf where a token is hidden.
     """
     trial = Trial(case)
     given = explanation(trial.module, trial.inputs)

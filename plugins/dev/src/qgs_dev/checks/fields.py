@@ -205,7 +205,7 @@ def _refusal(case: Case, given: Fields) -> str:
 
 
 def resolved(case: Case, given: Fields) -> Recipe:
-    """Return a small recipe with the component of `case` and queries that provide `given`."""
+    """Return a small recipe with the component of `case` and queries with the fields `given`."""
     slot = case.slot
     # Thousands of queries would take seconds to render and test nothing more.
     config = (case.with_at_most(count=6) if slot == "queries" else case).config

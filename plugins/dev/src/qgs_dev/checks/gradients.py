@@ -51,9 +51,10 @@ SEPARATE = 200
 def check_gradients_reach_inputs(case: Case) -> None:
     """Require a gradient for each input that the slot must read and for each required field.
 
-    If a component stops a gradient on purpose, for example the gradient of reference points, list
-    this check and `gradients_match_differences` as expected failures. A component for ablations,
-    which requires no fields and returns only zeros, passes.
+    Results must have a gradient with respect to these inputs. If a component stops a gradient on
+    purpose, for example the gradient of reference points, list this check and
+    `gradients_match_differences` as expected failures. A component for ablations, which requires no
+    fields and returns only zeros, passes.
     """
     trial = Trial(case)
     missing = {*_read(case)}
@@ -346,7 +347,7 @@ def check_float64_stays_float64(case: Case) -> None:
 
 
 class LearnedLayers(TorchFunctionMode):
-    """Mode that records the outputs of learned layers, or replays recorded ones.
+    """Torch mode that records the outputs of learned layers, or replays recorded ones.
 
     A product counts as a learned layer if all its factors require gradients, as parameters,
     features and values computed from them do.

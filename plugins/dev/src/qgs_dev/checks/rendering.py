@@ -62,7 +62,7 @@ def check_rendering_is_over_the_background(case: Case) -> None:
 
 
 def check_depth_is_expected(case: Case) -> None:
-    """Require that depth is the mean camera-frame z of Gaussians with their blending weights."""
+    """Require that depth is the mean camera-frame z of Gaussians, weighted as in blending."""
     trial = _broad(case, views=2)
     cameras = trial.inputs["cameras"]
     pair, near, far = (trial.inputs["gaussians"][:, at] for at in ([0, -1], [0], [-1]))
@@ -159,7 +159,7 @@ def check_camera_gradients_match_differences(case: Case) -> None:
 
 
 def _broad(case: Case, seed: int = 0, views: int = 1) -> Trial:
-    """Return a trial with V cameras that see broad Gaussians one behind another."""
+    """Return a trial with `views` cameras that see broad Gaussians one behind another."""
     sizes = Sizes(batch=1, queries=3, views=views)
     trial = Trial(case, sizes, seed)
     maker = Maker(case, sizes, seed)

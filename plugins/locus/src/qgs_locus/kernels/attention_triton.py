@@ -154,10 +154,10 @@ def _backward_queries(
     q, k, v, read_q, read_k, g, lse, rowsum, dq, of_bias, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradient of q to `dq`, and that of each head's bias to `of_bias` (B, h, N, F).
+    """Write the gradient of q to `dq`, and the gradient of the bias to `of_bias` (B, h, N, F).
 
-    The latter is with respect to the F numbers of each query. If `dq` or `of_bias` is None, its
-    gradient is not computed.
+    `of_bias` holds the gradient with respect to the F numbers of each query, for each head. If
+    `dq` or `of_bias` is None, its gradient is not computed.
     """
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
