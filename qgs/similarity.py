@@ -23,10 +23,10 @@ Padding: TypeAlias = Literal["same", "valid"]
 def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1.0) -> Tensor:
     """Return the SSIM (Wang et al. 2004, eq. 13) of x and y in a window around every pixel.
 
-    The window is Gaussian. x, y: images (..., H, W) in [0, 1]. padding: "same" pads with zeros, as
-    the TokenGS and LocusGS releases do. "valid" uses only windows inside the image, and raises
-    ValueError for images smaller than a window. correction: factor of the variances and the
-    covariance.
+    The window is Gaussian. x, y: images (..., H, W) in [0, 1].
+    padding: "same" pads with zeros, as the TokenGS and LocusGS releases do. "valid" uses only
+        windows inside the image, and raises ValueError for images smaller than a window.
+    correction: factor by which variances and covariance are multiplied.
     """
     height, width = x.shape[-2:]
     if padding == "valid" and min(height, width) < WINDOW:
@@ -49,7 +49,7 @@ def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1
 
 @full_precision
 def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
-    """Return the mean of `similarity_map` (0-d); on a CPU a faster kernel computes most cases."""
+    """Return the mean of `similarity_map`, 0-d; most cases on a CPU use a faster kernel."""
     # Subclasses that torch uses to count or trace hold no numbers and cannot become arrays.
     plain = type(images) is type(truth) is Tensor and images.is_cpu
     single = images.dtype == truth.dtype == torch.float32

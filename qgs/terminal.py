@@ -64,7 +64,7 @@ def show_safely() -> None:
 def print_table(
     console: Console, title: str, rows: Sequence[Sequence[str]], **options: Any
 ) -> None:
-    """Print a table whose columns align right, except the first.
+    """Print a table whose first column aligns left and whose other columns align right.
 
     rows: the headers, then the cells of each row. options: arguments of Rich's `Table`.
     """

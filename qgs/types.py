@@ -122,7 +122,7 @@ class Views(TensorContainer):
         return chosen.replace(target_time=self.target_time)
 
     def joined(self, other: Self) -> Self:
-        """Append `other` views of the same scenes; image size and present fields must be equal."""
+        """Append `other` views of the same scenes, which must have equal image size and fields."""
         both = concatenated([x.replace(target_time=None) for x in (self, other)], 1)
         return both.replace(target_time=self.target_time)
 
@@ -188,8 +188,8 @@ class ImageMemory(TensorContainer):
 class QueryState(TensorContainer):
     """The state of every query: features (B, N, D) and named fields (B, N, ...).
 
-    mask: (B, N) bool, for scenes with different numbers of queries; False marks padding. None: no
-        padding. Values of padding are finite, no query reads them, and the Gaussians of padding
+    mask: (B, N) bool, for scenes with different numbers of queries; False marks padding, None means
+        no padding. Values of padding are finite, no query reads them, and the Gaussians of padding
         have opacity 0.
     """
 
@@ -216,7 +216,7 @@ class QueryState(TensorContainer):
         return name in self.fields
 
     def replace(self, **changes: Any) -> Self:
-        """Return a changed copy. `fields` extends its fields and replaces those of equal name."""
+        """Return a changed copy; `fields` adds fields, or replaces fields of equal name."""
         fields = {**self.fields, **changes.pop("fields", {})}
         return super().replace(fields=fields, **changes)
 
@@ -253,8 +253,7 @@ class GaussianAttributes(TensorContainer):
     offsets: (B, N, K, 3) raw, before any activation; a `centers` component turns them into means.
     scales: (B, N, K, 3) positive, world units. quats: (B, N, K, 4) unit, w x y z.
     opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1], even if `sh` is set.
-    sh: (B, N, K, C, 3), see `Gaussians`. features: (B, N, K, F), see `Gaussians`. Either may be
-        None.
+    sh: (B, N, K, C, 3) or None, see `Gaussians`. features: (B, N, K, F) or None, see `Gaussians`.
     """
 
     offsets: Tensor
@@ -302,7 +301,10 @@ class Gaussians(TensorContainer):
         return map_tensors(lambda x: x[index], self)
 
     def most_opaque(self, count: int) -> Self:
-        """Return the `count` most opaque Gaussians of each scene in their order; all if fewer."""
+        """Return the `count` most opaque Gaussians of each scene, in unchanged order.
+
+        Returns all Gaussians if there are fewer.
+        """
         # Sorted again, so that files keep the order of the queries.
         chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
 

@@ -9,7 +9,7 @@ _log = logging.getLogger(__name__)
 
 
 def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
-    """Join the first `most` of `names` to a text, with the number of the rest, "and 3 more".
+    """Join the first `most` of `names` to one text; "and 3 more" counts the names left out.
 
     The text is "" without names. Long names are cut; names with unprintable characters are escaped.
     """
@@ -53,13 +53,13 @@ def warn_once(message: str) -> None:
 
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:
-    """Return the choice that `word` probably misspells; None if there is none."""
+    """Return the choice that `word` probably misspells; None if no choice is similar."""
     # Names of one plug-in share their first part: at 0.6 any is like any other.
     return next(iter(get_close_matches(word, sorted(choices), cutoff=0.65)), None)
 
 
 def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
-    """Return advice for a message: the choice nearest to `word`, or else the list of choices.
+    """Return advice for a message: the choice most similar to `word`, or else the list of choices.
 
     noun: what the choices are, such as "components"; it starts the list.
     """

@@ -225,7 +225,7 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, s
     scene = map_tensors(Tensor.detach, scene).to("cpu")
     if broken := int((~_finite(scene)).sum()):
         raise ValueError(
-            f"{broken} of {scene.count} Gaussians have numbers not finite or too large"
+            f"{broken} of {scene.count} Gaussians have numbers that are not finite or too large"
         )
     return about_origin(replace(scene.to(torch.float32), means=scene.means))
 

@@ -1,4 +1,4 @@
-"""The default components, from TokenGS; one file per slot."""
+"""The default components, which are those of TokenGS, in one file for each slot."""
 
 from qgs.contracts import Component
 from qgs.tokengs.blocks import (

@@ -59,7 +59,7 @@ def merge_heads(x_BhTd: Tensor) -> Tensor:
 def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) -> AttentionWeights:
     """Compute scaled dot-product attention weights in float32.
 
-    bias: added to the logits; (B, 1, Q, T) for all heads, or (B, h, Q, T).
+    bias: added to the logits; (B, 1, Q, T) is the same for all heads, (B, h, Q, T) differs by head.
     """
     # So that logits keep their spread for any width of a head.
     scale = q_BhQd.shape[-1] ** -0.5
@@ -94,7 +94,8 @@ class SelfAttentionCore(nn.Module):
     def forward(self, x_BTD: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the attention output (B, T, D).
 
-        mask: False hides a token: (B, T) from all tokens, or (B, T, T) with a row for each query.
+        mask: bool, where False hides a token. (B, T) hides it from all tokens; in (B, T, T), row i
+            says which tokens token i reads.
         """
         q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
         if mask is not None:
@@ -134,16 +135,16 @@ class CrossAttentionCore(nn.Module):
         self.out_proj = nn.Linear(width, width)
 
     def project(self, x_BND: Tensor) -> Tensor:
-        """Return the normalised queries (B, h, N, d)."""
+        """Project features (B, N, D) to normalised queries (B, h, N, d)."""
         return self.q_norm(split_heads(self.q_proj(self.norm(x_BND)), self.heads))
 
     def forward(
         self, x_BND: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: Tensor | None = None
     ) -> Tensor:
-        """Return (B, N, D).
+        """Return the attention output (B, N, D).
 
-        bias: added to the logits; (B, N, M) for all heads, or (B, h, N, M). B and N may be 1. -inf
-            hides a token.
+        bias: added to the logits; (B, N, M) is the same for all heads, (B, h, N, M) differs by
+            head. B and N may be 1. -inf hides a token.
         """
         # Keys are normalised by their encoder, in float32 under autocast, as these queries are.
         q_BhNd = self.project(x_BND).to(v_BhMd.dtype)

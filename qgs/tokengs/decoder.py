@@ -1,4 +1,4 @@
-"""The default queries and decoder layer (TokenGS), with content-only attention and an MLP."""
+"""The default queries and decoder layer (TokenGS): attention without positions, and an MLP."""
 
 import torch
 from pydantic import Field
@@ -73,7 +73,7 @@ class CrossSelfMlp(DecoderLayer):
 
 
 class ContentCrossAttention(CrossAttention):
-    """Content-only cross-attention: softmax(q k / sqrt(d)) v over all image tokens."""
+    """Cross-attention without positions: softmax(q k / sqrt(d)) v over all image tokens."""
 
     name = "content"
     reads = memory_fields("keys", "values")
@@ -124,7 +124,7 @@ class MlpFeedForward(FeedForward):
 
     class Config(NormConfig):
         ratio: float = Field(default=4.0, ge=1)
-        """Hidden width divided by the model's width; the result is rounded down."""
+        """Hidden width of the MLP as a multiple of the model's width, rounded down."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)

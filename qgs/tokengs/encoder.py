@@ -51,16 +51,16 @@ class EncoderBlock(nn.Module):
 
 
 class PatchViT(PatchEncoder):
-    """Base of ViTs over the tokens of all views; a token is an RGB plus a Plücker embedding.
+    """Base class of ViTs over the patches of all views; a token adds RGB and Plücker embeddings.
 
     Subclasses run the blocks and build the image memory.
     """
 
     class Config(NormConfig, PatchEncoder.Config):
         depth: int = Field(default=3, ge=0, le=256)
-        """Number of ViT blocks. 0: the tokens are the embeddings."""
+        """Number of ViT blocks. With 0, the tokens are the patch embeddings."""
         mlp_ratio: float = Field(default=4.0, ge=1)
-        """Hidden width of the MLPs divided by the model's width; the result is rounded down."""
+        """Hidden width of the MLPs as a multiple of the model's width, rounded down."""
         layer_scale: float = Field(default=0.01, gt=0)
         """Initial value of all LayerScale factors in the encoder."""
 
@@ -79,11 +79,11 @@ class PatchViT(PatchEncoder):
         )
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return weights of a model with smaller patches, enlarged to this component's patches.
+        """Return `learned` weights of smaller patches, enlarged to the patches of this component.
 
-        If the new side is f times the old one, with a whole number f, a new patch gets the token
-        that the old weights give for the patch shrunk by averaging f x f pixels. Otherwise the
-        weights are returned unchanged.
+        If the side of a patch here is f times the learned side, with a whole number f, a patch gets
+        the token that the learned weights give for the patch after averaging f x f pixels.
+        Otherwise the weights are returned unchanged.
         """
         # Its shapes give the size of our patches.
         own = self.state_dict()
@@ -141,7 +141,10 @@ _KERNEL = "_embedding.proj.weight"
 
 
 def _larger(kernel: Tensor, side: int) -> Tensor:
-    """Enlarge a kernel (D, C, p, p) to patches of `side`, if `side` is a multiple of p."""
+    """Enlarge a kernel (D, C, p, p) to patches of `side` pixels.
+
+    If p does not divide `side`, the kernel is returned unchanged.
+    """
     if kernel.ndim != 4 or not kernel.numel() or side % kernel.shape[-1]:
         return kernel
     factor = side // kernel.shape[-1]

@@ -1,4 +1,4 @@
-"""Heads and centers: `qgs/gaussian_head` (TokenGS, LocusGS), `qgs/free`, `qgs/offset`."""
+"""The head `qgs/gaussian_head` (TokenGS, LocusGS), and the centers `qgs/free` and `qgs/offset`."""
 
 import math
 from collections.abc import Iterable
@@ -28,7 +28,10 @@ CHANNELS = (3, 3, 3, 4, 1)
 
 
 class GaussianHead(Head):
-    """Linear head, D -> K * 14, followed by the activations of TokenGS and LocusGS in float32."""
+    """Linear head: a query's D features give 14 numbers for each of its K Gaussians.
+
+    The activations of TokenGS and LocusGS follow, in float32.
+    """
 
     name = "gaussian_head"
 
@@ -40,19 +43,19 @@ class GaussianHead(Head):
         init_std: float = Field(default=0.002, gt=0)
         """Standard deviation of the initial weights (truncated normal)."""
         position_std: float | None = Field(default=None, gt=0)
-        """Standard deviation of the initial weights for positions. null uses `init_std`."""
+        """Standard deviation of the initial weights for positions; null means `init_std`."""
         z_init: float = 0.0
-        """Initial bias of the raw z of positions (default 0; TokenGS 2026.6: log 1.1)."""
+        """Initial bias of the raw z of positions (default 0; TokenGS release 2026.6: log 1.1)."""
         norm: bool = False
-        """Use a LayerNorm before the linear layer. TokenGS and LocusGS have none; it helps small
-        models."""
+        """Use a LayerNorm before the linear layer. TokenGS and LocusGS have none; a LayerNorm helps
+        small models."""
         scale_cap: float = Field(default=0.075, gt=0)
-        """Largest scale in world units. A raw scale of 0 gives 1/e of it."""
+        """Largest scale in world units. A raw scale of 0 gives 1/e of this limit."""
         scale_input_limit: float | None = Field(default=10.0, gt=0)
         """Limit of the absolute value of raw scales before the exponential. null: no limit
         (TokenGS)."""
         opacity_bias: float = -2.0
-        """Number added to the opacity before the sigmoid."""
+        """Number added to the raw opacity before the sigmoid."""
         quat_eps: float = Field(default=1e-4, gt=0)
         """Smallest divisor when raw quaternions are normalised (TokenGS: 1e-12)."""
 
@@ -83,7 +86,7 @@ class GaussianHead(Head):
         return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
 
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
-        """Convert raw channels (B, N, K, 14) to attributes, in float32 or better."""
+        """Convert raw channels (B, N, K, 14) to attributes of Gaussians, in float32 or better."""
         offsets, rgb, scale, rotation, opacity = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         cap = self.config.scale_cap
         limit = self.config.scale_input_limit
@@ -107,9 +110,9 @@ def posact(
 ) -> Tensor:
     """Compute sign(t) (exp|t| - 1), linear near 0 and exponential far out (TokenGS release).
 
-    input_limit: clamps |t|. output_limit: clamps the absolute result. None: no clamp. The LocusGS
-    release uses limits 100 and 1000, the TokenGS release none. The slope is 1 at t = 0, so that a
-    head that starts at zero can learn; it is 0 beyond a limit.
+    input_limit: largest |t|, to which t is clamped. output_limit: largest absolute result. None
+        means no limit. The LocusGS release uses limits 100 and 1000, the TokenGS release none. The
+        slope is 1 at t = 0, so that a head that starts at zero can learn; it is 0 beyond a limit.
     """
     # Exp of a stray output would be infinite.
     if input_limit is not None:

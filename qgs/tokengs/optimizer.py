@@ -18,12 +18,12 @@ Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 class OneCycleAdamW(Optimizer):
     """AdamW with a learning rate that rises and falls along cosines (LocusGS release).
 
-    The rise ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that
-    comes first. `warmup_shape` can make the rise linear. The fall follows the used fraction of the
+    The rise ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that is
+    earlier. `warmup_shape` can make the rise linear. The fall follows the used fraction of the
     steps or of the seconds, whichever is larger. Without a time budget this is torch's `OneCycleLR`
     with pct_start = warmup / steps.
 
-    A schedule for `learning_rate` replaces this cycle. Then warmup and divisors have no effect.
+    A schedule for `learning_rate` replaces rise and fall. Then warmup and divisors have no effect.
     """
 
     name = "adamw"
@@ -47,7 +47,7 @@ class OneCycleAdamW(Optimizer):
         """AdamW's decay rates for the averages of gradients and of their squares."""
         weight_decay: float = Field(default=0.05, ge=0)
         """AdamW's weight decay. It applies to parameters for which `ModelComponent.decays` is true.
-        0: none."""
+        0 means no decay."""
 
     def __init__(self, config: Config, training: TrainingConfig | None = None) -> None:
         super().__init__(config, training)
@@ -74,7 +74,7 @@ class OneCycleAdamW(Optimizer):
         return AdamW(own, lr=self.peak, betas=self.options.betas, fused=True)
 
     def learning_rate(self, step: int, seconds: float) -> float:
-        """Return the learning rate of the recipe's schedule, or without one that of the cycle."""
+        """Return the learning rate of the recipe's schedule; without a schedule, of the cycle."""
         if self.follows_schedule:
             return super().learning_rate(step, seconds)
         # steps - 1: the last step has the last rate, as in torch's OneCycleLR.

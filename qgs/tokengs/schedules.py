@@ -28,7 +28,7 @@ class Constant(Schedule):
 class _Listed(Schedule):
     """Schedule with a list `at` of ascending steps and a list `values` of numbers.
 
-    more: how many more numbers than steps there are.
+    more: by how much `values` must be longer than `at`.
     """
 
     more: ClassVar[int] = 0
@@ -62,7 +62,7 @@ class Steps(_Listed):
     values: tuple[float, ...]
     """The numbers in order, one more than there are steps in `at`."""
     at: tuple[Annotated[int, Field(ge=1)], ...] = Field(min_length=1)
-    """Ascending steps. At each of them the next value starts."""
+    """Ascending training steps. At each of these steps the next value starts."""
 
     def number(self, step: int) -> float:
         return self.values[bisect_right(self.at, step)]
@@ -75,15 +75,15 @@ class Steps(_Listed):
 
 
 class Linear(_Listed):
-    """Interpolation between the numbers `values` at the steps `at`; constant outside of `at`."""
+    """Interpolation between `values` at the steps `at`; outside of these steps, constant."""
 
     schedule: Literal["linear", "cosine"]
-    """Interpolate linearly, or along half cosines, whose slope is 0 at both ends."""
+    """Interpolate linearly, or along half cosines, whose slope is 0 at each step of `at`."""
     values: tuple[float, ...] = Field(min_length=2)
     """The numbers at the steps in `at`. The first one also holds before the first step, the last
     one after the last step."""
     at: tuple[Step, ...]
-    """Ascending steps, one for each of `values`."""
+    """Ascending training steps, one for each of `values`."""
 
     def number(self, step: int) -> float:
         after = bisect_right(self.at, step)

@@ -28,7 +28,7 @@ class LayerSupervision(Supervision):
     class Config(ComponentConfig):
         layers: tuple[int, ...] = Field(default=(12,), min_length=1)
         """Numbers of the supervised decoder layers, ascending. 1 is the first layer. 0 is the
-        initial state, only in a decoder of depth 0."""
+        initial state of the queries, which is valid only in a decoder of depth 0."""
 
         @field_validator("layers")
         @classmethod
@@ -60,7 +60,7 @@ class LayerSupervision(Supervision):
 
 
 class OnePass(Objective):
-    """Objective of one forward pass: the recipe's losses of a prediction from all input views."""
+    """Objective with one forward pass: the recipe's losses on a prediction from all input views."""
 
     name = "one_pass"
 

@@ -27,10 +27,10 @@ ends all others.
 
 
 def make_accelerator(device: str, unread: bool) -> Accelerator:
-    """Return an Accelerator for all processes that a launcher started (DDP), or for a single one.
+    """Return an Accelerator for all processes that a launcher started (DDP), or for one process.
 
-    device: as for `choose_device`. unread: some parameters never get a gradient, so DDP must search
-    for them.
+    device: "cpu" or "cuda". unread: whether some parameters never get a gradient, so that DDP must
+        search for them.
     Raises ValueError if the launcher asks for anything but DDP.
     """
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
@@ -53,7 +53,7 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def choose_device(wanted: str, say: Callable[[str], None] = print) -> str:
-    """Return "cpu" or "cuda" for the name "auto", "cpu" or "cuda".
+    """Return the device "cpu" or "cuda" for `wanted`, which is "auto", "cpu" or "cuda".
 
     "auto" chooses CUDA if a CUDA device exists and gsplat is installed. If only gsplat is missing,
     `say` gets a message on how to use CUDA. Raises ValueError for an unknown name, and for "cuda"
@@ -86,9 +86,10 @@ StopRequest: TypeAlias = list[signal.Signals]
 
 @contextmanager
 def stop_requests(quiet: bool) -> Iterator[StopRequest]:
-    """Collect the signals SIGINT and SIGTERM inside the block; print the first unless `quiet`.
+    """Collect the signals SIGINT and SIGTERM inside the block, and announce the first on stderr.
 
-    Does nothing outside the main thread, because Python handles signals only there.
+    quiet: whether to announce nothing. Outside the main thread no signal is collected, because
+        Python handles signals only there.
     """
     request: StopRequest = []
     if threading.current_thread() is not threading.main_thread():

@@ -88,7 +88,7 @@ class RunFolder:
         return all(is_leftover(file) or file.name == _LOCK for file in self.path.iterdir())
 
     def refuse_other(self, resume: bool) -> None:
-        """Raise FileExistsError unless the path is new or, with `resume`, holds a run."""
+        """Raise FileExistsError unless the folder is new or, with `resume`, holds a run."""
         if self.path.is_file():
             raise FileExistsError(f"{self.path} is a file; choose another folder for this run")
         if self.is_new or (resume and self.state.is_file()):
@@ -135,7 +135,7 @@ class RunFolder:
         return read_records(self.history_file)
 
     def cut_records(self, step: int) -> None:
-        """Drop records of steps after `step`, and damaged lines."""
+        """Drop records of steps after `step`, and damaged lines, from the histories of the run."""
         for path in (self.history_file, self.path / EVALUATIONS):
             if path.exists():
                 kept = [record for record in read_records(path) if record["step"] <= step]
@@ -166,8 +166,9 @@ class Saver:
     def save(self, step: int, good: tuple[int, Weights] | None = None) -> None:
         """Save the run after `step` optimiser steps.
 
-        good: steps and weights to save as the checkpoint in place of the present weights. The
-        checkpoint of the moving average is then not written.
+        good: number of steps and weights to save as the checkpoint in place of the present weights.
+            The checkpoint of the moving average is then not written. None saves the present
+            weights.
         """
         states: dict[str, State] = {"weights": unique_tensors(self.model)}
         states |= {name: one.state() for name, one in self.stateful.items()}
@@ -190,7 +191,7 @@ class Saver:
         wait_for_everyone()
 
     def restore(self, states: Mapping[str, State]) -> None:
-        """Restore the weights and every entry of `stateful`.
+        """Restore the weights and every entry of `stateful` from `states`.
 
         Raises CheckpointError if `states` does not fit this run.
         """
@@ -203,7 +204,8 @@ class Saver:
                     raise
                 raise CheckpointError(
                     f"{self.folder.state} is damaged or was written by another version of qgs: its "
-                    f"part `{name}` cannot be restored ({type(error).__name__}: {error})"
+                    f"part `{name}` cannot be restored ({type(error).__name__}: {error}); "
+                    "start a new run in another folder"
                 ) from error
 
     def _write_checkpoint(self, path: Path, step: int, weights: Weights) -> None:
@@ -232,7 +234,7 @@ def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, Stat
 def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
     """Read a file that `write_state` wrote; return its recipe and states.
 
-    Raises FileNotFoundError, CheckpointError for a damaged file, and RecipeError.
+    Raises FileNotFoundError, CheckpointError for a damaged file, and RecipeError for a bad recipe.
     """
     with TensorFile(path) as file:
         tensors = file.read()
@@ -248,10 +250,11 @@ def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
 
 
 def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
-    """Return the saved states of the run in `folder`; none if it must start at step 0.
+    """Return the saved states of the run in `folder`; empty if the run starts at step 0.
 
-    Raises OtherRunError if `recipe` and the run's recipe differ in more than FREE, CheckpointError
-    if the state cannot be read.
+    A run that was stopped before its first save starts at step 0. Raises OtherRunError if `recipe`
+    and the run's recipe differ in options that are not in FREE, and CheckpointError if the state
+    cannot be read.
     """
     if folder.state.is_file():
         run, states = read_state(folder.state)

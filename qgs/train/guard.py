@@ -1,4 +1,4 @@
-"""Checks that stop a run: dead model, NaN or infinity in a step, and too little memory."""
+"""Checks that stop a training run: dead model, NaN or infinity in a step, and too little memory."""
 
 import logging
 import math
@@ -82,14 +82,14 @@ class OutOfMemoryError(TrainingError):
 
 @dataclass
 class Guard:
-    """Guard that stops a run with a dead model or values that are not finite.
+    """Guard that stops a run whose model is dead or whose values are not finite.
 
     It keeps copies of the last good weights. A model is dead if it no longer renders or learns, see
     `SignsOfLife`. All processes must call each method together. `step` is the number of finished
     optimiser steps. Methods that save raise CollapseError if weights are not finite.
 
     training_pass: the module, not wrapped by accelerate. repeat: function that computes the
-    gradients of a step again. skipped: number of latest steps in a row that were not finite.
+        gradients of a step again. skipped: number of latest steps in a row that were not finite.
     """
 
     training_pass: TrainingPass
@@ -110,12 +110,13 @@ class Guard:
         self.signs = SignsOfLife(**state["detector"])
 
     def refuse_nonfinite(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
-        """Skip the step after `step`, which is not finite, or raise an error for it.
+        """Skip a step with NaN or infinity, or raise an error for it; `step` steps are finished.
 
-        Its gradients are computed again to find the first tensor that is not finite.
+        The gradients of the step are computed again to find the first tensor that is not finite.
         With on_nonfinite "skip", up to MAX_SKIPPED steps in a row are skipped with a warning.
-        Otherwise the run is saved as it was before the step, and NonFiniteError is raised;
-        CollapseError if the model was already dead. symptom: the numbers that are not finite.
+        Otherwise raises NonFiniteError after saving the run as it was before the step, or
+        CollapseError if the model was already dead. symptom: text that names the numbers that are
+        not finite.
         """
         self.skipped += 1
         # All processes repeat the step: its collective operations need everyone.
@@ -135,7 +136,7 @@ class Guard:
         )
 
     def watch(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Record the numbers of `step`, all finite; copy the weights if they are good.
+        """Record the numbers of `step`, which are finite; copy the weights if they are good.
 
         Raises CollapseError if the last `training.collapse_window` steps were dead, or if weights
         to copy are not finite.
@@ -153,7 +154,7 @@ class Guard:
     def save(self, step: int, ends: bool = False) -> None:
         """Save the run; for a dead model the checkpoint keeps the last good weights.
 
-        ends: the training budget is used up; then a dead model raises CollapseError.
+        ends: whether the training budget is used up; a dead model then raises CollapseError.
         """
         # A run shorter than a window is dead when all of its steps were.
         if self.signs.dead < min(self.config.collapse_window, step):
@@ -169,8 +170,8 @@ class Guard:
     def memory_explained(self, step: int, saves: bool = False) -> Iterator[None]:
         """Raise OutOfMemoryError if the block runs out of memory.
 
-        saves: try to save the run first. Only for blocks that do not change weights; runs with
-        several processes are not saved.
+        saves: whether to try to save the run first. Use it only for blocks that do not change
+            weights. Runs with several processes are not saved.
         """
         try:
             yield
@@ -215,8 +216,9 @@ class SignsOfLife:
 
     A step is dead if the rendering is empty (mean alpha below EMPTY_ALPHA), if the gradient has
     vanished (norm below NO_GRADIENT), or if the images show only the background although earlier
-    images showed more. dead: number of latest steps in a row that were dead. symptom: why the
-    latest step was dead. has_drawn: an earlier image clearly differed from the background.
+    images showed more.
+    dead: number of latest steps in a row that were dead. symptom: why the latest step was dead,
+        else "". has_drawn: whether an earlier image clearly differed from the background.
     """
 
     dead: int = 0
@@ -224,7 +226,7 @@ class SignsOfLife:
     has_drawn: bool = False
 
     def observe(self, numbers: Mapping[str, float]) -> None:
-        """Record a step: "alpha" and "deviation" of its renderings, and "gradient" (norm)."""
+        """Update the counter by a step's numbers: "alpha", "deviation" and "gradient" (norm)."""
         self.symptom = ""
         if numbers["alpha"] < EMPTY_ALPHA:
             self.symptom = f"the renderings are empty (mean alpha {numbers['alpha']:.1e})"
@@ -264,7 +266,7 @@ class GoodWeights:
         return self.copies[0]
 
     def observe(self, numbers: Mapping[str, float]) -> None:
-        """Record a step's "psnr", in dB."""
+        """Update the running mean of PSNR by a step's "psnr", in dB."""
         # The PSNR of one batch depends on its scenes, so running means are compared.
         psnr = numbers["psnr"]
         self.psnr = psnr if self.psnr is None else self.psnr + (psnr - self.psnr) / 10
@@ -272,9 +274,8 @@ class GoodWeights:
     def due(self, step: int, window: int) -> bool:
         """Return whether to copy the weights after `step` steps.
 
-        They are copied if the last copy is old enough and the PSNR is good.
-
-        window: `training.collapse_window`, in steps. All processes get the same result.
+        They are copied if the last copy is old enough and the PSNR is good. window:
+        `training.collapse_window`, in steps. All processes get the same result.
         """
         # Rarer in long runs: each copy moves the whole model to the host.
         interval = max(window // 5, min(window, step // 10))
@@ -285,7 +286,7 @@ class GoodWeights:
         return self.psnr >= self.best - LOSS_OF_QUALITY
 
     def refresh(self, step: int) -> None:
-        """Copy the present weights, reached after `step` optimiser steps."""
+        """Copy the present weights, reached after `step` steps; keep the two latest copies."""
         present = unique_tensors(self.model) if PartialState().is_main_process else {}
         # In host memory, because training needs the device's.
         copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
@@ -311,7 +312,7 @@ def not_finite(numbers: Mapping[str, float]) -> str:
 def first_bad_tensor(
     training_pass: nn.Module, batches: Sequence[Batch], repeat: Callable[[], Any]
 ) -> str:
-    """Find the first tensor that is not finite while `repeat` computes a step; return text on it.
+    """Return text on the first tensor that is not finite while `repeat` computes a step.
 
     The text names the tensor and the samples of its batch; it is "" if all tensors are finite.
     Torch's anomaly mode is not used: it names an operation, not a module, misses infinities, and
@@ -322,7 +323,7 @@ def first_bad_tensor(
     batch = batches[0]
 
     def see(name: str, value: Any) -> None:
-        """Check `value`, a tensor or a nested container of tensors. name: names it in messages."""
+        """Check `value`, a tensor or a nested container of tensors. name: what messages call it."""
         for path, tensor in named_tensors(value, name):
             bad = tensor[~tensor.isfinite()]
             if bad.numel() and not found:

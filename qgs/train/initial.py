@@ -1,4 +1,4 @@
-"""Option `init_from`: training that starts from the weights of a checkpoint."""
+"""Option `init_from` of a recipe: training starts from the weights of a checkpoint."""
 
 import torch
 from torch import Tensor
@@ -20,11 +20,11 @@ _KEPT = ": the first queries are kept, additional queries are noisy copies"
 
 
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
-    """Load the weights of the checkpoint `recipe.init_from` into `model`; nothing if it is null.
+    """Load the weights of the checkpoint `recipe.init_from` into `model`; if null, do nothing.
 
     model: newly built from `recipe`. The number of queries is adapted by `Queries.resized`, with
-    random numbers from the recipe's seed. Encoder, feedback and head adapt their weights with
-    `ModelComponent.adapted`. All other weights must have the same names and shapes.
+        random numbers from the recipe's seed. Encoder, feedback and head adapt their weights with
+        `ModelComponent.adapted`. All other weights must have the same names and shapes.
 
     Returns lines for the user: resized weights, new weights, and differing options of the two
     recipes that change the predictions. Raises FileNotFoundError, or CheckpointError that lists all
@@ -76,7 +76,7 @@ def _part(prefix: str, weights: Weights) -> dict[str, Tensor]:
 
 
 def _comparable(tensors: Weights, count: int | None) -> Shapes:
-    """Return shapes by name. -1 replaces the number of queries `count`, which may differ."""
+    """Return shapes by name, with -1 for the number of queries `count`, which may differ."""
     return {
         name: (-1, *shape[1:]) if name.startswith(_QUERIES) and shape[:1] == (count,) else shape
         for name, shape in shapes_of(tensors).items()

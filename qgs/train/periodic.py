@@ -38,14 +38,14 @@ def judge(
 ) -> None:
     """Score the model, and its moving average if it has one, on the recipe's test views.
 
-    Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png. Restores the model's mode.
-    Raises InterruptedError after a scene if a stop is requested, and the errors of `evaluate`.
-    step: optimiser steps so far. average: None without a moving average.
+    Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png. Training or evaluation mode
+    of the model is restored. Raises InterruptedError after a scene if a stop is requested, and the
+    errors of `evaluate`. step: optimiser steps so far. average: None without a moving average.
     """
 
     def between_scenes(done: int, wanted: int) -> None:
         if stop:
-            raise InterruptedError("training was asked to stop")
+            raise InterruptedError("evaluation ends early: training was asked to stop")
 
     rows: list[Picture] = []
 

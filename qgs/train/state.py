@@ -21,12 +21,13 @@ from qgs.train.folder import OtherRunError
 def make_optimizer(
     module: nn.Module, optimizer: Optimizer, factors: Mapping[str, float]
 ) -> torch.optim.Optimizer:
-    """Build torch's optimiser, with parameters grouped by weight decay and learning rate factor.
+    """Build torch's optimiser, with parameters grouped by weight decay and learning-rate factor.
 
     The innermost component that has a parameter decides whether weight decay applies to it
-    (`ModelComponent.decays`). Outside of components, it applies to all but 1-d parameters. A shared
-    parameter has its first name. factors: learning-rate factors by name of the parameter, the
-    result of `Recipe.rate_factors`; 0 freezes a parameter.
+    (`ModelComponent.decays`). Outside of components, weight decay applies to all but 1-d
+    parameters. A parameter that modules share is named by its first name.
+    factors: learning-rate factors by parameter name, from `Recipe.rate_factors`; 0 freezes a
+        parameter.
     Raises ValueError if all parameters are frozen.
     """
     groups: defaultdict[tuple[bool, float], list[nn.Parameter]] = defaultdict(list)
@@ -141,7 +142,7 @@ class RandomStates:
         return {str(rank): states for rank, states in enumerate(gather_object([own]))}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the generators of this process; a rank without a saved state changes nothing."""
+        """Restore the generators of this process; without a saved state for its rank, keep them."""
         rank = PartialState().process_index
         # A run may continue with more processes than before.
         if rank and str(rank) not in state:
@@ -173,7 +174,7 @@ class OptimizerState:
         return {name: kept.get(place, {}) for place, name in enumerate(self._names)}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the result of `state()`; learning rates and options of parameter groups stay.
+        """Restore the result of `state()`, but no learning rates or options of parameter groups.
 
         Raises KeyError if a parameter has no entry.
         """
@@ -183,7 +184,7 @@ class OptimizerState:
 
 
 class MovingAverage(AveragedModel):
-    """Moving average of a model's weights, in the copy `module` of the model.
+    """Moving average of a model's weights; `module` is a copy of the model with the averages.
 
     `update_parameters` sets average = decay * average + (1 - decay) * weights. Buffers are copied
     without averaging.

@@ -31,7 +31,7 @@ class Tracker(ABC):
     """Base class of experiment trackers, which record numbers and pictures of a run."""
 
     package: ClassVar[str] = ""
-    """Package that the tracker needs, under the name that Python and pip share; "" for none."""
+    """Package that the tracker needs, by a name that import and pip share; "" if it needs none."""
 
     @abstractmethod
     def __init__(self, run: Path, options: Mapping[str, Any], step: int):
@@ -45,7 +45,7 @@ class Tracker(ABC):
         """Record the numbers of a step, by name."""
 
     def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        """Record a uint8 (H, W, 3) picture. This base class ignores pictures."""
+        """Record a uint8 (H, W, 3) picture; this base class does nothing."""
         return
 
     def close(self) -> None:
@@ -56,9 +56,9 @@ class Tracker(ABC):
 class Trackers:
     """Trackers that a recipe names. Only the main process opens them, when the run's folder exists.
 
-    A tracker that fails is logged, closed and no longer used; training continues without it.
-    Raises ValueError for a tracker that is not installed, and MissingExtraError if a package that
-    a tracker needs is missing.
+    A failure of a tracker is logged; the tracker is closed, and training continues without it.
+    Raises ValueError for a tracker that is not installed, and MissingExtraError if a package that a
+    tracker needs is missing.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -80,7 +80,7 @@ class Trackers:
         self._open: dict[str, Tracker] = {}
 
     def open(self, run: Path, options: Mapping[str, Any], step: int = 0) -> None:
-        """Start all trackers for the run in the folder `run`; arguments as for `Tracker`."""
+        """Start all trackers for the run in the folder `run`; options, step: see `Tracker`."""
         for name, kind in self._kinds.items():
             try:
                 self._open[name] = kind(run, options, step)

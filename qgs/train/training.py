@@ -112,7 +112,7 @@ def train(
 class Trainer:
     """One training run: its model, data, optimiser and loop.
 
-    The constructor opens the data and draws the first batch, but writes no file of a new run. The
+    The constructor opens the data and loads the first batch, but writes no file of a new run. The
     folder is created after the first step, so that a start that fails leaves no folder.
     """
 
@@ -158,7 +158,8 @@ class Trainer:
     def _build_model(self, initial: bool) -> None:
         """Build the model, its training pass, torch's optimiser and the moving average.
 
-        Collects warnings in `notes`. initial: load pretrained weights and those of `init_from`.
+        Collects warnings in `notes`. initial: whether to load pretrained weights and those of
+        `init_from`, for a run that is not continued.
         """
         recipe = self.recipe
         self.model = recipe.build_model(self.accelerator.device, pretrained=initial).train()
@@ -207,7 +208,7 @@ class Trainer:
         self.saver.stateful = stateful
 
     def _open_data(self, source: SceneSource) -> Generator[Batch, None, None]:
-        """Return an iterator of batches that starts with the first unseen batch of the run."""
+        """Return an iterator of batches, from the first batch that the run has not used yet."""
         processes = self.accelerator.num_processes
         return training_batches(
             source,
@@ -226,7 +227,7 @@ class Trainer:
         )
 
     def _fetch(self) -> None:
-        """Fetch the batches of the next step, or store the error.
+        """Load the batches of the next step, or store the error for `_refuse_missing_batches`.
 
         It runs during a step, so that processes can agree on failures at its end.
         """

@@ -54,7 +54,7 @@ class TrainingPass(nn.Module):
     def forward(self, inputs: Views, targets: Views) -> Outcome:
         """Return the objective's `Outcome` for a batch of input and target views.
 
-        Raises ValueError if a term has a reserved name.
+        Raises ValueError if a term of the loss has a reserved name.
         """
         # Input views are appended to the targets.
         targets = targets.joined(inputs) if self.judge_inputs else targets
@@ -71,8 +71,7 @@ class TrainingPass(nn.Module):
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
         """Sum the losses of all supervised layers; implements `Passes.judge`.
 
-        The supervision sets the weight of each layer. `signs` are those of the last layer.
-
+        The supervision sets the weight of each layer. `Outcome.signs` are those of the last layer.
         Raises ValueError if two losses have a term of the same name.
         """
         parameters = dict(self.losses.named_parameters(prefix="losses"))
@@ -112,7 +111,8 @@ class TrainingPass(nn.Module):
     def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render Gaussians; implements `Passes.render`.
 
-        The autograd graph is split into groups of at most `render_views` views.
+        Views are rendered in groups of at most `render_views`. The backward pass renders each group
+        again, so that only one group needs memory at a time.
         """
         if not self.render_views or cameras.shape[1] <= self.render_views:
             return self.model.render(gaussians, cameras)
@@ -131,7 +131,7 @@ class TrainingPass(nn.Module):
         target: Views,
         inputs: Views,
     ) -> dict[str, Tensor]:
-        """Return the terms of the losses `names`; the remaining arguments are those of `Loss`."""
+        """Return the loss terms of the losses `names`; the other arguments are those of `Loss`."""
         terms: dict[str, Tensor] = {}
         for name in names:
             found = self.losses[name](prediction, rendering, target, inputs)
@@ -184,7 +184,7 @@ class DetachedLayer:
     """
 
     def __init__(self, layer: LayerPrediction, parameters: Mapping[str, Tensor]) -> None:
-        """Detach `layer`. parameters: those of the losses by name, which get gradients too."""
+        """Detach `layer`. parameters: parameters of the losses by name, which get gradients too."""
         self.prediction: LayerPrediction = map_tensors(
             lambda x: x.detach().requires_grad_() if x.requires_grad else x, layer
         )
@@ -194,7 +194,7 @@ class DetachedLayer:
         self._copies = _trained(parameters, self.prediction)
 
     def add(self, terms: Mapping[str, Tensor], share: float) -> None:
-        """Add `share` times the 0-d `terms` and their gradients, and free their graph."""
+        """Add `share` times the 0-d `terms` and their gradients, and free their autograd graph."""
         weighted = {name: share * term for name, term in terms.items()}
         _add(weighted, self.terms)
         loss = _sum(weighted)
@@ -209,7 +209,7 @@ class DetachedLayer:
         )
 
     def total(self) -> Tensor:
-        """Return the 0-d sum of the terms. Its backward pass hands `gradients` to the model."""
+        """Return the 0-d sum of the terms, whose backward pass hands `gradients` to the model."""
         total = _sum(self.terms)
         for name, gradient in self.gradients.items():
             # The graph of the losses is freed. Their gradient g with respect to a source x reaches
@@ -222,10 +222,10 @@ class DetachedLayer:
 
 @torch.no_grad()
 def signs_of(rendering: Rendering, target: Views, background: Tensor) -> dict[str, Tensor]:
-    """Return "psnr", "alpha" and "deviation" of a rendering, each 0-d.
+    """Return the 0-d numbers "psnr", "alpha" and "deviation" of a rendering.
 
     psnr, alpha: means. deviation: mean |rgb - background| over the pixels of a view, largest of all
-    views; a mean, so that a single stray Gaussian does not hide that the model is dead.
+        views. It is a mean, so that a single stray Gaussian does not hide that the model is dead.
     """
     deviation = (rendering.rgb - background[:, None, None]).abs().mean((-3, -2, -1))
     return {
