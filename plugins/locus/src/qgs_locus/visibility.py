@@ -1,4 +1,4 @@
-"""`locus/anchor_visibility`: loss that moves anchors outside of all target views inwards."""
+"""`locus/anchor_visibility`: loss that moves anchors outside of all target views into view."""
 
 from collections.abc import Iterable
 
