@@ -79,10 +79,7 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Write the gradient of the loss with respect to each query's 23 numbers to `out`, (n, 23).
-
-    gradient: gradient of the loss with respect to the bias, (n, M).
-    """
+    """Compute the gradient of each query's 23 numbers from the `gradient` of the bias, into `out`."""
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]
