@@ -1,1 +1,1 @@
-"""Procedural scenes for qgs with exact depth maps: furnished rooms and abstract worlds."""
+"""Procedural scenes with exact depth maps, as data for qgs: furnished rooms, abstract worlds."""

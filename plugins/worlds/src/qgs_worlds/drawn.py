@@ -1,4 +1,4 @@
-"""Base of procedural scenes, whose images are rendered on demand and cached."""
+"""Base classes of procedural scenes, whose images are rendered on demand and cached."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ ImageCache = dict[tuple[str, int], np.ndarray]
 
 
 class DrawnConfig(SceneSource.Config):
-    """Options that all sources of procedural scenes share."""
+    """Options that all sources of procedural scenes have."""
 
     scenes: int = Field(default=2000, ge=1)
     """Number of scenes in the training split."""
@@ -31,18 +31,18 @@ class DrawnConfig(SceneSource.Config):
     views_per_scene: int = Field(default=8, ge=2)
     """Number of cameras in each scene."""
     samples: int = Field(default=2, ge=1, le=8)
-    """Rays per pixel along each axis; 2 casts 2 x 2 rays per pixel."""
+    """Number of rays per pixel along each axis; 2 means 2 x 2 rays per pixel."""
     seed: int = Field(default=0, ge=0)
-    """Random seed that determines all scenes, 0 or more."""
+    """Random seed, from 0 on, which determines all scenes."""
     cache_mb: int = Field(default=512, ge=0)
-    """Memory for rendered images, in MiB. 0 means that images are not kept."""
+    """Memory in MiB for a cache of rendered images. 0 means that no images are kept."""
 
 
 class DrawnScene(Scene):
-    """Procedural scene with `views_per_scene` cameras. Its key (seed, split, index) determines it.
+    """Procedural scene with F = `views_per_scene` cameras, determined by (seed, split, index).
 
     c2w: poses (F, 4, 4) with OpenCV axes, in the units of `tables`. lens: fx, fy, cx, cy in pixels.
-    scale: factor from the units of `tables` to metres of the scene.
+    scale: factor from lengths in the units of `tables` to metres.
     """
 
     c2w: np.ndarray
@@ -64,7 +64,7 @@ class DrawnScene(Scene):
     @property
     @abstractmethod
     def tables(self) -> "World | Room":
-        """Shapes, textures and lights of the scene, as tables for the ray caster."""
+        """The shapes, textures and lights of the scene, as tables for the ray caster."""
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -76,7 +76,10 @@ class DrawnScene(Scene):
         return Cameras(c2w, intrinsics, self._config.image_size)
 
     def depths(self, frames: Sequence[int]) -> Tensor:
-        """Return depth (z) at pixel centres, (F, 1, H, W) in metres; 0 marks sky without depth."""
+        """Return depths (z) at the pixel centres of F frames, (F, 1, H, W) in metres.
+
+        A depth of 0 marks the sky, which has no depth.
+        """
         from qgs_worlds.caster.casting import cast
 
         depths = cast(self.tables, self.c2w[list(frames)], self.lens, self._config.image_size)
@@ -84,7 +87,7 @@ class DrawnScene(Scene):
 
     @abstractmethod
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
-        """Render one image (H, W, 3) uint8 for each frame."""
+        """Return a rendered image (H, W, 3) uint8 for each of `frames`."""
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`."""
@@ -106,7 +109,7 @@ class DrawnScene(Scene):
 
 
 class DrawnSource(LazySource):
-    """Source of procedural scenes. Seed, split and index determine a scene."""
+    """Source of procedural scenes. Each scene is determined by seed, split and index."""
 
     Config = DrawnConfig
     scene: ClassVar[Callable[..., DrawnScene]]

@@ -1,1 +1,1 @@
-"""Ray caster for rooms and worlds, and the tables that describe scenes to it."""
+"""Ray caster for procedural rooms and worlds, and the tables that describe scenes to it."""

@@ -1,4 +1,4 @@
-"""Images and depth maps of scenes, rendered by threads in bands of rows."""
+"""Cast all rays of images in parallel: depth maps and colours of procedural scenes."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -24,11 +24,12 @@ def cast(
     paint: Callable[..., None] | None = None,
     images: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the depths (F, samples * H, samples * W) float32 of all rays; inf in the sky.
+    """Return the depth of every ray, (F, samples * H, samples * W) float32, for F cameras.
 
-    Depth is z in the camera frame. c2w: poses (F, 4, 4) with OpenCV axes. intrinsics: fx, fy,
-    cx, cy in pixels. samples: rays per pixel along each axis. paint: kernel that colours `images`
-    (F, H, W, 3) band by band; a pixel is the mean of its rays.
+    Depth is z in the camera frame; a ray into the sky has depth inf. c2w: poses (F, 4, 4) with
+    OpenCV axes. intrinsics: fx, fy, cx, cy in pixels, the same for all cameras. samples: rays per
+    pixel along each axis. paint: kernel that colours `images` (F, H, W, 3) band by band; a pixel is
+    the mean of its rays. Without `paint` only depths are computed.
     """
     height, width = size
     depths = np.empty((len(c2w), samples * height, samples * width), np.float32)

@@ -19,7 +19,7 @@ _ENTRIES = 2048
 
 @inner
 def _scrambled(i, j, seed):
-    """Return 32 pseudo-random bits for pixel i of frame j."""
+    """Return 32 pseudo-random bits for pixel number i of image number j."""
     h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 739982445) & 0xFFFFFFFF
@@ -28,7 +28,7 @@ def _scrambled(i, j, seed):
 
 @kernel
 def _curve(gamma):
-    """Return a table of the tone curve. Entry i is for light whose square root is i * _STEP."""
+    """Return the tone curve as a table: entry i is for light whose square root is i * _STEP."""
     table = np.empty(_ENTRIES)
     for i in range(_ENTRIES):
         value = (i * _STEP) ** (2.0 / gamma)
@@ -62,9 +62,9 @@ def _develop(image, light, gains, gamma, vignette, grain, seed, frame):
 class Effects(NamedTuple):
     """Camera effects that turn linear light into a photo.
 
-    gains: factors (3,) for R, G and B. gamma: exponent of the tone curve. vignette: share of light
-    lost at the corners. noise: standard deviation as a share of full brightness. seed: seed of the
-    noise. quality: JPEG quality; 0 for no JPEG compression.
+    gains: factors (3,) of the light in R, G and B. gamma: exponent of the tone curve. vignette:
+    share of light lost at the corners. noise: standard deviation as a share of full brightness.
+    seed: seed of the noise. quality: JPEG quality; 0 for no JPEG compression.
     """
 
     gains: np.ndarray
@@ -77,7 +77,7 @@ class Effects(NamedTuple):
     def photo(self, light: np.ndarray, frame: int) -> np.ndarray:
         """Turn linear light (H, W, 3) into a photo (H, W, 3) uint8.
 
-        frame: index of the camera, so that each photo has its own noise.
+        frame: index of the camera, which changes the noise from photo to photo.
         """
         image = np.empty(light.shape, np.uint8)
         # the sum of two numbers of 0 to 31 has a standard deviation of 13.06

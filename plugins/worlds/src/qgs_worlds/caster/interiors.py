@@ -26,8 +26,9 @@ _FLAT = 0.03
 def _range(low, high, lamp, reach, extent, cells):
     """Return the range of floor cells, on one axis, that a shape and its shadow cover.
 
-    low, high: limits of the shape. reach: length of the shadow relative to the shape's distance
-    from the lamp. extent: size of the room.
+    low, high: limits of the shape. lamp: position of the lamp. reach: distance of the shadow's edge
+    from the lamp, relative to the distance of the shape's edge. extent: size of the room. cells:
+    number of floor cells. All are values on this axis.
     """
     start = min(low, lamp + (low - lamp) * reach)
     end = max(high, lamp + (high - lamp) * reach)
@@ -38,7 +39,11 @@ def _range(low, high, lamp, reach, extent, cells):
 
 @inner
 def _darken(darkness, body, size, lamp):
-    """Add to the floor map `darkness` (C, C) a shape's lamp shadow and the dark area below it."""
+    """Darken the floor in the lamp's shadow of a shape and in the area below the shape.
+
+    darkness: share of light lost in each cell of the floor, (C, C). size: extent of the
+    room in metres. lamp: position of the lamp.
+    """
     cells = darkness.shape[0]
     x, y, z = triple(body.center)
     bottom = z - body.extent[2]
@@ -70,7 +75,7 @@ def _darken(darkness, body, size, lamp):
 
 @kernel
 def _blurred(values):
-    """Return a map (C, C) whose cells are means of 3 x 3 neighbours."""
+    """Return a blurred map (C, C): each cell is the mean of the 3 x 3 cells around it."""
     last = values.shape[0] - 1
     result = np.empty(values.shape)
     for i in range(values.shape[0]):
@@ -85,7 +90,10 @@ def _blurred(values):
 
 @kernel
 def floor_shadows(shapes, size, lamp):
-    """Return factors (C, C) of the light on the floor, 1 without shadow, indexed by x, then y."""
+    """Return the factors (C, C) by which shadows reduce the light on the floor.
+
+    The factors are indexed by cell along x, then along y; 1 is a cell without shadow.
+    """
     darkness = np.zeros((_SHADOW_CELLS, _SHADOW_CELLS))
     # the first shape is the room
     for i in range(1, shapes.shape[0]):
@@ -96,9 +104,10 @@ def floor_shadows(shapes, size, lamp):
 
 @inner
 def _on_round(body, part, p):
-    """Return normal and both kinds of coordinates of `_surface` for a ball or a cylinder.
+    """Return the normal and four texture coordinates of a point on a ball or a cylinder.
 
-    p: point in the shape's frame. part: 1 for a cap, 0 for the side.
+    p: point in the shape's frame. part: 1 for a cap of the cylinder, 0 for any other point. The
+    coordinates are those of `_surface`.
     """
     x, y, z = p
     radius = float(body.extent[0])
@@ -111,9 +120,9 @@ def _on_round(body, part, p):
 
 @inner
 def _surface(shape, part, place):
-    """Return texture index, world normal and four coordinates of a point on a shape.
+    """Return texture index, world normal and four texture coordinates of a point on a shape.
 
-    The first two coordinates are in metres, the last two in [-1, 1] across the surface.
+    The first two coordinates are in metres; the last two run from -1 to 1 across the surface.
     """
     body = shape.body
     inside = body.kind == s.INTERIOR
@@ -141,7 +150,10 @@ def _edge(distance):
 
 @inner
 def _wall_shadow(place, size, face):
-    """Return a light factor that falls towards the edges of the room, where two walls meet."""
+    """Return a light factor for a point on a wall, the floor or the ceiling.
+
+    The factor is smaller near the edges, where two of these surfaces meet.
+    """
     x, y, z = place
     a = 1.0 if face < 2 else _edge(0.5 * size[0] - abs(x))
     b = 1.0 if face == 2 or face == 3 else _edge(0.5 * size[1] - abs(y))
@@ -151,7 +163,7 @@ def _wall_shadow(place, size, face):
 
 @inner
 def _floor_shadow(floor, place, size):
-    """Interpolate the light factors of the floor at a point."""
+    """Return the light factor of the floor at a point, interpolated between cells of `floor`."""
     last = floor.shape[0] - 1
     # below the last line, so that cell i + 1 exists
     a = min(max((place[0] / size[0] + 0.5) * last, 0.0), last - 1e-6)
@@ -193,9 +205,10 @@ def _light(room, code, place, normal):
 
 @inner
 def _gather(t, code, i, j, own, samples, top, o, rays, points):
-    """Write the hits of a pixel's rays on face `own` to `points`; return their number n.
+    """Write the points where a pixel's rays hit the face `own` to `points`; return their number n.
 
-    Row 0 of `points` is the mean of the hits, rows 1 to n are the hits.
+    Rows 1 to n of `points` are the hits, row 0 is their mean. These rays are marked as TAKEN in
+    `code`.
     """
     n = 0
     step = 1.0 / samples
@@ -219,7 +232,7 @@ def _gather(t, code, i, j, own, samples, top, o, rays, points):
 def _albedo(texture, shape, part, points, n, footprint):
     """Return the mean RGB of a texture over the hits of a pixel, rows 1 to n of `points`.
 
-    A texture without sharp edges is evaluated once, at row 0, the mean of the hits.
+    A texture without sharp edges is evaluated only once, at the mean of the hits in row 0.
     """
     first = 0 if smooth(texture.pattern) else 1
     last = 1 if smooth(texture.pattern) else n + 1
@@ -237,7 +250,7 @@ def _albedo(texture, shape, part, points, n, footprint):
 
 @inner
 def _shade(room, code, points, n, footprint):
-    """Return the RGB in [0, 1] of a face at the hits of a pixel, rows 1 to n of `points`."""
+    """Return the mean RGB of a face, in [0, 1], over the hits in rows 1 to n of `points`."""
     shape = room.shapes[code >> 3]
     place = triple(points[0])
     row, normal, _, _, _, _ = _surface(shape, code & 7, place)
@@ -250,10 +263,11 @@ def _shade(room, code, points, n, footprint):
 
 @kernel
 def paint_room(image, t, code, top, samples, room, c2w, rays):
-    """Write a band of an image, (rows, W, 3) uint8; this overwrites `code`.
+    """Colour a band of image rows, `image` (rows, W, 3) uint8. This overwrites `code`.
 
-    t, code, rays: results of `trace`. top: image row of the band's first row. Rays of a pixel that
-    hit the same face share their light; a texture without sharp edges is evaluated once for them.
+    t, code, rays: results of `trace` for the band. top: number of the band's first row in the whole
+    image. Rays of a pixel that hit the same face share one computation of light; if the texture has
+    no sharp edges, they share its colour too.
     """
     eye = triple(c2w[:, 3])
     points = np.empty((samples * samples + 1, 3))

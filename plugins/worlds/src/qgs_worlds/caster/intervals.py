@@ -1,7 +1,8 @@
 """Intersections of a ray o + t d with primitives, in the frame of the primitive.
 
-An interval is (entry t, exit t, entry face, exit face). A ray that misses has entry inf and exit
--inf. All numbers and constants are float32, because one float64 would slow the vectorised loops.
+An interval is the part of a ray inside a primitive: (entry t, exit t, entry face, exit face). A ray
+that misses has entry inf and exit -inf. All numbers and constants are float32, because one float64
+would slow the vectorised loops.
 """
 
 import math
@@ -40,7 +41,10 @@ def reciprocal(x):
 
 @inner
 def slab(o, inverse, h):
-    """Return entry and exit t of a ray between -h and h on one axis. inverse: 1 / d."""
+    """Return the t at which a ray enters and leaves the range -h to h on one axis.
+
+    o, inverse: on this axis, the start of the ray and 1 / d.
+    """
     a = (-h - o) * inverse
     b = (h - o) * inverse
     return min(a, b), max(a, b)
@@ -55,7 +59,10 @@ def nearest(o, d):
 
 @inner
 def ellipsoid(o, d):
-    """Return the interval in the unit sphere. o: point of the ray nearest to the origin."""
+    """Return the interval of a ray in the unit sphere: entry t, exit t, and two faces, both 0.
+
+    o: point of the ray nearest to the origin.
+    """
     inside = ONE - dot(o, o)
     root = math.sqrt(max(inside, ZERO) / dot(d, d))
     met = inside > ZERO
@@ -64,7 +71,7 @@ def ellipsoid(o, d):
 
 @inner
 def ball(o, d, radius):
-    """Return an interval with the entry into a sphere around the origin, and inf as exit."""
+    """Return the interval of a ray in a sphere around the origin, with inf as exit t."""
     inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
     x, y, z = along(o, middle, d)
@@ -77,7 +84,11 @@ def ball(o, d, radius):
 
 @inner
 def _last_and_first(x, y, z):
-    """Return the overlap of three (entry, exit) pairs; its faces are the indices of the limits."""
+    """Return the overlap of three ranges of t on x, y and z as an interval.
+
+    x, y, z: pairs (entry t, exit t). The entry face and the exit face are the numbers, 0 to 2, of
+    the axes whose range begins last and ends first.
+    """
     near = max(x[0], y[0], z[0])
     far = min(x[1], y[1], z[1])
     entry = ZERO if near == x[0] else (ONE if near == y[0] else _TWO)
@@ -87,7 +98,10 @@ def _last_and_first(x, y, z):
 
 @inner
 def box(o, d):
-    """Return the interval in the cube [-1, 1]^3. Faces are numbered by axis, 0 to 2."""
+    """Return the interval of a ray in the cube [-1, 1]^3: entry t, exit t, two faces.
+
+    A face is the number of its axis, 0 to 2.
+    """
     x = slab(o[0], reciprocal(d[0]), ONE)
     y = slab(o[1], reciprocal(d[1]), ONE)
     z = slab(o[2], reciprocal(d[2]), ONE)
@@ -96,7 +110,10 @@ def box(o, d):
 
 @inner
 def block(o, d, h):
-    """Return the interval in a box with half sizes h. Faces are numbered by axis, 0 to 2."""
+    """Return the interval of a ray in a box with half sizes h: entry t, exit t, two faces.
+
+    A face is the number of its axis, 0 to 2.
+    """
     x = slab(o[0], reciprocal(d[0]), h[0])
     y = slab(o[1], reciprocal(d[1]), h[1])
     z = slab(o[2], reciprocal(d[2]), h[2])
@@ -105,10 +122,10 @@ def block(o, d, h):
 
 @inner
 def interior(o, d, h):
-    """Return an interval from the t at which a ray from inside a room hits its walls, to inf.
+    """Return an interval from the t at which a ray hits the surfaces of a room, to inf.
 
-    Faces 0 to 5 are -x, +x, -y, +y, floor and ceiling; the floor is at z = 0. h: half size in x and
-    y, full size in z.
+    The ray starts inside the room. Entry faces 0 to 5 are the walls at -x, +x, -y and +y, the floor
+    and the ceiling. The floor is at z = 0. h: half size of the room in x and y, full size in z.
     """
     tx = (math.copysign(h[0], d[0]) - o[0]) / d[0]
     ty = (math.copysign(h[1], d[1]) - o[1]) / d[1]
@@ -123,7 +140,10 @@ def interior(o, d, h):
 
 @inner
 def _shaft(o, d, radius, half):
-    """Return entry and exit t of an upright cylinder, then those of the slab between its caps."""
+    """Return the t at which a ray enters and leaves an upright cylinder around the z axis.
+
+    The third and fourth number are the t at which the ray crosses the planes of the two caps.
+    """
     low, high = slab(o[2], reciprocal(d[2]), half)
     inverse = reciprocal(d[0] * d[0] + d[1] * d[1])
     middle = -(o[0] * d[0] + o[1] * d[1]) * inverse
@@ -139,14 +159,20 @@ def _shaft(o, d, radius, half):
 
 @inner
 def cylinder(o, d, h):
-    """Return the interval in a cylinder of radius h[0] and half height h[2]. Face 1: a cap."""
+    """Return the interval of a ray in a cylinder of radius h[0] and half height h[2].
+
+    Face 1 is a cap, face 0 the side.
+    """
     near, far, low, high = _shaft(o, d, h[0], h[2])
     return near, far, (ONE if near == low else ZERO), (ONE if far == high else ZERO)
 
 
 @inner
 def capsule(o, d, half):
-    """Return the interval in a capsule of radius 1 around the z axis from -half to half."""
+    """Return the interval of a ray in a capsule.
+
+    The capsule has radius 1 around the z axis from z = -half to half.
+    """
     near, far, _, _ = _shaft(o, d, ONE, half)
     # the ends are whole spheres, because their inner halves are inside the shaft
     for end in (-half, half):
@@ -159,9 +185,9 @@ def capsule(o, d, half):
 
 @inner
 def frustum(o, d, top):
-    """Return the interval in a truncated cone from z = -1 to 1. Face 1 is a cap.
+    """Return the interval of a ray in a truncated cone from z = -1 to 1.
 
-    Its radius is 1 at z = -1 and `top` <= 1 at z = 1.
+    The radius is 1 at z = -1 and `top` <= 1 at z = 1. Face 1 is a cap, face 0 the side.
     """
     # caps come first, because they cut off the side
     low, high = slab(o[2], reciprocal(d[2]), ONE)
@@ -195,10 +221,10 @@ def frustum(o, d, top):
 
 @inner
 def torus(o, d, thickness, start):
-    """Return an interval with the first hit of a torus, from t = `start` on, as entry and exit.
+    """Return an interval with the first hit of a torus from t = `start` on, as entry and exit.
 
-    The torus lies in the xy plane, with outer radius 1. The search uses sphere tracing, because the
-    roots of the quartic equation miss thin rings in float32.
+    The torus lies in the xy plane and has outer radius 1. The search uses sphere tracing, because
+    the roots of the quartic equation miss thin rings in float32.
     """
     step = ONE / math.sqrt(dot(d, d))
     t, end, _, _ = ellipsoid(o, d)
@@ -220,7 +246,7 @@ def torus(o, d, thickness, start):
 
 @inner
 def height_at(heights, x, y):
-    """Return the bilinear height of a map `heights` (G, G) at x, y in [-1, 1]."""
+    """Return the height at x, y in [-1, 1], interpolated in the height map `heights` (G, G)."""
     last = heights.shape[0] - 1
     a = min(max((x + ONE) * _HALF, ZERO), _INSIDE) * np.float32(last)
     b = min(max((y + ONE) * _HALF, ZERO), _INSIDE) * np.float32(last)
@@ -241,7 +267,11 @@ def _above(heights, o, d, t):
 
 @inner
 def _next_line(o, d, t, cells):
-    """Return the t at which a ray crosses the next border of a height map's cells, on one axis."""
+    """Return the t at which a ray crosses the next border of a height map's cells, on one axis.
+
+    o, d: start and direction of the ray on this axis. The search begins after `t`. cells: number of
+    cells.
+    """
     if abs(d) < TINY:
         return NONE
     place = (o + t * d + ONE) * _HALF * cells
@@ -251,9 +281,9 @@ def _next_line(o, d, t, cells):
 
 @inner
 def _surface_between(heights, o, d, t, above, line, below):
-    """Return the t of a hit on a height map, between t and `line`.
+    """Return the t between `t` and `line` at which a ray hits a height map.
 
-    above, below: height of the ray over the map at t (positive) and at `line` (negative).
+    above: height of the ray over the map at `t`, positive. below: this height at `line`, negative.
     """
     # regula falsi, because heights along a ray in one cell are a parabola
     for _ in range(3):
@@ -270,9 +300,10 @@ def _surface_between(heights, o, d, t, above, line, below):
 
 @inner
 def relief(o, d, heights, start):
-    """Return an interval with the first hit of a height map's solid, as entry and exit.
+    """Return an interval with the first hit of a height map from t = `start` on, as entry and exit.
 
-    The solid is the part of the cube [-1, 1]^3 below the map. Face 0 is the top, face 1 a side.
+    The map bounds a solid: the part of the cube [-1, 1]^3 below the map. Face 0 is the top of the
+    solid, face 1 a side.
     """
     t, end, _, _ = box(o, d)
     t = max(t, start)
@@ -297,7 +328,12 @@ def relief(o, d, heights, start):
 
 @inner
 def less(near, far, entry, cut_near, cut_far, cut_leave):
-    """Return the entry t and face of a shape minus a cut; faces of the cut's wall are 3 higher."""
+    """Return the t at which a ray enters a body from which a cut is removed, and the face there.
+
+    near, far, entry: entry t, exit t and entry face of the body. cut_near, cut_far, cut_leave:
+    entry t, exit t and exit face of the cut. The wall of the cut has the numbers of the cut's faces
+    plus 3. A ray that misses has t = inf.
+    """
     outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
     # a ray that starts in the cut, or enters through it, hits the wall of the cut
     inner = (cut_far > NEAR) & (cut_far > near) & (cut_far < far) & (cut_near <= cut_far)
@@ -307,14 +343,14 @@ def less(near, far, entry, cut_near, cut_far, cut_leave):
 
 @inner
 def local(primitive, v):
-    """Return the world direction v in the frame of a primitive."""
+    """Return the direction v, given in the world frame, in the frame of a primitive."""
     axes = primitive.axes
     return dot(axes[0], v), dot(axes[1], v), dot(axes[2], v)
 
 
 @inner
 def local_point(primitive, p):
-    """Return the world point p in the frame of a primitive."""
+    """Return the point p, given in the world frame, in the frame of a primitive."""
     return local(primitive, minus(p, primitive.center))
 
 
@@ -326,7 +362,10 @@ def hollow(shape):
 
 @inner
 def upright(body, v):
-    """Return the same as `local`, faster, for shapes that are turned only about z."""
+    """Return the world direction v in the frame of `body`, a shape that is turned only about z.
+
+    The result is the same as that of `local`, which is slower.
+    """
     cos = body.axes[0, 0]
     sin = body.axes[0, 1]
     return cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]
@@ -348,13 +387,16 @@ def hit(body, o, d):
 
 @kernel
 def height_of(heights, x, y):
-    """Call `height_at` from Python, which cannot call it directly."""
+    """Call the kernel `height_at`, which Python cannot call directly."""
     return height_at(heights, x, y)
 
 
 @kernel
 def clearances(shapes, points):
-    """Return distances (F, S) in metres from points (F, 3) to the boxes of shapes; 0 in a box."""
+    """Return the distances in metres from F points (F, 3) to the boxes around S shapes, (F, S).
+
+    A point inside a box has distance 0.
+    """
     distances = np.empty((points.shape[0], shapes.shape[0]))
     for f in range(points.shape[0]):
         for i in range(shapes.shape[0]):

@@ -16,7 +16,7 @@ def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
 
 
 def look_along(eyes: np.ndarray, forward: np.ndarray, roll: np.ndarray | None = None) -> np.ndarray:
-    """Return poses c2w (F, 4, 4) with OpenCV axes; z is up in the world.
+    """Return poses c2w (F, 4, 4) with OpenCV axes for F cameras in a world whose z axis is up.
 
     eyes: camera centres (F, 3). forward: viewing directions (F, 3). roll: angles (F,) in radians
     about the viewing direction; None keeps cameras level.

@@ -11,7 +11,7 @@ from qgs_worlds.caster.vectors import inner
 
 @inner
 def _hash(i, j, seed):
-    """Return a pseudo-random number in [0, 1) for the lattice point (i, j)."""
+    """Return a pseudo-random number in [0, 1) for the point (i, j) of an integer grid."""
     # primes of xxHash, which spread neighbours over all bits
     h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
@@ -20,7 +20,7 @@ def _hash(i, j, seed):
 
 @inner
 def _noise(x, y, seed):
-    """Return value noise in [0, 1] at (x, y), with lattice points at distance 1."""
+    """Return value noise in [0, 1] at (x, y), from random values at integer coordinates."""
     i = math.floor(x)
     j = math.floor(y)
     a = eased(x - i)
@@ -45,7 +45,11 @@ def _seam(x, width):
 
 @inner
 def _grid(x, y, shift, seed, softness):
-    """Return tone and joint at (x, y) of unit tiles. shift: offset of every second row."""
+    """Return tone and joint of tiles at (x, y), both from 0 to 1. Tiles have size 1.
+
+    tone: random brightness, which differs from tile to tile. joint: `softness` between two tiles,
+    else 0. shift: offset of every second row.
+    """
     row = math.floor(y)
     x = x + shift * (row & 1)
     # no two tiles are quite alike
@@ -67,7 +71,10 @@ def _planks(x, y, seed, fade):
 
 @inner
 def _picture(p, q, seed):
-    """Return the colour weights (m, n) for a landscape: hills under a sky with a sun."""
+    """Return colour weights (m, n), see `mixture`, of a painted landscape at (p, q) in [-1, 1].
+
+    The picture shows hills under a sky with a sun.
+    """
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
     # hills farther off are higher and paler
     far = hill + 0.35 * _noise(1.2 * p + 40, 8.5, seed) + 0.1
@@ -84,7 +91,10 @@ def _picture(p, q, seed):
 
 @inner
 def _rug(p, q, x, y, seed):
-    """Return the colour weights (m, n) for a rug: two borders, a central ring, and diamonds."""
+    """Return colour weights (m, n), see `mixture`, of a rug at (p, q) in [-1, 1].
+
+    The rug has two borders, a ring in the centre, and diamonds. x, y: the position in periods.
+    """
     edge = min(1 - abs(p), 1 - abs(q))
     ring = abs(p) + abs(q)
     if edge < 0.06 or 0.14 < edge < 0.18:
@@ -101,7 +111,10 @@ def _rug(p, q, x, y, seed):
 
 @inner
 def _window(p, q, seed):
-    """Return the colour weights (m, n) for a window: frame, glazing bars, trees and sky."""
+    """Return colour weights (m, n), see `mixture`, of a window at (p, q) in [-1, 1].
+
+    The window has a frame and glazing bars, and shows trees and sky.
+    """
     if abs(p) < 0.03 or abs(q - 0.25) < 0.025 or abs(p) > 0.94 or abs(q) > 0.95:
         return 0.0, 1.0
     trees = -0.5 + 0.5 * _noise(3 * p, 0.5, seed) + 0.15 * _noise(11 * p, 3.5, seed)
@@ -112,23 +125,27 @@ def _window(p, q, seed):
 
 @inner
 def _spines(x, seed):
-    """Return the colour weights (m, n) for spines of books, some with a band."""
+    """Return colour weights (m, n), see `mixture`, of a row of book spines.
+
+    Some spines have a band. x: position along the row, in widths of a book.
+    """
     i = math.floor(x + 0.3 * _noise(x, 0.5, seed))
     return _hash(i, 1, seed), (0.9 * _hash(i, 2, seed) if _hash(i, 3, seed) > 0.5 else 0.0)
 
 
 @inner
 def smooth(kind):
-    """Return True if the pattern `kind` has no sharp edges."""
+    """Return True if the pattern `kind` has no sharp edges, else False."""
     return kind in (PLAIN, CLOUDS, GRADIENT)
 
 
 @inner
 def mixture(texture, u, v, p, q, footprint):
-    """Return weights (m, n) of a texture's colours a, b, c: its RGB is lerp(lerp(a, b, m), c, n).
+    """Return weights (m, n) by which a texture mixes its three colours a, b, c at a point.
 
-    u, v: position on the surface in metres. p, q: position in [-1, 1] across the surface.
-    footprint: distance between neighbouring samples in metres; finer details fade away.
+    The RGB of the texture is lerp(lerp(a, b, m), c, n). u, v: position on the surface in metres.
+    p, q: position in [-1, 1] across the surface. footprint: distance between neighbouring samples
+    in metres; finer details fade away.
     """
     kind = texture.pattern
     seed = texture.seed

@@ -1,4 +1,4 @@
-"""First hits of the rays of an image. Each shape is tested in the rows and columns it covers.
+"""Find the first hit of each ray of an image. A shape is tested only in the pixels it may cover.
 
 The ray of pixel (u, v) is o + t d, with camera centre o and d = B (1, u, v) for a 3 x 3 matrix B.
 The z of d is 1 in the camera frame, so t is the depth.
@@ -38,7 +38,7 @@ _PLANE = 0.02
 
 @inner
 def _corners(body, c2w, corners):
-    """Write to `corners` (8, 3) the camera-frame corners of the box around a primitive."""
+    """Write the corners of the box around a primitive, in the camera frame, to `corners` (8, 3)."""
     middle = minus(body.center, c2w[:, 3])
     for a in range(3):
         toward = c2w[:, a]
@@ -54,7 +54,10 @@ def _corners(body, c2w, corners):
 
 @inner
 def _clipped(corners, points):
-    """Write the corners of a box, clipped at the camera plane, to `points`; return their number."""
+    """Write the corners of a box, after clipping at the camera plane, to `points`.
+
+    Returns the number of these corners. Only the part of the box in front of the camera is kept.
+    """
     n = 0
     for k in range(8):
         z = corners[k, 2]
@@ -75,9 +78,10 @@ def _clipped(corners, points):
 
 @inner
 def _covered(corners, points, intrinsics):
-    """Return the range u0, u1, v0, v1 of pixels that a box covers; u0 > u1 behind the camera.
+    """Return the range u0, u1, v0, v1 of pixel coordinates that a box covers.
 
-    corners: see `_corners`. points: working memory (20, 3).
+    If the box is behind the camera, u0 > u1. corners: result of `_corners`. points: working memory,
+    (20, 3).
     """
     u0 = v0 = np.inf
     u1 = v1 = -np.inf
@@ -94,9 +98,10 @@ def _covered(corners, points, intrinsics):
 
 @inner
 def _span(low, high, samples, first, count):
-    """Return the first and the end index of samples between two pixel coordinates.
+    """Return the first index and the end index of the samples between two pixel coordinates.
 
-    first: pixel of sample 0. count: number of samples.
+    low, high: the coordinates. samples: samples per pixel. first: pixel of sample 0. count: number
+    of all samples.
     """
     # half a sample more on both sides, because bounds and rays round differently
     low = (low - first) * samples - 0.5
@@ -106,7 +111,10 @@ def _span(low, high, samples, first, count):
 
 @inner
 def ray_basis(c2w, intrinsics):
-    """Return the columns of the matrix B: pixel (u, v) has world direction d = B (1, u, v)."""
+    """Return the three columns of the ray basis, a matrix B, in the world frame.
+
+    The ray of pixel (u, v) has direction d = B (1, u, v).
+    """
     right = over(c2w[:, 0], intrinsics[0])
     down = over(c2w[:, 1], intrinsics[1])
     corner = along(along(c2w[:, 2], -intrinsics[2], right), -intrinsics[3], down)
@@ -115,15 +123,17 @@ def ray_basis(c2w, intrinsics):
 
 @inner
 def _row_base(rays, v):
-    """Return the direction of the ray of pixel (0, v)."""
+    """Return the direction of the ray of pixel (0, v) for a ray basis `rays`."""
     return narrow(along(rays[0], v, rays[2]))
 
 
 @inner
 def _ray(o, base, step, u):
-    """Return for a ray its point nearest to the origin, its direction, and the t of this point.
+    """Return a ray's point nearest to the origin, its direction, and the t of this point.
 
-    Intersections start at this point, because float32 would lose thin shapes far from the camera.
+    o, base, step: start of the ray, direction of its row's ray 0, and change of direction per
+    pixel. u: pixel in the row. Intersections start at the nearest point, because float32 would lose
+    thin shapes far from the camera.
     """
     d = along(base, u, step)
     p, t = nearest(o, d)
@@ -141,9 +151,10 @@ def _store(spans, k, found, t):
 
 @inner
 def _inside_row(kind, extra, heights, steps, o, base, step, spans):
-    """Write the entry t, exit t, entry face and exit face of a row's R rays to `spans` (4, R).
+    """Intersect the R rays of a row with a primitive, and write their intervals to `spans` (4, R).
 
-    Each kind of primitive has its own loop, because LLVM vectorises loops without branches.
+    An interval is entry t, exit t, entry face and exit face. Each kind of primitive has its own
+    loop, because LLVM vectorises loops without branches.
     """
     count = steps.shape[0]
     if kind == s.ELLIPSOID:
@@ -174,9 +185,10 @@ def _inside_row(kind, extra, heights, steps, o, base, step, spans):
 
 @inner
 def _closest(t, code, own, first, second):
-    """Update t and code of a row where a shape is nearer than all earlier shapes.
+    """Update the hits of a row of R rays where a shape is nearer than all earlier shapes.
 
-    own: code of the shape. first, second: intervals (4, R) of its body and of its cut.
+    t, code: depths and face codes (R,) of the hits. own: code of the shape. first, second:
+    intervals (4, R) of the shape's body and of its cut.
     """
     for k in range(t.shape[0]):
         near, face = less(
@@ -197,9 +209,9 @@ def _keep(t, code, k, own, found):
 
 @inner
 def _cover_row(t, code, own, kind, extent, steps, o, base, step):
-    """Do the work of `_closest` for shapes of furnished rooms, which have no cut.
+    """Do the work of `_closest` for a shape of a furnished room.
 
-    Storing no intervals takes a third of the time.
+    Such a shape has no cut, so intervals need not be stored. This takes a third of the time.
     """
     if kind == s.BLOCK:
         for k in range(t.shape[0]):
@@ -226,7 +238,7 @@ def _trace_primitive(primitive, heights, o, base, step, steps, spans):
 
 @inner
 def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
-    """Do the work of `_trace_shape` for shapes of furnished rooms, which are in metres."""
+    """Do the work of `_trace_shape` for shapes of furnished rooms, whose frame is in metres."""
     above, below, first, last = area
     kind = body.kind
     extent = triple(body.extent)
@@ -242,7 +254,11 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
 
 @inner
 def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch):
-    """Update t and code in an area of samples where a shape is nearer than all earlier shapes."""
+    """Update the hits of rays in an area where a shape is nearer than all earlier shapes.
+
+    t, code: depths and face codes of the hits. own: code of the shape. area: first row, end row,
+    first column and end column of the rays. scratch: working memory.
+    """
     above, below, first, last = area
     step = narrow(rays[1])
     along_row = steps[first:last]
@@ -261,10 +277,11 @@ def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, are
 
 @kernel
 def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
-    """Return depth t and face code, both (R, C) float32, of a band of an image, and the ray basis.
+    """Return depth t, face code and ray basis of a band of image rows.
 
-    The band has `rows` pixel rows from `top` on, with samples x samples rays per pixel. A ray
-    without a hit has t = inf and code SKY. The ray basis is the result of `ray_basis`.
+    t and code are (R, C) float32. The band has `rows` pixel rows from row `top` on, with samples x
+    samples rays per pixel, so R = rows * samples and C = columns * samples. A ray without a hit has
+    t = inf and code SKY. The ray basis is the result of `ray_basis`.
     """
     t = np.full((rows * samples, columns * samples), NONE, np.float32)
     code = np.full((rows * samples, columns * samples), np.float32(SKY), np.float32)

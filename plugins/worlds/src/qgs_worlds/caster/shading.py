@@ -32,9 +32,10 @@ _LIFT = 2e-3
 
 @inner
 def on_axis(axis, p, unit):
-    """Return normal, texture coordinates u and v, and number of the box face at point p.
+    """Return normal, texture coordinates u and v, and face number of a point on a box.
 
-    axis: axis of the face's normal. unit: metres per unit of the box's frame.
+    axis: axis of the face's normal, 0 to 2. p: the point in the box's frame. unit: metres per unit
+    of this frame, on each axis.
     """
     x, y, z = p
     if axis == 0:
@@ -56,7 +57,10 @@ def _on_relief(field, p, unit):
 
 @inner
 def _on_primitive(primitive, heights, face, p):
-    """Return the same as `on_axis` for any primitive, at point p on one of its faces."""
+    """Return normal, texture coordinates u and v, and face number of a point on a primitive.
+
+    face: face that was hit, as in an interval. p: the point in the primitive's frame.
+    """
     kind = primitive.kind
     extra = primitive.extra
     unit = triple(primitive.unit)
@@ -88,7 +92,7 @@ def _on_primitive(primitive, heights, face, p):
 
 @inner
 def to_world(primitive, n):
-    """Turn a normal from a primitive's frame into the world frame; its length is not 1."""
+    """Return the normal n of a primitive in the world frame. The length of the result is not 1."""
     axes = primitive.axes
     # `axes` leads into the frame, so its transpose leads normals out of it
     return dot(axes[:, 0], n), dot(axes[:, 1], n), dot(axes[:, 2], n)
@@ -98,7 +102,8 @@ def to_world(primitive, n):
 def surface(shape, heights, part, place):
     """Return texture index, world normal and texture coordinates u, v of a point on a shape.
 
-    part: number of the face; faces of a cut are 3 higher.
+    part: number of the face; faces of the shape's cut have numbers from 3 on. place: the point in
+    the world frame.
     """
     cut = part >= 3
     primitive = shape.cut if cut else shape.body
@@ -114,7 +119,10 @@ def surface(shape, heights, part, place):
 
 @inner
 def _clouds(air, x, y, z):
-    """Return the share of cloud, in [0, 1], in direction (x, y, z), from noise on a high plane."""
+    """Return the share of cloud, from 0 to 1, in the direction (x, y, z).
+
+    The clouds are noise on a high plane.
+    """
     if air.clouds <= 0 or z <= 0.02:
         return 0.0
     # the summand limits how fine the clouds are at the horizon
@@ -132,7 +140,10 @@ def _clouds(air, x, y, z):
 
 @inner
 def _glow(lights, view):
-    """Return the brightness of the glow around the sun: a cosine to the 16th, times a half."""
+    """Return the brightness of the glow around the sun in direction `view`.
+
+    It is half of the 16th power of the cosine between `view` and the sun; without a sun, it is 0.
+    """
     if lights.shape[0] == 0 or lights[0].lamp > 0:
         return 0.0
     near = max(dot(view, lights[0].place), 0.0) ** 2
@@ -156,7 +167,10 @@ def _sky(air, lights, view):
 
 @inner
 def _light(light, shadows, own, place, normal, view, open_, shine):
-    """Return the strengths of diffuse reflection and of highlight of one light at a point."""
+    """Return how strongly one light is reflected at a point: diffusely, and as a highlight.
+
+    open_: share of ambient light at the point. shine: exponent of the highlight; 0 for none.
+    """
     toward = minus(light.place, times(light.lamp, place))
     square = dot(toward, toward)
     near = 1.0 / math.sqrt(square)
@@ -178,7 +192,12 @@ def _light(light, shadows, own, place, normal, view, open_, shine):
 
 @inner
 def _shade(world, around, code, place, view, footprint, distance):
-    """Return the RGB, in linear light, of a surface at point `place` seen in direction `view`."""
+    """Return the RGB, in linear light, of a surface seen from the camera.
+
+    around: see `surroundings`. code: face code of the surface. place: point on the surface. view:
+    direction from the camera. footprint: distance between neighbouring pixels at the point.
+    distance: distance of the point from the camera. All lengths are in metres.
+    """
     i = code >> 3
     shape = world.shapes[i]
     air = world.air[0]
@@ -207,10 +226,10 @@ def _shade(world, around, code, place, view, footprint, distance):
 
 @inner
 def _gather(t, code, i, j, own, samples):
-    """Average the rays of a pixel that hit the same face, and mark them as used.
+    """Average the rays of a pixel that hit the same face, and mark them as TAKEN in `code`.
 
     own: code of the face. Returns the number of these rays, their mean t, and the means of their
-    columns and rows within the pixel, weighted by t.
+    columns and of their rows within the pixel, both weighted by t.
     """
     n = 0
     t_sum = u_sum = v_sum = ZERO
@@ -230,10 +249,10 @@ def _gather(t, code, i, j, own, samples):
 
 @kernel
 def paint(image, t, code, top, samples, world, c2w, rays):
-    """Write a band of an image, (rows, W, 3) float32 linear light; this overwrites `code`.
+    """Colour a band of image rows, `image` (rows, W, 3) float32 linear light. Overwrites `code`.
 
-    t, code, rays: results of `trace`. top: image row of the band's first row. Rays of a pixel that
-    hit the same face are shaded once, at their mean.
+    t, code, rays: results of `trace` for the band. top: number of the band's first row in the whole
+    image. Rays of a pixel that hit the same face are shaded once, at their mean.
     """
     # kept over the band, because neighbouring points have the same boxes nearby
     around = surroundings(world.shapes)

@@ -1,6 +1,7 @@
-"""Shadow maps, rendered once per scene by the ray caster, and ambient occlusion.
+"""Shadows of lights by shadow maps, and ambient occlusion.
 
-Ambient occlusion darkens points near other shapes. It is estimated from boxes around shapes.
+The ray caster renders the shadow maps once per scene. Ambient occlusion darkens points near other
+shapes; it is estimated from boxes around shapes.
 """
 
 import math
@@ -32,9 +33,10 @@ for _face in range(6):
 def shadow_maps(
     shapes: np.ndarray, heights: np.ndarray, lights: np.ndarray, middle: np.ndarray, radius: float
 ) -> tuple[np.ndarray, s.Shadows]:
-    """Return a copy of `lights` whose field `shadows` points to its maps, and all shadow maps.
+    """Return a copy of `lights` and the shadow maps of all lights.
 
-    middle, radius: ball in which the sun casts shadows. Lamps cast shadows everywhere.
+    In the copy, the field `shadows` gives the number of the light's first map plus 1. middle,
+    radius: ball in which the sun casts shadows. Lamps cast shadows everywhere.
     """
     lights = lights.copy()
     maps = []
@@ -59,7 +61,7 @@ def shadow_maps(
 def _views(
     light: np.ndarray, middle: np.ndarray, radius: float
 ) -> list[tuple[np.ndarray, int, float]]:
-    """Return pose c2w, side and focal length in pixels for each shadow map of a light."""
+    """Return a tuple for each shadow map of a light: pose c2w, side and focal length in pixels."""
     place = light["place"]
     c2w = np.tile(np.eye(4), (6, 1, 1))
     if light["lamp"]:
@@ -74,7 +76,10 @@ def _views(
 
 @inner
 def _seen(shadows, k, own, p):
-    """Return the share of light that reaches point p by shadow map k; 1 outside the map."""
+    """Return the share of light that reaches point p, by shadow map number k.
+
+    It is 1 outside the map. own: see `lit`.
+    """
     view = shadows.maps[k]
     side = view.side
     place = minus(p, view.c2w[:, 3])
@@ -106,9 +111,10 @@ def _seen(shadows, k, own, p):
 
 @inner
 def lit(shadows, light, own, p):
-    """Return the share of a light that reaches point p, in [0, 1].
+    """Return the share of a light that reaches point p, from 0 (in shadow) to 1.
 
-    own: index of the shape of p if this shape cannot cast a shadow on itself, otherwise -1.
+    own: index of the shape on which p lies, if this shape cannot cast a shadow on itself; otherwise
+    -1.
     """
     k = light.shadows - 1
     if light.lamp > 0:
@@ -120,10 +126,12 @@ def lit(shadows, light, own, p):
 
 @kernel
 def surroundings(shapes):
-    """Return the cache that `visible` keeps between points: all boxes, near boxes, and their place.
+    """Return the cache that `visible` keeps between points: three arrays.
 
-    Boxes are (19, S), one field per row, so that loops over shapes are vectorised. The place (5,)
-    is a point, the number of boxes near it, and the squared distance up to which they are valid.
+    The first array (19, S) has 19 fields of the boxes around S shapes, field by field, so that
+    loops over shapes are vectorised. The second array (19, S) has the boxes near a point. The third
+    array (5,) has that point, the number of boxes near it, and the squared distance from it up to
+    which the second array is valid.
     """
     boxes = np.empty((_FIELDS, shapes.shape[0]), np.float32)
     for i in range(shapes.shape[0]):
@@ -141,7 +149,11 @@ def surroundings(shapes):
 
 @inner
 def _find(shapes, around, p, reach, slack):
-    """Copy the boxes near point p to the cache, except those of hollow shapes."""
+    """Copy the boxes near point p to the cache `around`, except boxes of `hollow` shapes.
+
+    reach: distance in metres at which shapes darken points. slack: distance in metres from p up to
+    which the copied boxes stay valid.
+    """
     boxes, near, place = around
     place[:3] = p
     place[4] = slack * slack
@@ -159,12 +171,13 @@ def _find(shapes, around, p, reach, slack):
 
 @reducing
 def visible(shapes, around, own, point, normal, strength, reach, footprint):
-    """Return the share of ambient light at a point, 1 without occlusion.
+    """Return the share of ambient light that reaches a point; 1 without occlusion.
 
-    It compares distances to shapes at two heights above the point, after Evans 2006, "Fast
-    approximations for global illumination on dynamic scenes". around: see `surroundings`. own:
-    index of the point's shape. footprint: distance between neighbouring pixels at the point, in
-    metres.
+    Distances from two heights above the point to other shapes are compared with the heights, after
+    Evans 2006, "Fast approximations for global illumination on dynamic scenes". around: see
+    `surroundings`. own: index of the shape on which the point lies. strength: 0
+    for no occlusion. reach: distance at which shapes darken points. footprint: distance between
+    neighbouring pixels at the point. Lengths are in metres.
     """
     x, y, z = narrow(point)
     nx, ny, nz = narrow(normal)

@@ -1,4 +1,4 @@
-"""Primitives and shapes, and their conversion to tables for the ray caster."""
+"""Primitives and shapes of scenes, and their conversion to tables for the ray caster."""
 
 import math
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ ROUND = (s.ELLIPSOID, s.CAPSULE, s.TORUS)
 class Primitive(NamedTuple):
     """Solid of a given kind, such as a box or a torus.
 
-    half: half sizes in metres. turn: rotation to the world frame. extra: see `PRIMITIVE` in
-    `tables.py`.
+    half: half sizes in metres. turn: rotation from the primitive's frame to the world frame. extra:
+    a further size of some kinds, such as the thickness of a torus; see `PRIMITIVE` in tables.py.
     """
 
     kind: int
@@ -39,7 +39,7 @@ class Primitive(NamedTuple):
         return Primitive(self.kind, center, half, product(turn, self.turn), self.extra)
 
     def reach(self) -> float:
-        """Return the vertical distance from the centre to the highest point, in metres."""
+        """Return the height of the primitive's highest point above its centre, in metres."""
         size = self.half[2]
         up = abs(self.turn[8])
         if self.kind == s.CAPSULE:
@@ -54,10 +54,10 @@ class Primitive(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Primitive `body`, from which the primitive `cut` may be removed.
+    """Solid shape: the primitive `body`, from which the primitive `cut` is removed if it is given.
 
-    texture: index of the first texture. faces: number of textures, one for each face. cut_texture:
-    texture of the cut's wall. scale: metres per unit of a texture.
+    texture: index of the body's first texture. faces: number of its textures, one for each face.
+    cut_texture: texture of the cut's wall. scale: metres per unit of a texture.
     """
 
     body: Primitive
@@ -75,14 +75,14 @@ class Shape(NamedTuple):
 
 
 def rotated(turn: Turn, p: Point) -> Point:
-    """Rotate the point p by `turn`."""
+    """Return the point p, rotated by `turn`."""
     a, b, c, d, e, f, g, h, i = turn
     x, y, z = p
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
 def product(a: Turn, b: Turn) -> Turn:
-    """Return the matrix product a b: the rotation by b, then by a."""
+    """Return the matrix product a b, which rotates by b first, then by a."""
     columns = [rotated(a, b[axis::3]) for axis in range(3)]
     return tuple(chain(*zip(*columns, strict=True)))
 
@@ -95,7 +95,7 @@ def about_z(angle: float) -> Turn:
 
 
 def any_turn(rng: Random) -> Turn:
-    """Return a uniform random rotation."""
+    """Return a random rotation; all rotations are equally likely."""
     # normal distributions prefer no direction
     w, x, y, z = (rng.gauss(0, 1) for _ in range(4))
     f = 2 / (w * w + x * x + y * y + z * z)
@@ -107,7 +107,10 @@ def any_turn(rng: Random) -> Turn:
 
 
 def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primitive:
-    """Return a round or square bar between two points."""
+    """Return a bar from `start` to `end`.
+
+    radius: half the thickness in metres. square: True for a square section, False for a round one.
+    """
     x, y, z = (b - a for a, b in zip(start, end, strict=True))
     # two equal points must not divide by 0
     length = math.sqrt(x * x + y * y + z * z) + 1e-9
@@ -126,7 +129,7 @@ def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primit
 
 
 def packed(shapes: Sequence[Shape]) -> np.ndarray:
-    """Return a table of SHAPE for the ray caster, one row for each shape."""
+    """Return the shapes as a table of SHAPE for the ray caster, one row for each shape."""
     table = np.zeros(len(shapes), s.SHAPE)
     body = _primitives([shape.body for shape in shapes])
     table["body"] = body
@@ -144,7 +147,7 @@ def packed(shapes: Sequence[Shape]) -> np.ndarray:
 
 
 def _primitives(primitives: Sequence[Primitive]) -> np.ndarray:
-    """Return a table of PRIMITIVE, one row for each primitive."""
+    """Return the primitives as a table of PRIMITIVE, one row for each primitive."""
     kind, center, half, turn, extra = map(np.array, zip(*primitives, strict=True))
     metric = (kind >= s.BLOCK)[:, None]
     unit = np.where(metric, 1.0, half)

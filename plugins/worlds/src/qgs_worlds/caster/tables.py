@@ -1,7 +1,7 @@
 """NumPy record types that describe shapes, textures, lights and air to the ray caster.
 
-The world frame is in metres, z up. A shape is a primitive, from which a second, convex primitive
-may be cut.
+The world frame is in metres, with z up. A shape is a primitive (`body`), from which a second,
+convex primitive (`cut`) may be removed.
 """
 
 from typing import NamedTuple
@@ -73,7 +73,11 @@ MAP = np.dtype([("begin", "i8"), ("side", "i8"), ("focal", "f8"), ("c2w", "f8", 
 
 
 class Shadows(NamedTuple):
-    """Shadow maps: a table of MAP, and the depths and face codes of the pixels of all maps."""
+    """Shadow maps of all lights.
+
+    maps: table of MAP, one row for each map. depths, codes: depth and face code of every pixel, of
+    all maps one after the other.
+    """
 
     maps: np.ndarray
     depths: np.ndarray
@@ -81,9 +85,9 @@ class Shadows(NamedTuple):
 
 
 class World(NamedTuple):
-    """Abstract scene for the ray caster: tables of SHAPE, TEXTURE, LIGHT and one row of AIR.
+    """Abstract scene for the ray caster: tables of SHAPE, TEXTURE and LIGHT, and one row of AIR.
 
-    heights: height maps (K, G, G) float32 in [-1, 1].
+    heights: K height maps (K, G, G) float32 in [-1, 1]. shadows: shadow maps of the lights.
     """
 
     shapes: np.ndarray
@@ -97,9 +101,9 @@ class World(NamedTuple):
 class Room(NamedTuple):
     """Furnished room for the ray caster.
 
-    shapes: table of SHAPE; row 0 is the room itself. heights: see `World`. textures: table of
-    TEXTURE. size: x, y, z extent in metres. lights: table of LIGHT. floor: factors (C, C) of the
-    light on the floor, indexed by x, then y.
+    shapes: table of SHAPE; row 0 is the room itself. heights: height maps (K, G, G), which rooms do
+    not use. textures: table of TEXTURE. size: x, y, z extent in metres. lights: table of LIGHT.
+    floor: factors (C, C) by which shadows reduce the light on the floor, indexed by x, then y.
     """
 
     shapes: np.ndarray

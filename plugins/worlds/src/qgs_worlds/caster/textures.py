@@ -1,4 +1,4 @@
-"""Noise and patterns of textures, evaluated at a point of a surface."""
+"""Colours of textures at a point of a surface: noise, with patterns on top."""
 
 import math
 
@@ -16,15 +16,15 @@ _TABLE = np.random.default_rng(7).random((_SIDE, _SIDE)).astype(np.float32)
 
 @inner
 def chance(i, j, seed):
-    """Return a pseudo-random number in [0, 1) for the lattice point (i, j)."""
+    """Return a pseudo-random number in [0, 1) for the point (i, j) of an integer grid."""
     return float(_TABLE[(i + seed) & (_SIDE - 1), (j + (seed >> 6)) & (_SIDE - 1)])
 
 
 @inner
 def _corner(basis, i, j, seed, x, y):
-    """Return what lattice point (i, j) adds to noise at offset (x, y).
+    """Return the contribution of grid point (i, j) to noise at the offset (x, y) from it.
 
-    VALUE noise takes a random number, GRADIENT noise a random slope times the offset.
+    For VALUE noise it is a random number; for GRADIENT noise it is a random slope times the offset.
     """
     if basis == s.VALUE:
         return chance(i, j, seed) - 0.5
@@ -33,7 +33,11 @@ def _corner(basis, i, j, seed, x, y):
 
 @inner
 def _cells(x, y, i, j, seed):
-    """Return the distance to the nearest of random points, one per cell, scaled to a mean of 0."""
+    """Return noise at (x, y) from random points, one in each cell of a grid.
+
+    It is the distance to the nearest of these points, shifted and scaled to a mean of about 0.
+    i, j: cell of (x, y).
+    """
     least = 4.0
     for a in range(-1, 2):
         for b in range(-1, 2):
@@ -45,7 +49,7 @@ def _cells(x, y, i, j, seed):
 
 @inner
 def eased(x):
-    """Return the smoothstep of x in [0, 1], which has slope 0 at both ends."""
+    """Return smoothstep at x in [0, 1]: a step from 0 to 1 whose slope is 0 at both ends."""
     return x * x * (3 - 2 * x)
 
 
@@ -53,7 +57,7 @@ def eased(x):
 def noise(basis, x, y, seed):
     """Return noise at (x, y) with a mean of about 0, mostly between -0.5 and 0.5.
 
-    basis: VALUE, GRADIENT or CELLS. Lattice points are at distance 1.
+    basis: kind of noise: VALUE, GRADIENT or CELLS. Its grid has cells of size 1.
     """
     i = math.floor(x)
     j = math.floor(y)
@@ -73,13 +77,20 @@ def noise(basis, x, y, seed):
 
 @inner
 def _seen(footprint, period):
-    """Return the visibility in [0, 1] of details with a period; 0 below two pixel footprints."""
+    """Return the visibility of details of a texture, from 0 to 1.
+
+    period: size of a repeated detail. footprint: distance between neighbouring pixels in the same
+    unit; details of two footprints or less have visibility 0.
+    """
     return min(max(2.0 - 4.0 * footprint / period, 0.0), 1.0)
 
 
 @inner
 def _octaves(texture, x, y, footprint):
-    """Return the sum of a texture's noise octaves, around 0.5. x, y, footprint: in periods."""
+    """Return the sum of a texture's noise octaves at (x, y), around 0.5.
+
+    x, y and footprint (distance between neighbouring pixels) are in periods of the texture.
+    """
     total = 0.0
     weight = texture.contrast
     for octave in range(texture.octaves):
@@ -103,13 +114,16 @@ def _step(x, blur):
 
 @inner
 def _bar(x, width, blur):
-    """Return 1 in a bar of `width` centred on each integer, else 0; edges are blurred."""
+    """Return 1 inside bars of width `width` around integers x, else 0; edges have width `blur`."""
     return _step(0.5 * width - abs(x - math.floor(x + 0.5)), blur)
 
 
 @inner
 def _glyphs(x, y, seed):
-    """Return 1 where (x, y) is inked in lines of random letters of 4 x 6 dots, else 0."""
+    """Return 1 if (x, y) is on the ink of a text of random letters, else 0.
+
+    A line has height 1, a letter width 1. Letters consist of 4 x 6 dots.
+    """
     line = math.floor(y)
     place = math.floor(x)
     if chance(place // 3, line, seed + 5) < 0.25 or chance(place, line, seed) < 0.15:
@@ -123,7 +137,7 @@ def _glyphs(x, y, seed):
 
 @inner
 def _mean(kind, width):
-    """Return the mean share of the pattern's colour over a whole pattern."""
+    """Return the share of the pattern's own colour, as a mean over the whole pattern."""
     if kind == s.CHECKER:
         return 0.5
     if kind == s.TILES:
@@ -135,7 +149,10 @@ def _mean(kind, width):
 
 @inner
 def _pattern(kind, x, y, width, seed, blur):
-    """Return the share of the pattern's colour at (x, y), and a random tone in [0, 1]."""
+    """Return the share of the pattern's own colour at (x, y), and a random tone in [0, 1].
+
+    x, y, blur: in periods of the pattern.
+    """
     if kind == s.STRIPES or kind == s.RINGS:
         place = x if kind == s.STRIPES else math.sqrt(x * x + y * y)
         return _bar(place, width, blur), chance(math.floor(place + 0.5), 0, seed)
@@ -159,9 +176,9 @@ def _pattern(kind, x, y, width, seed, blur):
 
 @inner
 def _marked(texture, rgb, u, v, warped, footprint):
-    """Blend the pattern of a texture over the colour `rgb`.
+    """Return the colour `rgb` with the pattern of a texture blended over it, at (u, v).
 
-    warped: u in periods of the noise, after the noise's warp.
+    warped: u in periods of the texture's noise, after the noise was warped.
     """
     period = texture.pattern_period
     blur = footprint / period * max(texture.aspect, 1.0)
@@ -180,7 +197,8 @@ def _marked(texture, rgb, u, v, warped, footprint):
 def color(texture, u, v, footprint):
     """Return the RGB of a texture at (u, v).
 
-    footprint: distance between neighbouring pixels on the surface, in the unit of u and v.
+    footprint: distance between neighbouring pixels on the surface. u, v and footprint have one
+    unit.
     """
     x = u / texture.period
     y = v / texture.period

@@ -1,6 +1,6 @@
 """Decorators for numba kernels, and operations on points, directions and RGB colours.
 
-A point, direction or colour is a tuple of three numbers, or an array of three.
+Points, directions and colours are tuples or arrays of three numbers.
 """
 
 import math
@@ -25,13 +25,13 @@ reducing = partial(inner, fastmath={"contract", "reassoc", "arcp", "nsz", "nnan"
 
 @inner
 def triple(a):
-    """Return an array of three numbers as a tuple."""
+    """Return an array a of three numbers as a tuple."""
     return a[0], a[1], a[2]
 
 
 @inner
 def narrow(a):
-    """Return the vector with float32 numbers."""
+    """Return the vector a as a tuple of float32 numbers."""
     return np.float32(a[0]), np.float32(a[1]), np.float32(a[2])
 
 
@@ -43,25 +43,25 @@ def dot(a, b):
 
 @inner
 def minus(a, b):
-    """Return a - b."""
+    """Return the vector a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @inner
 def along(o, t, d):
-    """Return o + t * d."""
+    """Return o + t * d: the point at parameter t of the ray from o in direction d."""
     return o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
 
 
 @inner
 def times(s, a):
-    """Return s * a."""
+    """Return the vector a times the number s."""
     return s * a[0], s * a[1], s * a[2]
 
 
 @inner
 def over(a, s):
-    """Return a / s."""
+    """Return the vector a divided by the number s."""
     return a[0] / s, a[1] / s, a[2] / s
 
 
@@ -79,14 +79,14 @@ def mix(a, b, w):
 
 @inner
 def unit(a):
-    """Return the vector divided by its length."""
+    """Return the vector a divided by its length; a zero vector gives a zero vector."""
     # the summand keeps a vector without length from becoming NaN
     return times(1.0 / math.sqrt(dot(a, a) + 1e-20), a)
 
 
 @inner
 def longest(a):
-    """Return the axis, 0 to 2, along which a vector has the largest absolute value."""
+    """Return the number of the axis, 0 to 2, on which a vector has the largest absolute value."""
     if abs(a[0]) >= abs(a[1]) and abs(a[0]) >= abs(a[2]):
         return 0
     return 1 if abs(a[1]) >= abs(a[2]) else 2

@@ -1,4 +1,4 @@
-"""Plugin `rooms`: procedural furnished rooms as training data."""
+"""Plug-in `rooms`: procedural furnished rooms as training data."""
 
 from qgs.contracts import Plugin
 from qgs_worlds.rooms.source import RoomsSource

@@ -1,4 +1,4 @@
-"""Pieces of furniture. Each is a list of shapes around the origin with its back towards +y.
+"""Random pieces of furniture: lists of shapes around the origin, with the back towards +y.
 
 The world frame of a room is in metres: x and y along the walls, z up, the floor at z = 0. The z
 axis goes through the centre of the room. Shapes are upright and may be turned about z.
@@ -26,7 +26,7 @@ WALLS = 6
 class Shape(NamedTuple):
     """Shape of furniture, turned by `turn` radians about z.
 
-    kind: BLOCK, BALL or CYLINDER. half: half size along each axis in metres; for round shapes, the
+    kind: BLOCK, BALL or CYLINDER. half: half sizes on each axis in metres; for round shapes, the
     radii. texture: index of a material.
     """
 
@@ -37,7 +37,7 @@ class Shape(NamedTuple):
     texture: int
 
     def moved(self, x: float, y: float, turn: float) -> "Shape":
-        """Return the shape turned by `turn` radians about the origin, then moved by (x, y)."""
+        """Return the shape, turned by `turn` radians about the z axis, then moved by (x, y)."""
         cos = math.cos(turn)
         sin = math.sin(turn)
         cx, cy, cz = self.center
@@ -45,7 +45,7 @@ class Shape(NamedTuple):
         return Shape(self.kind, center, self.half, self.turn + turn, self.texture)
 
     def bounds(self) -> tuple[float, ...]:
-        """Return the bounding box of the shape: lowest x, y, z, then highest x, y, z."""
+        """Return the bounding box of the shape: lowest x, y, z, then highest x, y, z, in metres."""
         x, y, z = self.center
         a, b, c = self.half
         # most shapes are not turned, and bounds are asked for often
@@ -59,25 +59,32 @@ class Shape(NamedTuple):
 
 
 def box(x: float, y: float, z: float, w: float, d: float, h: float, texture: int) -> Shape:
-    """Return a w x d x h box. (x, y, z) is the centre of its bottom face."""
+    """Return a box of width w (along x), depth d (along y) and height h, in metres.
+
+    (x, y, z) is the centre of its bottom face. texture: index of a material.
+    """
     return Shape(s.BLOCK, (x, y, z + h / 2), (w / 2, d / 2, h / 2), 0.0, texture)
 
 
 def cylinder(x: float, y: float, z: float, radius: float, height: float, texture: int) -> Shape:
-    """Return an upright cylinder. (x, y, z) is the centre of its bottom face."""
+    """Return an upright cylinder. Lengths are in metres.
+
+    (x, y, z) is the centre of its bottom face. texture: index of a material.
+    """
     half = (radius, radius, height / 2)
     return Shape(s.CYLINDER, (x, y, z + height / 2), half, 0.0, texture)
 
 
 def sphere(x: float, y: float, z: float, radius: float, texture: int) -> Shape:
-    """Return a sphere whose lowest point is (x, y, z)."""
+    """Return a sphere whose lowest point is (x, y, z). texture: index of a material."""
     return Shape(s.BALL, (x, y, z + radius), (radius, radius, radius), 0.0, texture)
 
 
 def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
     """Return a table of SHAPE for the ray caster: first the room itself, then the shapes in it.
 
-    Textures 0 to 5 are those of walls, floor and ceiling. The textures of the shapes follow.
+    size: x, y, z extent of the room in metres. Textures 0 to 5 are those of walls, floor and
+    ceiling; textures of the other shapes follow from 6 on.
     """
     walls = Shape(s.INTERIOR, (0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2]), 0.0, -WALLS)
     return shapes.packed(
@@ -108,7 +115,10 @@ _LEVEL = 0.38
 
 
 def _terms(value: float | str) -> float | list[tuple[float, str]]:
-    """Parse a sum such as "h-0.3r" into pairs of factor and name. Return a number unchanged."""
+    """Parse a sum of lengths such as "h-0.3r" into pairs (factor, name of a length).
+
+    The name of a plain number in the sum is "". A `value` that is a number is returned unchanged.
+    """
     if not isinstance(value, str):
         return value
     found = re.findall(r"([+-]?)(?=[\d.a-z])([\d.]*)([a-z]*)", value)
@@ -135,21 +145,27 @@ for _kind in _KINDS.values():
 
 
 def _part(row: list[Any], sizes: Sizes) -> Shape:
-    """Return the shape that a row of `furniture.toml` describes."""
+    """Return the shape that a row of `parts` in furniture.toml describes.
+
+    sizes: values of the names in the row.
+    """
     make, lengths, material, *turn = row
     part = make(*_lengths(lengths, sizes), sizes[material])
     return part._replace(turn=sizes[turn[0]]) if turn else part
 
 
 class Furniture:
-    """Generator of random furniture for one room, from the kinds in `furniture.toml`."""
+    """Generator of random furniture for one room, of the kinds in furniture.toml."""
 
     def __init__(self, rng: Random, material: Materials) -> None:
         self.rng = rng
         self.material = material
 
     def piece(self, name: str, **sizes: Any) -> Piece:
-        """Return a random piece of furniture. sizes: values to use instead of random ones."""
+        """Return a random piece of furniture of the kind `name` in furniture.toml.
+
+        sizes: lengths and materials to use instead of random ones, by their names in the file.
+        """
         kind = _KINDS[name]
         for size, how in kind.get("draws", {}).items():
             if size not in sizes:
@@ -180,12 +196,15 @@ class Furniture:
         return self.material(next(name for name, below in how.items() if pick < below))
 
     def spots(self, most: float) -> list[float]:
-        """Return one to three random offsets from the middle, shares of a width up to `most`."""
+        """Return one to three random positions along the width of a piece, relative to this width.
+
+        0 is the middle; positions are from -most to most.
+        """
         return [self.rng.uniform(-most, most) for _ in range(self.rng.randrange(1, 4))]
 
 
 def _around_table(make: Furniture, sizes: Sizes) -> Piece:
-    """Return ornaments on a table and chairs around the table."""
+    """Return random ornaments on a table and chairs around it, without the table."""
     rng = make.rng
     w = sizes["w"]
     d = sizes["d"]
@@ -211,7 +230,7 @@ def _cushions(make: Furniture, sizes: Sizes) -> Piece:
 
 
 def _books(make: Furniture, sizes: Sizes) -> Piece:
-    """Return the boards of a shelf with rows of books and a few balls on them."""
+    """Return the boards of a shelf, with rows of books and a few balls on the boards."""
     rng = make.rng
     w = sizes["w"]
     levels = sizes["n"]

@@ -1,4 +1,4 @@
-"""Random materials of a room, with matching colours; `materials.toml` lists their kinds."""
+"""Random materials of a room, in matching colours; materials.toml lists the kinds."""
 
 import colorsys
 import tomllib
@@ -21,17 +21,17 @@ _WOODS: list[Color] = _KINDS["floor"]["kinds"][0]["paints"]["board"]["any"]
 
 
 def toned(color: Color, factor: float) -> Color:
-    """Return a darker (factor < 1) or lighter `color`, within [0, 1]."""
+    """Return `color` times `factor`, with values of at most 1: darker if `factor` < 1."""
     return [min(part * factor, 1.0) for part in color]
 
 
 def between(rng: Random, value: float | Sequence[float]) -> float:
-    """Return `value` if it is a number, or a uniform random number if it is a range [low, high]."""
+    """Return `value` if it is a number; return a uniform random number if it is [low, high]."""
     return value if isinstance(value, int | float) else rng.uniform(*value)
 
 
 class Materials:
-    """Generator and list of the random textures of one room, in a few matching hues."""
+    """Random textures of one room, in a few matching hues; calling the object adds a texture."""
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
@@ -42,7 +42,7 @@ class Materials:
         self._wood = rng.choice(_WOODS)
 
     def __call__(self, name: str) -> int:
-        """Add a random material of kind `name` of `materials.toml` and return its index."""
+        """Add a random material of the kind `name` in materials.toml, and return its index."""
         rng = self.rng
         paints = dict(_FIXED)
         kind = _KINDS[name]
@@ -64,7 +64,10 @@ class Materials:
         return len(self._rows) - 1
 
     def table(self, first: Sequence[int]) -> np.ndarray:
-        """Return a table of TEXTURE for the ray caster: materials `first`, then all materials."""
+        """Return a table of TEXTURE for the ray caster, one row for each material.
+
+        first: indices of materials whose rows come first. The rows of all materials follow.
+        """
         rows = [self._rows[i] for i in first] + self._rows
         table = np.zeros(len(rows), TEXTURE)
         for field in rows[0].keys() - {"colors"}:
@@ -73,7 +76,10 @@ class Materials:
         return table
 
     def _pattern(self, kind: dict[str, Any], paints: dict[str, Color]) -> dict[str, int]:
-        """Choose a random pattern for a kind of material, and add its colours to `paints`."""
+        """Choose a random pattern for a kind of material, and add its colours to `paints`.
+
+        Returns {"pattern": number of the pattern}; an empty dict if the kind has no pattern.
+        """
         names = kind.get("patterns", [])
         # a choice among one would consume a random number
         name = self.rng.choice(names) if len(names) > 1 else "".join(names)

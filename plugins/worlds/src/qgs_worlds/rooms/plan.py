@@ -35,7 +35,10 @@ _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 
 def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
-    """Return a random room of `size` metres, its furniture clear of cameras at `eyes` (F, 3)."""
+    """Return a random furnished room of `size` metres.
+
+    eyes: camera centres (F, 3), from which furniture keeps a distance.
+    """
     material = Materials(rng)
     # in most rooms all four walls are of one kind
     wall = material("wall")
@@ -61,7 +64,7 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
 
 
 class Furnisher:
-    """Placer of furniture that refuses collisions with cameras and with earlier pieces."""
+    """Places furniture in a room, unless it collides with a camera or with an earlier piece."""
 
     def __init__(self, size: Size, eyes: np.ndarray) -> None:
         self.size = size
@@ -70,7 +73,10 @@ class Furnisher:
         self._taken: list[tuple[float, float, float, float]] = []
 
     def place(self, piece: Piece, x: float, y: float, turn: float) -> bool:
-        """Place `piece` at (x, y), turned by `turn` radians. Return False if it does not fit."""
+        """Place `piece` at (x, y), turned by `turn` radians, if it fits.
+
+        Returns True if the piece was placed, False if it does not fit.
+        """
         low, high = turned(*bounds(piece), x, y, turn)
         if not self.free(low, high):
             return False
@@ -79,7 +85,10 @@ class Furnisher:
         return True
 
     def free(self, low: Point, high: Point) -> bool:
-        """Return True if a box is inside the room and clear of all pieces and cameras."""
+        """Return True if a box is inside the room and clear of all placed pieces and cameras.
+
+        low, high: lowest and highest corner of the box.
+        """
         half_x = self.size[0] / 2
         half_y = self.size[1] / 2
         if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
@@ -97,13 +106,16 @@ class Furnisher:
 
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
-    """Return the lowest and the highest corner of the bounding box of `shapes`."""
+    """Return the lowest and the highest corner of the box around all of `shapes`."""
     x0, y0, z0, x1, y1, z1 = zip(*[shape.bounds() for shape in shapes], strict=True)
     return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
 
 
 def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
-    """Return the bounding box of a box turned about z by `turn` radians and moved by (x, y)."""
+    """Return the bounding box of a box after a turn by `turn` radians about z and a move by (x, y).
+
+    low, high, and the result: lowest and highest corner of a box.
+    """
     cos = math.cos(turn)
     sin = math.sin(turn)
     xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
@@ -124,7 +136,10 @@ def _centre(make: Furniture, furnisher: Furnisher) -> None:
 
 
 def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
-    """Place a row of pieces with their backs to wall `side`: 0 to 3 are -x, -y, +x and +y."""
+    """Place a row of random pieces with their backs to a wall.
+
+    side: number of the wall; 0 to 3 are the walls at -x, -y, +x and +y.
+    """
     rng = make.rng
     across = furnisher.size[side % 2]
     along = furnisher.size[1 - side % 2]
@@ -144,7 +159,11 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
 
 
 def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
-    """Return x and y of a point `away` metres towards wall `side` and `along` metres beside it."""
+    """Return x and y of a point, given relative to a wall.
+
+    side: number of the wall, 0 to 3. away: distance in metres from the centre of the room towards
+    the wall. along: distance in metres beside this line, along the wall.
+    """
     angle = math.pi + side * math.pi / 2
     cos = math.cos(angle)
     sin = math.sin(angle)
@@ -152,7 +171,7 @@ def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
 
 
 def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
-    """Return a window on wall `window_side`, and pictures on the three other walls."""
+    """Return the shapes of a window on wall `window_side` and of pictures on the other walls."""
     rng = make.rng
     shapes: list[Shape] = []
     for side in range(4):
@@ -177,7 +196,7 @@ def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
 
 
 def _fixed(make: Furniture, size: Size) -> list[Shape]:
-    """Return the shapes of skirting boards, ceiling lamp and, in most rooms, a rug."""
+    """Return the shapes of skirting boards, of a ceiling lamp and, in most rooms, of a rug."""
     rng = make.rng
     board = make.material("pale")
     w, d, h = size
@@ -194,7 +213,7 @@ def _fixed(make: Furniture, size: Size) -> list[Shape]:
 
 
 def _lights(rng: Random, size: Size, window_side: int) -> np.ndarray:
-    """Return a table of LIGHT with two rows: a warm lamp below the ceiling, and a cool window."""
+    """Return a table of LIGHT with two rows: a warm lamp below the ceiling, a cool window."""
     x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
     lights = np.zeros(2, LIGHT)
     lights["place"] = (0.0, 0.0, size[2] - 0.2), (x, y, 1.6)

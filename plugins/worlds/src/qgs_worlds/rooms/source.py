@@ -44,7 +44,10 @@ class RoomsConfig(DrawnConfig):
 
 
 class RoomScene(DrawnScene):
-    """Furnished room and its cameras on a path. World frame: metres, z up, floor at z = 0."""
+    """Furnished room, with its cameras on a path through the room.
+
+    World frame: metres, z up, floor at z = 0.
+    """
 
     def __init__(
         self, name: str, index: int, config: RoomsConfig, split: Split, cache: ImageCache
@@ -60,7 +63,7 @@ class RoomScene(DrawnScene):
 
     @cached_property
     def tables(self) -> "Room":
-        """Walls, furniture, textures and lights, as tables for the ray caster."""
+        """The walls, furniture, textures and lights of the room, as tables for the ray caster."""
         from qgs_worlds.rooms.plan import furnish
 
         return furnish(Random(self._plan_seed), self.size, self.c2w[:, :3, 3])
@@ -78,7 +81,7 @@ class RoomScene(DrawnScene):
 
 
 class RoomsSource(DrawnSource):
-    """Source of random furnished rooms. Seed, split and index determine a room."""
+    """Source of random furnished rooms. Each room is determined by seed, split and index."""
 
     name = "procedural"
     Config = RoomsConfig
@@ -88,9 +91,9 @@ class RoomsSource(DrawnSource):
 def camera_path(
     rng: np.random.Generator, size: tuple[float, float, float], count: int
 ) -> np.ndarray:
-    """Return c2w (count, 4, 4) of a camera path that looks across a room of `size` metres.
+    """Return poses c2w (count, 4, 4) on a random path, with views across a room of `size` metres.
 
-    Camera axes follow OpenCV. A path starts near a wall and may be walked in both directions.
+    Camera axes follow OpenCV. The path leads along a wall, in a random direction.
     """
     # drawn along one wall, then turned, so that all four walls are equally likely
     side = int(rng.integers(4))

@@ -1,4 +1,4 @@
-"""Plugin `worlds`: procedural abstract scenes as training data, and models trained on them."""
+"""Plug-in `worlds`: procedural abstract scenes as training data, and models trained on them."""
 
 from qgs.contracts import Plugin
 from qgs_worlds.worlds.source import WorldsSource

@@ -1,4 +1,4 @@
-"""Random cameras: walks, orbits, turns on the spot, and scattered cameras around a target."""
+"""Random cameras: walks, orbits, turns on the spot, and cameras scattered around a point."""
 
 import math
 from typing import NamedTuple, TypeAlias
@@ -26,10 +26,11 @@ _PROBE = (6, 6)
 
 
 class Rig(NamedTuple):
-    """Cameras of a scene.
+    """The F cameras of a scene.
 
     c2w: poses (F, 4, 4) with OpenCV axes. fov: field of view along the longer side of an image, in
-    degrees. distance: metres from the cameras to their target. motion: name of the camera motion.
+    degrees. distance: metres from the cameras to the point that they look at. motion: name of the
+    camera motion, such as "walk".
     """
 
     c2w: np.ndarray
@@ -38,12 +39,15 @@ class Rig(NamedTuple):
     motion: str
 
     def lens(self, size: tuple[int, int]) -> np.ndarray:
-        """Return intrinsics fx, fy, cx, cy in pixels for images of size (H, W)."""
+        """Return intrinsics fx, fy, cx, cy in pixels for images of `size` (H, W)."""
         focal = lens(self.fov, (max(size), max(size)))[0]
         return np.array([focal, focal, size[1] / 2, size[0] / 2])
 
     def sight(self, place: Place) -> tuple[np.ndarray, float]:
-        """Return centre and radius of a ball around most of the view; indoors, around the room."""
+        """Return centre and radius, in metres, of a ball around most of what the cameras see.
+
+        Indoors it is a ball around the room.
+        """
         if place.kind == "indoors":
             half = 0.5 * place.top
             return np.array([0.0, 0.0, half]), math.hypot(*place.high[:2], half) + 0.5
@@ -54,8 +58,8 @@ class Rig(NamedTuple):
 class Path(NamedTuple):
     """Parameters of a camera path through or around the point `base`, with views of `target`.
 
-    length: length of the path in metres. s: position of each camera on the path, from -0.5 to 0.5.
-    fov: see `Rig`.
+    length: length of the path in metres. s: position of each camera on the path, from -0.5 (start)
+    to 0.5 (end). fov: field of view along the longer side of an image, in degrees.
     """
 
     base: np.ndarray
@@ -78,8 +82,9 @@ def draw_cameras(
 ) -> Rig:
     """Return `count` random cameras in `place` with useful views.
 
-    world: table of SHAPE and height maps. The cameras are the best of a few random sets and keep
-    `CLEARANCE` from fixed shapes. The caller must remove movable shapes that are nearer.
+    world: table of SHAPE, and height maps. varied: False gives only level walks. The cameras are
+    the best of a few random sets and keep the distance CLEARANCE from fixed shapes. The caller must
+    remove other shapes that are nearer.
     """
     best = None
     least = math.inf
@@ -100,7 +105,10 @@ def draw_cameras(
 
 
 def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
-    """Return 0 if all camera centres are in the allowed box and clear of fixed shapes, else 100."""
+    """Return 0 if all camera centres are in the allowed box and clear of fixed shapes.
+
+    Otherwise return the penalty 100. eyes: camera centres (F, 3).
+    """
     inside = (eyes >= place.low).all() and (eyes <= place.high).all()
     return 0.0 if inside and clearances(shapes[: place.fixed], eyes).min() > CLEARANCE else 100.0
 
@@ -117,7 +125,10 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
-    """Return cameras millimetres apart, where space is widest; used if all camera paths fail."""
+    """Return cameras within 1 cm of one point, the freest of some random points.
+
+    They are used if all random paths fail.
+    """
     # any point is better than one inside a wall
     points = rng.uniform(place.low, place.high, (64, 3))
     base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
@@ -129,7 +140,10 @@ def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: in
 
 
 def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
-    """Return random cameras, not yet tested for collisions. shrink: factor of the path's length."""
+    """Return random cameras that have not been tested for collisions.
+
+    shrink: factor of the path's length, to make it shorter.
+    """
     target = np.array(place.targets[rng.integers(len(place.targets))])
     base, distance = _stand(rng, place, target, varied)
     s = np.linspace(-0.5, 0.5, count)
@@ -181,7 +195,10 @@ def _stand(
 
 
 def _walk(rng: np.random.Generator, path: Path) -> Motion:
-    """Move along a bent line. Cameras with a wide field of view may look ahead."""
+    """Return a walk along a bent line.
+
+    If the field of view is wide, cameras may look ahead, not only at the target.
+    """
     base, target, length, s, fov = path
     # people move more along the ground than up
     way = rng.normal(size=3) * (1, 1, 0.3)
@@ -193,7 +210,7 @@ def _walk(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _orbit(rng: np.random.Generator, path: Path) -> Motion:
-    """Move around the target, with small changes of height and distance."""
+    """Return a path around the target, with small changes of height and distance."""
     base, target, length, s, _ = path
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
@@ -207,7 +224,7 @@ def _orbit(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _round(rng: np.random.Generator, path: Path) -> Motion:
-    """Turn almost on the spot, so that views overlap."""
+    """Return cameras that turn almost on the spot, so that views overlap."""
     base, target, length, s, fov = path
     angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
     way = np.stack([*_turned(target - base, angles), np.full(len(s), (target - base)[2])], 1)
@@ -216,7 +233,7 @@ def _round(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _gather(rng: np.random.Generator, path: Path) -> Motion:
-    """Look at the target from places scattered around one point."""
+    """Return cameras that look at the target from random positions around one point."""
     base, target, length, s, _ = path
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
     # the square root spreads them nearly evenly over the disc
@@ -228,7 +245,10 @@ _MOTIONS = {"walk": _walk, "orbit": _orbit, "round": _round, "gather": _gather}
 
 
 def _turned(way: np.ndarray, angles: np.ndarray) -> Motion:
-    """Turn the vector `way` about z by each angle (F,) in radians; return x and y, both (F,)."""
+    """Turn the vector `way` about z by each of F angles (F,) in radians.
+
+    Returns x and y of the turned vectors, both (F,).
+    """
     cos = np.cos(angles)
     sin = np.sin(angles)
     return cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]

@@ -1,4 +1,4 @@
-"""Random abstract scenes: shapes, lights, cameras and camera effects, and their images."""
+"""Random abstract scenes (shapes, lights, cameras, camera effects), and their images."""
 
 import math
 from collections.abc import Sequence
@@ -37,9 +37,10 @@ _THUMB = (10, 10)
 
 
 class Drawn(NamedTuple):
-    """Random scene: place, world, cameras and camera effects.
+    """A random abstract scene: place, world, cameras and camera effects.
 
-    scale: factor of all lengths that brings the median visible depth into the range of `depth`.
+    scale: factor of all lengths, which brings the median visible depth into the range
+    `WorldsConfig.depth`; 1 without such a range.
     """
 
     place: Place
@@ -49,14 +50,17 @@ class Drawn(NamedTuple):
     scale: float
 
     def photos(self, frames: list[int], size: Size, samples: int) -> list[np.ndarray]:
-        """Render one image (H, W, 3) uint8 for each frame, with samples^2 rays per pixel."""
+        """Return a rendered image (H, W, 3) uint8 for each of `frames`.
+
+        samples: rays per pixel along each axis.
+        """
         light = np.empty((len(frames), *size, 3), np.float32)
         cast(self.world, self.rig.c2w[frames], self.rig.lens(size), size, samples, paint, light)
         return [self.effects.photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
 
 
 def draw(key: list[int], config: "WorldsConfig") -> Drawn:
-    """Return the scene that a key (seed, split, index) determines."""
+    """Return the scene that `key` (seed, split, index) and the options `config` determine."""
     numbers = np.random.default_rng(key)
     # four generators, so that each option changes only its own part
     plan, skin, shine, camera = (Random(int(numbers.integers(1 << 62))) for _ in range(4))
@@ -91,7 +95,11 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
 
 
 def _tinted(rng: Random, by: float) -> np.ndarray:
-    """Return a random RGB tint with mean 1. by: standard deviation in stops, red against blue."""
+    """Return random factors for R, G and B whose mean is 1.
+
+    by: standard deviation of the factor of R, in stops (powers of 2); that of B changes the other
+    way.
+    """
     warm = rng.gauss(0, by)
     green = rng.gauss(0, 0.3 * by)
     color = np.array([2**warm, 2**green, 2**-warm])
@@ -101,7 +109,8 @@ def _tinted(rng: Random, by: float) -> np.ndarray:
 def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return random lights: a table of LIGHT, and a table of AIR with one row.
 
-    varied: False gives one white lamp without shadows near the top. Lamps may be inside objects.
+    varied: True gives sun and lamps at random, with shadows; False gives one white lamp without
+    shadows near the top of the place. Lamps may be inside objects.
     """
     if not varied:
         lamp = (1.0, (0.3, 0.2, place.top - 0.3), np.full(3, 1.2), 0)
@@ -151,9 +160,9 @@ def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) ->
 
 
 def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> Effects:
-    """Return random camera effects, or neutral ones if not `varied`.
+    """Return random camera effects; without `varied`, neutral effects with the right exposure.
 
-    light: small images (F, H, W, 3) of all views in linear light; they determine the exposure.
+    light: small images (F, H, W, 3) of all F views in linear light, which determine the exposure.
     """
     luminance = light.reshape(-1, 3) @ (0.3, 0.6, 0.1)
     # the mean of logarithms, so that a bright sky leaves the rest visible

@@ -1,4 +1,4 @@
-"""Random textures of a world: noise in matching colours, with patterns on top."""
+"""Random textures of a world: noise in matching colours, some with patterns on top."""
 
 import colorsys
 import math
@@ -37,7 +37,7 @@ class Palette:
         self._grey = rng.uniform(1.5, 7)
 
     def color(self) -> Color:
-        """Return a random colour, more often dull than saturated."""
+        """Return a random colour of this palette; dull colours are more frequent."""
         rng = self.rng
         hue = rng.choice(self._hues) if rng.random() < 0.8 else rng.random()
         saturation = rng.random() ** self._grey
@@ -46,7 +46,10 @@ class Palette:
         return red**2.2, green**2.2, blue**2.2
 
     def near(self, color: Color, by: float) -> Color:
-        """Return a random colour about `by` stops from `color`, with a slightly different hue."""
+        """Return a random colour near `color`, with a slightly different hue.
+
+        by: standard deviation of the brightness in stops (powers of 2).
+        """
         tone = 2 ** self.rng.gauss(0, by)
         red, green, blue = (min(tone * c * 2 ** self.rng.gauss(0, 0.25 * by), 0.9) for c in color)
         return red, green, blue
@@ -55,8 +58,8 @@ class Palette:
 def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
     """Return a table of TEXTURE with COUNT random rows.
 
-    varied: noise instead of uniform surfaces. highlights: let some varied textures be shiny; all
-    else stays the same.
+    varied: True for noise, False for uniform surfaces and simple patterns. highlights: True lets
+    some varied textures be shiny; nothing else changes.
     """
     palette = Palette(rng)
     table = np.zeros(COUNT, s.TEXTURE)
@@ -135,7 +138,10 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
 
 @kernel
 def height_maps(seed, count):
-    """Return smooth random height maps (count, 33, 33) float32 in [-1, 1], coarse to fine."""
+    """Return smooth random height maps (count, 33, 33) float32 in [-1, 1].
+
+    The number of hills differs from map to map.
+    """
     maps = np.empty((count, _SIDE, _SIDE), np.float32)
     for k in range(count):
         cells = 2.0 + 5.0 * chance(k, 0, seed)

@@ -22,12 +22,13 @@ _TERRAIN = 24.0
 
 @dataclass
 class Place:
-    """Shapes of a scene, and possible positions and targets of cameras, in metres.
+    """Shapes of a scene, and possible positions and targets of its cameras, in metres.
 
-    kind: indoors, outdoors or objects. fixed: number of shapes, at the start of `shapes`, that are
-    never removed to make room for cameras. low, high: corners of the box for camera centres.
-    eyes: smallest and largest usual height of a camera. targets: points to look at. distance:
-    smallest and largest distance from a camera to its target. top: largest height of lamps.
+    kind: "indoors", "outdoors" or "objects". fixed: number of shapes, at the start of `shapes`,
+    that must not be removed to make room for cameras. low, high: corners of the box of allowed
+    camera centres. eyes: smallest and largest usual height of a camera. targets: points to look at.
+    distance: smallest and largest distance from a camera to its target. top: largest height of
+    lamps.
     """
 
     kind: str
@@ -46,7 +47,7 @@ def _level(x: float, y: float) -> float:
 
 
 def _toward(angle: float, away: float) -> tuple[float, float]:
-    """Return x and y of the point at distance `away` from the origin, in direction `angle`."""
+    """Return x and y of the point at the distance `away` from the origin, in direction `angle`."""
     return away * math.cos(angle), away * math.sin(angle)
 
 
@@ -95,7 +96,11 @@ def _indoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
 
 
 def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) -> Thing:
-    """Place a random object on the floor or, in varied scenes, at a random height."""
+    """Return the shapes of a random object at the point `at`.
+
+    The object stands on the floor; in varied scenes it may float at a random height. size: scale
+    of the object. ceiling: height of the room in metres.
+    """
     thing = things.draw()
     pick = rng.random()
     lift = 0.0
@@ -105,7 +110,10 @@ def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) ->
 
 
 def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
-    """Return a thin random bar or column that crosses the room."""
+    """Return a thin random bar across a room, or a column from floor to ceiling.
+
+    x, y: half the extent of the room. z: height of the room.
+    """
     a = (rng.uniform(-x, x), rng.uniform(-y, y))
     b = (rng.uniform(-x, x), rng.uniform(-y, y))
     ends = rng.choice((((*a, 0.0), (*a, z)), ((-x, a[1], z * 0.9), (x, b[1], z * 0.9))))
@@ -113,7 +121,10 @@ def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
 
 
 def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
-    """Return four walls and a ceiling, with random windows or doors in up to `most` walls."""
+    """Return four walls and a ceiling, with random windows or doors.
+
+    size: extent of the room in metres. most: largest number of walls with an opening.
+    """
     half_x = size[0] / 2
     half_y = size[1] / 2
     height = size[2]
@@ -144,7 +155,7 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
 
 
 def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
-    """Return one or two bars across the opening `hole` of a wall."""
+    """Return one or two bars (glazing bars) across `hole`, the opening of a wall."""
     (x, y, z) = hole.center
     (_, wide, high) = hole.half
     radius = rng.uniform(0.015, 0.05)
@@ -190,7 +201,7 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
 
 
 def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
-    """Return a function of x, y that gives the height of a terrain, in metres.
+    """Return a function that gives the height of a terrain in metres at a point (x, y).
 
     field: height map with values in [-1, 1]. amplitude: height of the value 1, in metres.
     """
@@ -200,7 +211,10 @@ def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
 
 
 def _far(rng: Random, things: Things, angle: float) -> Thing:
-    """Return a random distant hill, building or tree, whose base is below the lowest ground."""
+    """Return the shapes of a random distant hill, building or tree.
+
+    Its base is below the lowest ground. angle: direction from the origin, in radians.
+    """
     pick = rng.random()
     if pick < 0.3:
         away = rng.uniform(60, 220)
