@@ -79,7 +79,7 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Compute the gradient of each query's 23 numbers from the `gradient` of the bias, into `out`."""
+    """Compute gradients of the queries' 23 numbers, in `out`, from the `gradient` of the bias."""
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]
