@@ -1,8 +1,8 @@
 """Query-based feed-forward 3D Gaussian splatting from composable, checked components.
 
 model = qgs.compose("recipes/tiny/locus.yaml", overrides=["model.queries.count=128"])
-result = qgs.reconstruct(model, "photos")  # or Views, in any world
-prediction = model(views)  # in the model's own world
+result = qgs.reconstruct(model, "photos")  # or Views, in any world frame
+prediction = model(views)  # in the model's own world frame
 rendering = model.render(prediction.gaussians, cameras)
 qgs.save(model, path); model = qgs.load(path)
 """
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 # files of both would mix. Looked up by file name: importlib.metadata would double the import time.
 for _other in Path(__file__).resolve().parents[1].glob("qgs-[0-9]*-info"):
     raise ImportError(
-        f"the climate model `qgs` ({_other}) is installed over query-gaussians. Run "
-        "`pip uninstall qgs`, then reinstall query-gaussians"
+        f"another package named `qgs`, a climate model ({_other}), is in the folder of "
+        "query-gaussians. Run `pip uninstall qgs`, then reinstall query-gaussians"
     )
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")

@@ -1,4 +1,7 @@
-"""Base class of tensor containers; functions that check shapes, list, map and join tensors."""
+"""Base class of tensor containers, and functions on tensors of containers.
+
+The functions check shapes, and list, map and concatenate tensors.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -30,14 +33,14 @@ class TensorContainer:
         return replace(cast(Any, self), **changes)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """Apply `Tensor.to` to every tensor. A dtype converts cameras and other geometry too."""
+        """Apply `Tensor.to` to every tensor. A dtype converts all tensors, including cameras."""
         return map_tensors(lambda x: x.to(*args, **kwargs), self)
 
 
 def map_tensors(function: Callable[[Tensor], Any], value: Any) -> Any:
     """Apply `function` to each tensor in containers, mappings, lists and tuples.
 
-    A part in which no tensor changes is returned as it is, without a copy.
+    A container, mapping, list or tuple in which no tensor changes is returned without a copy.
     """
     if isinstance(value, Tensor):
         return function(value)
@@ -63,7 +66,7 @@ def concatenated(parts: Sequence[_C], dim: int) -> _C:
     found = [dict(named_tensors(part)) for part in parts]
     for other in found:
         if some := sorted(other.keys() ^ found[0].keys()):
-            raise ValueError(f"{', '.join(some)} must be in all parts or in none")
+            raise ValueError(f"{', '.join(some)} must be in all concatenated parts or in none")
     # `map_tensors` comes to the tensors in the order of their names.
     names = iter(found[0])
 
@@ -77,7 +80,7 @@ def concatenated(parts: Sequence[_C], dim: int) -> _C:
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
     """Yield the dotted name and the tensor for all tensors that `map_tensors` finds in `value`.
 
-    name: start of all names.
+    name: prefix of all names.
     """
     if isinstance(value, Tensor):
         yield name, value
@@ -98,8 +101,8 @@ def check_shapes(
 ) -> None:
     """Raise ValueError unless the fields of `container` have `shapes`, such as "B N 3".
 
-    A letter stands for the same size in all fields, "..." for the same leading axes. known: sizes
-    of letters that are known beforehand. Fields that are None are not checked.
+    A letter stands for one size, the same in all fields, and "..." for any leading axes, the same
+    in all fields. known: required sizes, by letter. Fields that are None are not checked.
     """
     sizes: dict[str, Any] = {**_DIGITS, **(known or {})}
     for name, spec in shapes.items():

@@ -49,8 +49,8 @@ class CheckpointFile(TensorFile):
             recipe = file.recipe
 
     name: path of a file or run folder, PLUGIN/NAME of a model that a plugin ships, or a URL; see
-    `checkpoint_path`. Recipe and weights are read at first use. extra: metadata given to `save`.
-    Raises FileNotFoundError, and CheckpointError for a file that is not a checkpoint of this
+    `checkpoint_path`. Recipe and weights are read at first use. extra: the metadata that `save` was
+    given. Raises FileNotFoundError, and CheckpointError for a file that is not a checkpoint of this
     format version.
     """
 
@@ -67,11 +67,11 @@ class CheckpointFile(TensorFile):
             written = int(text[:20])
         if written != FORMAT_VERSION:
             raise CheckpointError(
-                f"{self.path} has {_FORMAT} {written}, and qgs {__version__} reads only "
-                f"{FORMAT_VERSION}: install the version of qgs that wrote the file"
+                f"{self.path} has {_FORMAT} {written}, but qgs {__version__} reads only "
+                f"version {FORMAT_VERSION}: install the version of qgs that wrote the file"
             )
         if SEAL not in self.metadata:
-            raise self.damaged(f"its metadata lack {SEAL}")
+            raise self.damaged(f"its metadata lack the checksum {SEAL}")
         self.extra = {
             key.removeprefix(_EXTRA): value
             for key, value in self.metadata.items()
@@ -82,8 +82,8 @@ class CheckpointFile(TensorFile):
     def recipe(self) -> Recipe:
         """Recipe of the model.
 
-        Raises CheckpointError if components are missing here or have changed. The message names the
-        releases that wrote the file.
+        Raises CheckpointError if components of the recipe are not installed or have changed. The
+        message names the releases of the packages that wrote the file.
         """
         try:
             return self.stored_recipe(_RECIPE)
@@ -94,8 +94,8 @@ class CheckpointFile(TensorFile):
                 f"{names.get(plugin, plugin)} {version}" for plugin, version in versions
             )
             raise CheckpointError(
-                f"{self.path} was written with {releases}; install them, because its recipe fails "
-                f"here:\n{error}"
+                f"{self.path} was written with {releases}; install these releases, because the "
+                f"installed ones do not fit its recipe:\n{error}"
             ) from error
 
     @cached_property
@@ -105,7 +105,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def step(self) -> int | None:
-        """Optimiser steps of the training so far; None if unknown, as for imported weights."""
+        """Number of training steps so far; None if unknown, as for imported weights."""
         if "step" not in self.extra:
             return None
         with self.entry(_EXTRA + "step") as text:
@@ -113,7 +113,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def domain(self) -> Domain:
-        """Ranges of the cameras that the model was trained on; empty if unknown."""
+        """Ranges of camera measurements in the model's training; empty if unknown."""
         key = _EXTRA + KEY
         if key not in self.metadata:
             return Domain()
@@ -121,9 +121,9 @@ class CheckpointFile(TensorFile):
             return Domain.read(self.mapping(key))
 
     def untrained(self, device: str | torch.device | None = None) -> QueryGaussianModel:
-        """Build the recipe's model without the saved weights; the device "meta" takes no memory.
+        """Build the recipe's model without the saved weights. The device "meta" takes no memory.
 
-        Raises CheckpointError if it cannot be built.
+        Raises CheckpointError if the model cannot be built.
         """
         try:
             return self.recipe.build_model(device, pretrained=False)
@@ -151,7 +151,8 @@ class CheckpointFile(TensorFile):
 def load(name: AnyPath, device: str | torch.device | None = None) -> QueryGaussianModel:
     """Load the model of a checkpoint in evaluation mode.
 
-    name: as for `CheckpointFile`. device, errors: as for `CheckpointFile.model`.
+    name: checkpoint, as for `CheckpointFile`. The device and errors are those of
+    `CheckpointFile.model`.
     """
     with CheckpointFile(name) as file:
         return file.model(device)
@@ -167,8 +168,8 @@ def save(
     """Write the weights of `model` and its complete recipe to `path`, atomically.
 
     extra: additional metadata, such as {"step": "1000"}. weights: weights to write in place of the
-    model's present weights, by the names of `unique_tensors`.
-    Raises ValueError for a model that was not built from a recipe, and OSError, as for a full disk.
+    model's present weights, with the names that `unique_tensors` returns. Raises ValueError for a
+    model that was not built from a recipe, and OSError if the file cannot be written.
     """
     if model.recipe is None:
         raise ValueError(
@@ -193,8 +194,9 @@ def write_checkpoint(
 ) -> None:
     """Write a checkpoint from its parts, without copying a tensor.
 
-    tensors: contiguous CPU tensors by the names of `unique_tensors`. tree: complete recipe.
-    releases: see `Recipe.releases`. extra: additional metadata.
+    tensors: contiguous CPU tensors, with the names that `unique_tensors` returns. tree: complete
+    recipe. releases: (distribution, version) of qgs and the plugins that the recipe uses, by name
+    of the plugin. extra: additional metadata.
     """
     metadata = {
         _RECIPE: json.dumps(tree),
@@ -208,7 +210,7 @@ def write_checkpoint(
 
 
 def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
-    """Return parameters and persistent buffers by name; a shared tensor only by its first name."""
+    """Return parameters and persistent buffers by name; a shared tensor has only its first name."""
     first: dict[int, tuple[str, Tensor]] = {}
     for name, tensor in model.state_dict(keep_vars=True).items():
         first.setdefault(id(tensor), (name, tensor))
@@ -216,10 +218,10 @@ def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
 
 
 def load_weights(model: nn.Module, tensors: Weights, origin: object) -> None:
-    """Copy `tensors` into `model`; copy nothing if any tensor does not fit.
+    """Copy `tensors` into `model`. If any tensor does not fit, no tensor is copied.
 
-    origin: file of the tensors, for messages. Raises CheckpointError that lists differences in
-    names, shapes and types, and ValueError for NaN and infinity.
+    origin: file of the tensors, for messages. Raises a CheckpointError that lists differences in
+    names, shapes and types, and ValueError for NaN or infinity.
     """
     # Everything is compared before anything is copied.
     refuse_misfit(model, tensors, origin)
@@ -230,7 +232,7 @@ def load_weights(model: nn.Module, tensors: Weights, origin: object) -> None:
 
 
 def refuse_nonfinite(tensors: Weights, origin: object) -> None:
-    """Raise ValueError for NaN and infinity in `tensors`, which were read from `origin`."""
+    """Raise ValueError for NaN or infinity in `tensors`. origin: their file, for the message."""
     if broken := nonfinite(tensors):
         fix = "its training diverged, or the file is damaged: take another checkpoint"
         raise ValueError(f"{origin}: weights are not finite: {listed(broken)}; {fix}")

@@ -34,10 +34,11 @@ PATIENCE = 60.0
 def checkpoint_path(name: AnyPath) -> Path:
     """Return the local file of the checkpoint `name`.
 
-    name: path of a checkpoint or of a run folder with one; or else PLUGIN/NAME of a model that an
-    installed plugin ships (see `qgs list`), or a URL that fsspec opens (see `downloaded`). A path
-    that exists wins. Raises FileNotFoundError, PluginError for a plugin that cannot be used, and
-    OSError for a failed download.
+    name: path of a checkpoint file or of a run folder that contains a checkpoint; PLUGIN/NAME of a
+    model that an installed plugin ships (see `qgs list`); or a URL that fsspec opens
+    (see `downloaded`). If `name` is an existing path, it is read as a path. Raises
+    FileNotFoundError, PluginError for a plugin that cannot be used, and OSError for a failed
+    download.
     """
     text = os.fspath(name)
     path = Path(text).expanduser()
@@ -74,13 +75,13 @@ def card_of(file: Path) -> str:
 
 
 def about(file: Path) -> str:
-    """Return the first paragraph of the model card of `file`; "" if it has no card."""
+    """Return the first paragraph of the card of the model in `file`; "" if there is no card."""
     paragraphs = (part for part in card_of(file).split("\n\n") if not part.startswith("#"))
     return " ".join(next(paragraphs, "").split())
 
 
 def downloaded(url: str) -> Path:
-    """Return the local copy of the safetensors file at `url`; download it at first use.
+    """Return the local copy of the safetensors file at `url`. The first use downloads the file.
 
     Copies are kept in the folder that the environment variable QGS_CACHE names, by default in
     ~/.cache/qgs. A damaged copy is downloaded again. Raises OSError if the download fails or is not
@@ -120,7 +121,9 @@ def _download(url: str, file: Path) -> None:
             with _opened(url) as stream, temporary.open("wb") as local:
                 _copy(stream, local, file.parent)
             if not _is_whole(temporary):
-                raise ValueError("the download is a web page or no complete safetensors file")
+                raise ValueError(
+                    "the download is not a complete safetensors file, perhaps a web page"
+                )
     # The file system of the URL may raise anything.
     except Exception as error:
         cause = str(getattr(error, "reason", error)) or type(error).__name__
@@ -132,7 +135,7 @@ def _download(url: str, file: Path) -> None:
 
 
 def _copy(stream: Any, local: IO[bytes], folder: Path) -> None:
-    """Copy `stream` to `local`. Raises OSError if it exceeds LARGEST or the free space."""
+    """Copy `stream` to `local`. Raises OSError if the data exceed LARGEST or the free space."""
     announced = getattr(stream, "length", None) or getattr(stream, "size", None) or 0
     # A server may announce less than it sends, or nothing.
     limit = min(LARGEST, shutil.disk_usage(folder).free)
@@ -141,11 +144,11 @@ def _copy(stream: Any, local: IO[bytes], folder: Path) -> None:
         local.write(part)
         left -= len(part)
     if announced > limit or left <= 0:
-        raise OSError(f"the file is larger than {decimal(limit)}")
+        raise OSError(f"the file is larger than the limit or the free space, {decimal(limit)}")
 
 
 def _opened(url: str) -> Any:
-    """Open `url` for reading. A user and password in it are sent by HTTP basic authentication."""
+    """Open `url` for reading. User and password in `url` are sent by HTTP basic authentication."""
     place = urlsplit(url)
     if place.scheme not in ("http", "https"):
         path = opened_path(url)

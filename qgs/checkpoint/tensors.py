@@ -1,4 +1,4 @@
-"""Safetensors files: read safely even if they are hostile, and written atomically."""
+"""Safetensors files: safe reading, even of hostile files, and atomic writing."""
 
 import json
 import os
@@ -28,16 +28,16 @@ _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
 
 
 class CheckpointError(ValueError):
-    """Error for a file without usable weights; the message says what is wrong and what helps."""
+    """Error for a file without usable weights. The message says what is wrong and how to fix it."""
 
 
 class TensorFile:
-    """A safetensors file that is open for reading; a context manager.
+    """Safetensors file that is open for reading, as a context manager.
 
-    metadata: the text entries in the header of the file.
-    Raises CheckpointError for a file that is incomplete or of another kind, and the system's
-    OSError and MemoryError. safetensors compares the sizes in the header with the size of the file
-    before it maps the file into memory.
+    metadata: the text entries in the header of the file. Raises CheckpointError for a file that is
+    incomplete or not a safetensors file, and passes on OSError and MemoryError. The library
+    safetensors compares the sizes in the header with the size of the file before it maps the file
+    into memory.
     """
 
     def __init__(self, path: AnyPath) -> None:
@@ -89,7 +89,10 @@ class TensorFile:
 
     @contextmanager
     def entry(self, key: str) -> Iterator[str]:
-        """Yield the text of the metadata entry `key`; errors inside become CheckpointErrors."""
+        """Yield the text of the metadata entry `key`.
+
+        Errors in the body of the `with` statement become a CheckpointError for a damaged file.
+        """
         try:
             yield self.metadata[key]
         except (RecipeError, CheckpointError):
@@ -100,7 +103,10 @@ class TensorFile:
             raise self.damaged(what) from error
 
     def mapping(self, key: str) -> dict[str, Any]:
-        """Return the JSON mapping in the metadata entry `key`. Raises CheckpointError."""
+        """Return the JSON mapping in the metadata entry `key`.
+
+        Raises CheckpointError if the entry is missing or is not a mapping.
+        """
         with self.entry(key) as text:
             found = json.loads(text)
             if not isinstance(found, dict):
@@ -121,7 +127,10 @@ class TensorFile:
 
 
 def write_tensors(path: AnyPath, tensors: Weights, metadata: Mapping[str, str]) -> None:
-    """Write contiguous CPU `tensors` to `path`, atomically as by `replacing`. Raises OSError."""
+    """Write contiguous CPU `tensors` to `path`, atomically.
+
+    Raises OSError if the file cannot be written.
+    """
     with replacing(path) as temporary:
         try:
             save_file(dict(tensors), temporary, {**metadata, SEAL: seal(metadata)})
@@ -133,7 +142,7 @@ def write_tensors(path: AnyPath, tensors: Weights, metadata: Mapping[str, str]) 
 
 
 def seal(metadata: Mapping[str, str]) -> str:
-    """Return the checksum of all metadata entries except SEAL."""
+    """Return the checksum of all metadata entries except SEAL, the entry for this checksum."""
     entries = sorted((key, text) for key, text in metadata.items() if key != SEAL)
     return blake2b(json.dumps(entries).encode(), digest_size=16).hexdigest()
 
@@ -154,7 +163,7 @@ def shapes_of(tensors: Weights) -> dict[str, tuple[int, ...]]:
 
 
 def nonfinite(tensors: Weights) -> list[str]:
-    """Return the names of tensors that hold NaN or infinity. All must be on one device."""
+    """Return the names of tensors that hold NaN or infinity. All tensors must be on one device."""
     finite = {name: tensor.isfinite().all() for name, tensor in tensors.items()}
     # One read for all: each read would make the host wait for the device.
     flags = torch.stack([*finite.values()]).tolist() if finite else []
@@ -178,7 +187,8 @@ def differing_tensors(file: Shapes, recipe: Shapes) -> list[str]:
 def differing_types(file: Weights, recipe: Weights) -> list[str]:
     """List differences in dtypes of the tensors that both a file and a recipe's model have.
 
-    Each difference is one line. Half precision in the file fits float32 in the model.
+    Each difference is one line. Half precision in the file and float32 in the model is not a
+    difference.
     """
     allowed = {torch.float32: (torch.float32, torch.float16, torch.bfloat16)}
     return [

@@ -27,7 +27,7 @@ class CommandGroup(TyperGroup):
         return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command `cmd_name` of the core or a plug-in; raise ValueError without one."""
+        """Return the command `cmd_name` of the core or a plug-in; ValueError if there is none."""
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own
@@ -42,9 +42,10 @@ class CommandGroup(TyperGroup):
 
 
 def offered_command(name: str, offers: list[EntryPoint]) -> Any:
-    """Import the command `name` of a plug-in. If the import fails, the command raises ValueError.
+    """Import the command `name` of a plug-in, and return the command.
 
-    offers: entry points with this name; several are an error.
+    offers: entry points with this name. If there are several, or the import fails, the returned
+    command only raises ValueError.
     """
     try:
         (entry,) = offers
@@ -92,9 +93,10 @@ for _name, _command in COMMANDS.items():
 
 
 def main() -> None:
-    """Run the program. A mistake of the user prints a message without traceback; exit code 2.
+    """Run the program.
 
-    The environment variable QGS_DEBUG=1 shows the traceback.
+    For a mistake of the user, it prints a message without traceback, and exits with code 2. The
+    environment variable QGS_DEBUG=1 shows the traceback.
     """
     # File names and messages from servers may contain control characters.
     show_safely()

@@ -19,7 +19,7 @@ def convert(
         typer.Option(min=1, help="Number of Gaussians to keep: the most opaque. Default: all."),
     ] = None,
 ) -> None:
-    """Convert a PLY file of Gaussians to PLY, .splat or a plug-in's format.
+    """Convert a PLY or .splat file of Gaussians to PLY, .splat or a plug-in's format.
 
     --count keeps only the most opaque Gaussians.
     """

@@ -24,14 +24,14 @@ def evaluate(
     overrides: Overrides = None,
     index: Annotated[
         str | None,
-        typer.Option(help="JSON file with the scenes and frames to score. Sets evaluation.index."),
+        typer.Option(help="JSON file of scenes and frames to score: the option evaluation.index."),
     ] = None,
     tune: Tune = None,
     out: Annotated[
         Path | None,
         typer.Option(
             help="Folder for the results. Default: RUN/evaluation; RUN/evaluation-N if settings "
-            "differ from the run's; ./evaluation_NAME for a shipped model or a URL."
+            "differ from those of the run; ./evaluation_NAME for the model of a plug-in or a URL."
         ),
     ] = None,
     strict: Annotated[
@@ -40,7 +40,7 @@ def evaluate(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Score a checkpoint on views that it has not seen.
+    """Score a checkpoint on held-out views.
 
     Two baselines are scored as well: the nearest input view and the mean input colour.
     """
@@ -62,7 +62,9 @@ def evaluate(
         option = setting.split("=")[0]
         if option not in free and option.split(".")[0] not in free:
             allowed = ", ".join(free)
-            raise ValueError(f"{setting} would change the trained model; set only {allowed}")
+            raise ValueError(
+                f"{setting} would change the trained model; `qgs eval` can only change {allowed}"
+            )
     with CheckpointFile(run) as file:
         checkpoint = file.path
         recipe = file.recipe
@@ -82,11 +84,12 @@ def evaluate(
 
 
 def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:
-    """Return the default folder for results, such as RUN/evaluation beside RUN/checkpoint.
+    """Return the default folder for results, such as RUN/evaluation for RUN/checkpoint.safetensors.
 
-    RUN/checkpoint_ema gets RUN/evaluation_ema. other: settings differ from the recipe; return the
-    first unused of RUN/evaluation-2, RUN/evaluation-3, ... own: the checkpoint is a file of the
-    user. Otherwise return an unused folder in the working directory.
+    RUN/checkpoint_ema.safetensors gets RUN/evaluation_ema. other: True if settings differ from the
+    recipe; the result is the first unused folder of RUN/evaluation-2, RUN/evaluation-3 and so on.
+    own: True if the checkpoint is a file of the user; False gives an unused folder in the working
+    directory.
     """
     checkpoint = checkpoint if own else Path(checkpoint.name)
     label = checkpoint.stem.removeprefix("checkpoint").removeprefix("_")

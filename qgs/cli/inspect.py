@@ -15,7 +15,7 @@ RecipeFile: TypeAlias = Annotated[
 
 
 def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
-    """Print the recipe with all defaults, the origin of each value, and parameter counts.
+    """Print a recipe with all defaults, the origin of each value, and parameter counts.
 
     The recipe is printed as YAML to standard output, the parameter counts of components
     to standard error.
@@ -51,7 +51,7 @@ def recipes(
     """List the recipes that come with qgs, or print one of them.
 
     All commands accept the names of these recipes. A file of the same name in the working
-    directory comes first.
+    directory is preferred.
     """
     from qgs.files import refuse_existing, write_text
     from qgs.recipe.files import files_of, recipe_folder

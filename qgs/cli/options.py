@@ -23,15 +23,15 @@ Threads: TypeAlias = Annotated[
 Device: TypeAlias = Annotated[
     str,
     typer.Option(
-        help="auto, cpu or cuda. auto uses CUDA if there is a GPU and gsplat is installed."
+        help="auto, cpu or cuda. auto: cuda if there is a GPU and gsplat is installed, else cpu."
     ),
 ]
 Size: TypeAlias = Annotated[
     str | None,
     typer.Option(
         metavar="HxW",
-        help="Height and width to which photos are cropped and resized. Default: no cropping; the "
-        "shorter side of the recipe's data.image_size.",
+        help="Height and width to which photos are cropped and resized. Default: photos are not "
+        "cropped; their shorter side becomes that of the recipe's data.image_size.",
     ),
 ]
 Inputs: TypeAlias = Annotated[
@@ -42,11 +42,11 @@ Frames: TypeAlias = Annotated[
     typer.Option(help="Input photos by number or file name: 0,8,x.jpg. Default: qgs chooses."),
 ]
 SceneName: TypeAlias = Annotated[
-    str | None, typer.Option("--scene", help="Name of the scene to use, if the data has several.")
+    str | None, typer.Option("--scene", help="Name of the scene to use, if there are several.")
 ]
 ViewsSettings: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change an option of the recipe's `views`. Repeatable."),
+    typer.Option("--set", help="Change an option of `views`: views.scale=auto. Repeatable."),
 ]
 Scale: TypeAlias = Annotated[
     float | None,
@@ -66,7 +66,7 @@ Tune: TypeAlias = Annotated[
 
 
 def scale_settings(scale: float | None) -> list[str]:
-    """Return recipe overrides for the value of --scale; raise ValueError unless it is positive."""
+    """Return recipe overrides for --scale; raise ValueError unless `scale` is None or positive."""
     if scale is None:
         return []
     if not 0 < scale < float("inf"):
@@ -83,7 +83,7 @@ def use_threads(threads: int | None) -> None:
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
-    """Return (H, W) in pixels for the text "HxW"; raise ValueError for other text."""
+    """Return (H, W) in pixels for the text "HxW", None for None. Other text raises ValueError."""
     if text is None:
         return None
     # Height first, as in recipes and tensors.

@@ -30,15 +30,18 @@ if TYPE_CHECKING:
 def reconstruct(
     checkpoint: Checkpoint,
     photos: Annotated[
-        str, typer.Argument(help="Folder or URL of photos or of a data set, or a video file.")
+        str, typer.Argument(help="Folder or URL of photos or a data set; or a video file.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the results, or .ply or .splat file.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder for all results, or .ply or .splat file for Gaussians.")
+    ],
     inputs: Inputs = None,
     frames: Frames = None,
     holdout: Annotated[
         str | None,
         typer.Option(
-            help="Photos to score, or `none`. Default: held-out (every eighth) near the inputs."
+            help="Photos to score, or `none`. Default: held-out photos (every eighth) near the "
+            "inputs."
         ),
     ] = None,
     tune: Tune = None,
@@ -89,7 +92,10 @@ def reconstruct(
 
 
 def _refuse_unusable(out: Path, overwrite: bool) -> None:
-    """Raise an error before any work if `out` exists and is not empty, or cannot be written."""
+    """Raise an error before any work if `out` cannot be written, or exists and is not empty.
+
+    overwrite: True allows an `out` that exists.
+    """
     # This comes before heavy imports, so that the user need not wait.
     if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
         raise FileExistsError(f"{out} already exists: choose another --out, or add --overwrite")

@@ -32,11 +32,11 @@ def train(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Train a model, then evaluate it on views that it has not seen.
+    """Train a model, then evaluate it on held-out views.
 
     Ctrl-C or SIGTERM finishes the step, saves the run, and exits with code 128 + signal.
-    To continue, run the same command with --resume. A killed process continues from the
-    last save. The result is the same as without interruption.
+    To continue, run the same command with --resume. After a killed process, training
+    continues from the last save. The result is the same as without interruption.
 
     On 8 GPUs:
 
@@ -84,7 +84,10 @@ def _report(result: TrainingResult, console: Console) -> None:
 
 
 def with_absolute_path(recipe: Recipe) -> Recipe:
-    """Make paths of data and index absolute, so that `qgs eval` works in every directory."""
+    """Make the recipe's paths of data and evaluation index absolute.
+
+    Then `qgs eval` works in every directory.
+    """
     from qgs.paths import is_local, opened_path
 
     def absolute(section: dict[str, Any], *keys: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The contracts: one abstract class per slot, and the common base of components."""
+"""Contracts: an abstract class for each slot of a recipe, and the base of all components."""
 
 from qgs.contracts.component import (
     Component,

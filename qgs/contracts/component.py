@@ -1,4 +1,4 @@
-"""Base classes of all components: options, fields that they read and write, problems."""
+"""Base classes of all components, and classes for their options, fields and problems."""
 
 from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,9 +12,9 @@ from pydantic import BaseModel, ConfigDict
 
 # A ValueError, because pydantic turns those into problems of the option.
 class OptionError(ValueError):
-    """Error for validators of a Config.
+    """Error that a validator of component options raises.
 
-    `reason` says what is wrong, `fix` what to write instead.
+    reason: what is wrong. fix: what to write instead.
     """
 
     def __init__(self, reason: str, fix: str) -> None:
@@ -49,10 +49,11 @@ class ComponentConfig(BaseModel):
 class FieldSpec:
     """Description of a named tensor that one component writes and later components read.
 
-    shape: sizes of the axes after the first two, batch and item; a str is a symbolic size ("D").
-    frame: the coordinate frame of its numbers, "none", "world" or "camera".
-    encoding: a name for the meaning of raw numbers that could be read in several ways. Writer and
-        reader must use the same one.
+    shape: sizes of all axes but the first two, which are scene and item, such as query or token. A
+        str is a symbolic size, such as "D".
+    frame: the coordinate frame of the tensor's numbers, "none", "world" or "camera".
+    encoding: a name for the meaning of numbers that could be read in several ways. The writing and
+        the reading component must use the same name.
     """
 
     shape: tuple[int | str, ...]
@@ -81,7 +82,7 @@ class ModelDims:
 
 @dataclass(frozen=True)
 class RecipeContext:
-    """Facts about the rest of a recipe, for `Component.problems`.
+    """Facts about a recipe that `Component.problems` of each of its components can use.
 
     image_size: (H, W) of the data's images; None for a recipe without data.
     inputs: number of input views in a training sample; None for a recipe without data.
@@ -96,9 +97,10 @@ class RecipeContext:
 
 @dataclass(frozen=True)
 class Problem:
-    """A fault of an option, and how to fix it.
+    """Mistake in an option of a component, and how to fix it.
 
-    option: dotted path of the option inside the component; "" for the component itself.
+    option: dotted path of the option inside the component; "" for the component itself. reason:
+    what is wrong.
     """
 
     option: str
@@ -110,10 +112,10 @@ class Problem:
 def without_effect(
     config: ComponentConfig, options: Iterable[str], because: str
 ) -> Iterator[Problem]:
-    """Yield a problem for each of `options` that is not at its default although nothing reads it.
+    """Yield a problem for each of `options` that has no effect but a value other than its default.
 
     because: the setting in `config` that disables the options. Default values are no problem,
-    because resolved recipes contain them.
+    because a checked recipe contains the defaults of all options.
     """
     for option in options:
         default = type(config).model_fields[option].get_default()
@@ -127,12 +129,12 @@ def without_effect(
 class Component(metaclass=ABCMeta):
     """Base of everything that a recipe selects with `type: PLUGIN/NAME`.
 
-    The contract of a slot sets `slot`. A component sets `name` and nests a class `Config` with its
-    options. Classmethods are called with a valid config before anything is built.
+    The abstract class of a slot sets `slot`. A component sets `name` and nests a class `Config`
+    with its options. Classmethods are called with a valid config, before any component is built.
 
     Rules for `forward`: It treats the scenes of a batch independently. It changes no inputs,
     parameters or buffers. It draws random numbers only in training, from torch's global generator.
-    Every tensor that it reads gets a gradient.
+    It propagates gradients to every tensor that it reads.
     """
 
     slot: ClassVar[str]
@@ -191,14 +193,14 @@ class Component(metaclass=ABCMeta):
     def load_pretrained(self) -> None:  # noqa: B027 (most have no such files)
         """Read weights from files that options name.
 
-        Called once after the component is built, except on the meta device, or if a checkpoint
+        Called once after the component is built. Not called on the meta device, nor if a checkpoint
         contains all weights. Raises MissingExtraError for a missing file or package; the message
         says what to do.
         """
 
 
 class ModelComponent(Component, torch.nn.Module):
-    """A component with parameters. It is built with the sizes that all parts of the model share."""
+    """Component with parameters. It is built with the sizes that all parts of a model share."""
 
     def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
         super().__init__(config)
@@ -207,8 +209,8 @@ class ModelComponent(Component, torch.nn.Module):
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
         """Return whether weight decay applies to `parameter`, called `name` inside this component.
 
-        By default it applies to all but 1-d parameters: biases, norms, LayerScale (LocusGS
-        release).
+        By default, weight decay applies to all parameters except 1-d ones, which are biases, norms
+        and LayerScales (LocusGS release).
         """
         # A norm or LayerScale that decays to 0 would switch off its layer.
         return parameter.ndim != 1
@@ -216,12 +218,13 @@ class ModelComponent(Component, torch.nn.Module):
     def adapted(self, learned: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Return a state dict for this component, made from the weights of another model.
 
-        learned: the other model's state dict of the same slot; it may be empty. `init_from` calls
-        this for encoder, feedback and head. Weights that cannot be brought to this component's
-        shapes are returned unchanged; loading then refuses them.
+        learned: state dict of the component in the same slot of the other model; it may be empty.
+        Training with `init_from` calls this method of encoder, feedback and head. Weights that
+        cannot be converted to this component's shapes are returned unchanged; loading then refuses
+        them.
         """
         return dict(learned)
 
 
 class MissingExtraError(RuntimeError):
-    """Error for a missing optional package; the message names the command that installs it."""
+    """Error for a missing optional package or file. The message says how to install it."""

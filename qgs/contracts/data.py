@@ -23,7 +23,7 @@ Side: TypeAlias = Annotated[int, Field(ge=1)]
 
 
 class Scene(ABC):
-    """The frames of one scene; images are decoded on demand.
+    """Frames of one scene: cameras and images. Images are decoded on demand.
 
     Frames are numbered from 0, and missing images are not counted. Options, files, tables and
     messages all use these numbers.
@@ -51,11 +51,14 @@ class Scene(ABC):
         """Return images (len(frames), 3, H, W), float32 in [0, 1]."""
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """Return masks (len(frames), 1, H, W), 1 on the object, 0 off it; None without masks."""
+        """Return masks (len(frames), 1, H, W); None if the scene has none.
+
+        A mask is 1 on the object, and 0 elsewhere.
+        """
         return None
 
     def frame_name(self, frame: int) -> str:
-        """Return the name under which a user knows a frame: a file name or a time stamp."""
+        """Return a name of a frame for users: file name or time stamp, by default the number."""
         return str(frame)
 
     def label(self, frame: int) -> str:
@@ -63,7 +66,7 @@ class Scene(ABC):
         return numbered(frame, self.frame_name(frame))
 
     def stored_size(self, frame: int) -> Size | None:
-        """Return (H, W) of the stored photo; None if images are generated at any size."""
+        """Return (H, W) of the stored photo of `frame`; None for scenes with generated images."""
         return None
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
@@ -82,11 +85,11 @@ class SceneSourceConfig(ComponentConfig):
     """Options of all data sources. A source adds the option `path`, the location of its data."""
 
     image_size: tuple[Side, Side] = (64, 64)
-    """Size (H, W), in pixels, to which all images are brought."""
+    """Size (H, W), in pixels, of all images that the source returns."""
 
 
 class SceneSource(Component):
-    """A collection of scenes with a training and a test split.
+    """Source of scenes, with a training split and a test split.
 
     The constructor reads only what it needs to list the scenes; `Scene.images` decodes images.
     The constructor raises FileNotFoundError or ValueError; the message names the path and a fix.
@@ -104,7 +107,7 @@ class SceneSource(Component):
     False."""
 
     class Config(SceneSourceConfig):
-        """Options of this source; by default only those of all data sources."""
+        """Options of this source; by default only the options that all data sources have."""
 
     config: SceneSourceConfig
 
@@ -132,7 +135,7 @@ class SceneSource(Component):
         """Return options that open all frames at `path` for a model trained on other data.
 
         trained: the options of the training data, of any source; None if unknown. Options that make
-        sense for `path` too are copied from it.
+        sense for `path` too are copied from `trained`.
         """
         # Only the look of photos also holds for other data.
         options: dict[str, object] = {"path": path, "image_size": image_size}
@@ -143,10 +146,10 @@ class SceneSource(Component):
 
     @abstractmethod
     def scenes(self, split: Split) -> Sequence[Scene]:
-        """Return the scenes of a split; indexing the sequence must be cheap and deterministic."""
+        """Return the scenes of a split. Indexing the sequence must be cheap and deterministic."""
 
     def names(self, split: Split) -> Sequence[str]:
-        """Return the names of `scenes(split)`; the default opens all scenes for their names."""
+        """Return the names of `scenes(split)`. By default, this opens all scenes."""
         # Correct for any source, but slow if opening a scene reads files.
         return [scene.name for scene in self.scenes(split)]
 
@@ -170,19 +173,19 @@ class ViewSampler(Component):
 
     @abstractmethod
     def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
-        """Draw input frames, ascending, and target frames; raise ValueError for scenes too short.
+        """Draw input frames, in ascending order, and target frames.
 
-        There are at most `views.inputs` input frames, equally many in all samples of a step.
-        Held-out frames are never drawn.
-        step: number of optimiser steps before the sample is used; `qgs.contracts.schedule.END` in
-        evaluation.
+        There are at most `views.inputs` input frames, and the same number in all samples of a step.
+        Held-out frames are never drawn. step: number of optimiser steps before the sample is used;
+        `qgs.contracts.schedule.END` in evaluation. Raises ValueError for a scene with too few
+        frames.
         """
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
         """Return the input and target frames of each window that evaluation scores in a scene.
 
-        The default is an empty list: evaluation then makes windows around held-out frames, or draws
-        samples if there are none.
+        The default is an empty list: evaluation then makes windows around held-out frames, or calls
+        `draw` if there are no held-out frames.
         """
         return []
 
