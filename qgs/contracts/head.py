@@ -19,9 +19,9 @@ GAUSSIAN_FIELDS: Fields = {
 class Head(ModelComponent):
     """Head: QueryState -> GaussianAttributes of K Gaussians per query, in their valid ranges.
 
-    Attributes of an untrained head are in these ranges too, for nonzero features. A head that
-    outputs `sh` or `features` declares them in `writes`, see GAUSSIAN_FIELDS, so that losses can
-    require them.
+    `GaussianAttributes` gives these ranges. An untrained head keeps to them too, for nonzero
+    features. A head that outputs `sh` or `features` declares them in `writes`, see GAUSSIAN_FIELDS,
+    so that losses can require them.
     """
 
     slot: ClassVar[str] = "head"

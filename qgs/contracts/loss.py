@@ -17,8 +17,8 @@ class Loss(Component, torch.nn.Module):
 
     A subclass defines `term`; this class multiplies the result by `weight`, which may follow a
     schedule. Training calls the loss for each supervised layer, with a rendering from the target
-    cameras and all input views of the prediction. It minimises the sum of all terms, weighted by
-    layer. A term is one number to minimise; `history.jsonl` lists it under its name, which is
+    cameras and all input views of the prediction. Training minimises the sum of all terms, weighted
+    by layer. A term is one number to minimise; `history.jsonl` lists it under its name, which is
     unique within a recipe. Every term has a gradient in the prediction or in the rendering.
 
     renderings: the target views that one call needs; training may render few at a time
@@ -75,9 +75,9 @@ class Supervision(Component):
 
     @abstractmethod
     def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:
-        """Return the weight of each supervised layer by its number; the weights sum to 1.
+        """Return the weight of each supervised layer by layer number; the weights sum to 1.
 
-        The first layer has the number 1, and numbers ascend. 0 is the initial state, which is
+        Layer numbers start at 1 and are in ascending order. 0 is the initial state, which is
         supervised only in a decoder without layers.
         rounds: numbers of the last layers of feedback rounds, which are supervised too.
         """

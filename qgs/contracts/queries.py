@@ -55,7 +55,7 @@ class Queries(ModelComponent):
         }
 
     def support(self, state: QueryState) -> SpatialSupport | None:
-        """Return the spatial support of each query; None for queries without a position."""
+        """Return the ellipsoid that each query covers; None for queries without a position."""
         return None
 
 

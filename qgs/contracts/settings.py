@@ -17,7 +17,8 @@ class ViewsConfig(ComponentConfig):
     inputs: int = Field(default=4, ge=1)
     """Number of input views per sample."""
     targets: int = Field(default=4, ge=1)
-    """Number of target views per sample, sampled between the first and the last input view."""
+    """Number of target views per sample, chosen at random between the first and the last input
+    view."""
     gap: tuple[int, int] = (10, 40)
     """Distance from the first to the last input view, as [min, max] in frames. Neighbouring frames
     have distance 1. In scenes with times the unit is a distinct time, not a frame. A scene shorter

@@ -1,4 +1,4 @@
-"""Sources of scenes, and samplers that draw input and target views from scenes."""
+"""Data sources, which provide scenes, and samplers that choose input and target views."""
 
 from qgs.contracts import Component
 from qgs.data.photos.source import PhotosSource

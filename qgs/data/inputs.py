@@ -96,8 +96,8 @@ def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
 class Frusta:
     """Cameras of a scene, in units of the scene's depth, and the overlap of their views.
 
-    trained_on: the cameras of training. depth: depth of the scene in its unit, by default from
-        `scene_depth`.
+    trained_on: measurements of the cameras of training. depth: depth of the scene in its unit, by
+        default from `scene_depth`.
     """
 
     def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:

@@ -50,10 +50,10 @@ def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
 
 
 def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
-    """Return the least and the largest gap between first and last input in a scene.
+    """Return the least and the largest gap between first and last input in a scene, in moments.
 
-    Gaps are in moments, see `moments`; count is their number in the scene. Raises ValueError if
-    there are too few moments for the inputs.
+    A moment is a time or, in scenes without times, a frame. count: number of moments in the scene.
+    Raises ValueError if there are too few moments for the inputs.
     """
     low, high = views.gap
     what = "frames" if scene.times is None else "times"

@@ -127,7 +127,7 @@ class Measures:
             for key, column in metric.columns().items():
                 name = _name(label, key)
                 if name in self.columns:
-                    raise ValueError(f"two metrics have a value called {name}; rename one of them")
+                    raise ValueError(f"two metrics have a value called {name}; rename one metric")
                 self.columns[name] = column
                 self._owners[name] = metric
 
@@ -171,7 +171,7 @@ def _name(metric: str, key: str) -> str:
 
 @dataclass
 class _Scorer:
-    """Scores samples of scenes, and collects facts about all of them.
+    """Scorer of samples, which records facts about all scenes on the way.
 
     seen: measurements of all cameras so far. gaussians: largest number of Gaussians per scene so
         far.

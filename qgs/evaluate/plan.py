@@ -73,11 +73,11 @@ class EvaluationPlan:
     With `evaluation.index`, the index file names scenes and frames. Without an index, the first
     `evaluation.scenes` scenes are scored. The samples of a scene are the first of these that exist:
 
-    1. the windows of `sampler`,
+    1. the windows of `sampler.windows`,
     2. `held_out_windows`, if the scene has held-out frames,
     3. `evaluation.samples` samples, which `sampler` chooses at random with `evaluation.seed`, as at
-    the end of training. Targets are all frames from the first to the last input that are not
-    inputs; in a scene with times, the sampler's targets.
+       the end of training. Targets are all frames from the first to the last input that are not
+       inputs; in a scene with times, the sampler's targets.
 
     Windows of 1 and 2 are thinned evenly to `evaluation.scenes` windows. Targets at several times
     become one sample for each time. No sample is mirrored.

@@ -48,8 +48,9 @@ def protocol_of(
 ) -> Protocol:
     """Return the protocol of evaluating `recipe` on the views that `index` lists.
 
-    Without an index (None), the views are chosen at random from `scenes`, names of scenes. step:
-    number of optimiser steps after which scheduled options of the renderer are read.
+    Without an index (None), the protocol tells how views are chosen. scenes: names of the scenes,
+    used only without an index. step: number of optimiser steps after which scheduled options of the
+    renderer are read.
     """
     evaluation = recipe.evaluation
     data, views = _data_and_views(recipe, index, scenes)

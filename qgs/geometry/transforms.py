@@ -30,9 +30,9 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 @full_precision
 def unit(vectors: Tensor, otherwise: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> Tensor:
-    """Normalise vectors (..., C); zero vectors become `otherwise`, by default the identity.
+    """Normalise vectors (..., C); zero vectors become `otherwise`.
 
-    This default is a quaternion w x y z.
+    By default this is the identity quaternion, w x y z.
     """
     length = vectors.norm(dim=-1, keepdim=True)
     divisor = torch.where(length > 0, length, 1)

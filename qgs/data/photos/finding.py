@@ -133,7 +133,7 @@ def _index(folder: UPath) -> _Index:
 
 
 def _spellings(name: str) -> enumerate[str]:
-    """Yield a numbered name, then in lower case and normal form of Unicode, then without suffix."""
+    """Yield (0, name), (1, name in lower case and normal form), (2, the latter without suffix)."""
     key = unicodedata.normalize("NFC", name).casefold()
     stem, dot, suffix = key.rpartition(".")
     known = dot + suffix in (*Image.registered_extensions(), ".npy", ".heic")
@@ -141,7 +141,10 @@ def _spellings(name: str) -> enumerate[str]:
 
 
 def inside(folder: UPath, path: UPath) -> Sequence[str]:
-    """Return the parts of the path from `folder` to `path`; ".." if `path` is outside."""
+    """Return the parts of the path from `folder` to `path`.
+
+    If `path` is outside of `folder`, the first part is "..".
+    """
     return os.path.relpath(path.path, folder.path or ".").split(os.sep)
 
 

@@ -115,7 +115,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
 
 
 def _flat(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return `values`, extended by the focal lengths and centre of an intrinsics matrix, if any."""
+    """Return `values` with fl_x, fl_y, cx and cy from its matrix of intrinsics, if it has one."""
     matrix = numbers(next((values[key] for key in _MATRICES if key in values), None))
     if matrix.shape != (3, 3):
         return values
@@ -232,7 +232,9 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
             raise ValueError(f"{key!r} must be a list of file names, got {given!r}")
         names = set(map(image_name, given))
         if unknown := sorted(names - known):
-            raise ValueError(f"{key!r} names {unknown[0]}, but no frame has this name: remove it")
+            raise ValueError(
+                f"{key!r} names {unknown[0]}, but there is no such frame: remove the name"
+            )
         return names
 
     train = named("train")

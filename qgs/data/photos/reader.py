@@ -220,7 +220,7 @@ def image_folder(folder: UPath, wanted: str | None) -> UPath:
             default=folder,
         )
     if not (folder / wanted).is_dir():
-        raise FileNotFoundError(f"{folder / wanted} does not exist: correct `images`")
+        raise FileNotFoundError(f"{folder / wanted} does not exist: correct the option `images`")
     return folder / wanted
 
 

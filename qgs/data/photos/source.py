@@ -215,7 +215,7 @@ class PhotoScene(Scene):
 
 
 def whole_mask(frame: PhotoFrame) -> Image.Image:
-    """Read the mask of a photo without crop; raise ValueError for an unreadable file.
+    """Read the whole mask of a photo, as stored; raise ValueError for an unreadable file.
 
     The photo must have a mask.
     """
@@ -225,7 +225,7 @@ def whole_mask(frame: PhotoFrame) -> Image.Image:
 
 
 def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
-    """Return `size`, the stored (H, W) of `file`, for the upright image.
+    """Return the upright (H, W) of the image `file`, whose stored (H, W) is `size`.
 
     Raises ValueError if the aspect ratio is not that of the size listed for `frame`.
     """
@@ -373,9 +373,10 @@ def _quarters(size: Size, frame: PhotoFrame) -> int:
 
 @lru_cache(maxsize=2**16)
 def _header(path: str, changed: int) -> tuple[Size, int]:
-    """Return the stored (H, W) and needed quarter turns of an image file; (1, 1) and 0 for others.
+    """Return the stored (H, W) of an image file, and the quarter turns that make it upright.
 
-    changed: time of the last change, part of the key of the cache.
+    For other files, return (1, 1) and 0. changed: time of the last change, part of the key of the
+    cache.
     """
     try:
         with open(path, "rb") as file, opened_image(file) as image:
