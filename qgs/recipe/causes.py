@@ -23,7 +23,7 @@ def at_their_causes(
 ) -> Iterator[RecipeProblem]:
     """Yield the problems `found` in the recipe `written`, moved to the lines that caused them.
 
-    Problems with the same cause become one problem. plugins: plugins passed as objects.
+    Problems with the same cause become one problem. plugins: plugins that need not be installed.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     left = found
@@ -61,7 +61,8 @@ def _blames(
     `written` consists of `written.under` and of `written.over`, the last file or override. The
     options of `written.over` are applied one by one. An option causes the problems that first
     appear after it.
-    found: problems that are absent without `written.over`. before: draft of `written.under`.
+    found: problems that are absent without `written.over`. before: draft (recipe with components
+        chosen, not yet checked) of `written.under`.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     base: Any = written.under

@@ -28,9 +28,9 @@ from qgs.recipe.yaml_text import KeyPath, find, inline
 
 
 def check(draft: Draft, problems: Problems) -> Parts:
-    """Check a draft of a recipe; return its components, except sublayers that no layer uses.
+    """Check a draft, a recipe whose components are chosen; return its components.
 
-    Raises RecipeError with all problems.
+    Sublayers that no decoder layer uses are left out. Raises RecipeError with all problems.
     """
     parts = _without_idle_sublayers(draft, problems)
     context = _context(draft)
@@ -89,8 +89,8 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
 def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
     """Return the components of a draft without sublayers that their decoder layer does not use.
 
-    A component that is left out is reported if the recipe names it for this layer, or if it names
-    it for all layers and no layer uses it.
+    A sublayer that is left out is reported if the recipe sets it for that layer alone, or if the
+    recipe sets it for all layers and no layer uses it.
     """
     kept = dict(draft.parts)
     layers: dict[KeyPath, Any] = {}
@@ -206,7 +206,7 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], b
 
 
 def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) -> tuple[str, str]:
-    """Return reason and fix for fields that `reader` reads but no earlier component writes."""
+    """Return reason and fix if `reader` reads fields (`missing`) that no earlier component gives."""
     named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
     reason = f"`{reader.type}` needs {named}, which no earlier component provides"
     for name in missing:

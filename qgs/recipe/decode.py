@@ -68,7 +68,7 @@ Parts: TypeAlias = Mapping[KeyPath, Chosen]
 
 
 def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen | None:
-    """Return the component at `place`; if it is invalid, add a problem and return None."""
+    """Return the component at `place` of a recipe; if invalid, add a problem and return None."""
     node = place.node
     if not isinstance(node, MapNode):
         reason = f"a component must be a mapping, got {brief(node)}"

@@ -64,7 +64,7 @@ class RecipeSettings(ComponentConfig):
     """Seed of the model's initial parameters and of training (default 0)."""
     init_from: str | None = None
     """Path of the checkpoint with whose weights training starts. The number of its queries is
-    changed to that of this recipe, as in the LocusGS release. null: initial parameters."""
+    changed to that of this recipe, as in the LocusGS release. null means initial parameters."""
     plugins: tuple[str, ...] | None = ()
     """Plugins whose components the recipe may use besides the built-in ones; null means none."""
 

@@ -1,4 +1,4 @@
-"""YAML 1.2 text of recipes, and nodes: its values, which know the line of each key."""
+"""YAML 1.2 text of recipes, and its values as nodes, which know the line of each key."""
 
 import json
 import os
@@ -74,7 +74,7 @@ class MapNode(dict[str, Any]):
         return found
 
     def origin_of(self, key: str) -> Origin:
-        """Return file and line of `key`; of the mapping if it has no such key."""
+        """Return file and line of `key`; if the mapping lacks this key, those of the mapping."""
         return self.origins.get(key, self.origin)
 
 

@@ -1,4 +1,4 @@
-"""Reconstruction of a scene in one call: it chooses photos, searches the scale, runs the model."""
+"""Reconstruction of a scene in one call: choose photos, search for the scale, run the model."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -45,9 +45,9 @@ def reconstruct(
     inputs: number of input photos; None uses the recipe's number.
     frames: input photos, by number or file name; None chooses them, see `qgs.data.inputs`.
     compare: photos to score, or "none". None scores held-out photos (every eighth) near the inputs.
-    size: (H, W) of images of a folder, see `chosen_scene`. scene: name, for a folder of scenes.
+    size: (H, W) of a folder's images, see `chosen_scene`. scene: name of a scene in the folder.
     overrides: changes of the recipe's `views`, such as "views.scale=auto".
-    tune: part to fit to the inputs first, see `tuning_settings`; None fits nothing.
+    tune: what to fit to the inputs first, such as "queries:50"; None fits nothing.
 
     Raises ValueError if the model has no recipe, for several scenes, for images outside of [0, 1].
     """

@@ -43,7 +43,7 @@ class Reconstruction:
 
     rendering: images of all views of the sample, inputs first. scores: one for each of these views.
     tuning, refinement: settings with which the Gaussians were fitted to photos; None if not fitted.
-        remarks: sentences for the user. scale: result of the search for the scale; None without a
+    remarks: sentences for the user. scale: result of the search for the scale; None without a
         search.
     """
 

@@ -53,7 +53,7 @@ class FoundScale:
 
     further: scored photos that are not inputs. names: file names of these photos.
     psnr: mean PSNR in dB of inputs and further photos, where further photos have twice the weight.
-    tried: all tried factors, each with its `psnr`.
+    tried: pairs of a tried factor and its mean PSNR.
     """
 
     factor: float
@@ -171,9 +171,9 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
 def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
     """Return the least and largest factor to try, and the factor below which scores are lowered.
 
-    At smaller factors than the third, depths are smaller than in training. It is 0 if the depth at
-    which the cameras look is unknown. trained: ranges of cameras in the model's training. frames:
-    the inputs.
+    At factors below the third number, depths are smaller than in training. The third number is 0 if
+    the depth at which the cameras look is unknown.
+    trained: ranges of cameras in the model's training. frames: the inputs.
     """
     depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()

@@ -122,11 +122,11 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Return the Gaussians (1, G) of a PLY file, in the layout of the 3DGS release, or of a .splat.
+    """Return the Gaussians (1, G) of a file: a PLY in the layout of the 3DGS release, or a .splat.
 
     They are in the world of the file. Gaussians that are not finite are left out, with a warning.
     The 3D filter of Mip-Splatting is applied. `sh` has all degrees up to the last that is not all
-    zeros; None if all are. Means are float64 if float32 would lose digits. Raises
+    zeros, and is None if all are zeros. Means are float64 if float32 would lose digits. Raises
     FileNotFoundError, and ValueError for another kind of file.
     """
     path = Path(path)
@@ -231,9 +231,10 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, s
 
 
 def about_origin(gaussians: Gaussians) -> tuple[Gaussians, str]:
-    """Return Gaussians (..., G) with float32 means relative to a local origin, and this "X Y Z".
+    """Return Gaussians (..., G) with float32 means relative to an origin, and this origin.
 
-    The origin is "" if float32 can hold the means as they are; another origin causes a warning.
+    The origin is text, "X Y Z", or "" if float32 can hold the means as they are. An origin that is
+    not "" causes a warning.
     """
     scene = narrowed(gaussians)
     if scene.means.dtype == scene.scales.dtype:

@@ -52,8 +52,8 @@ class GaussianHead(Head):
         scale_cap: float = Field(default=0.075, gt=0)
         """Largest scale in world units. A raw scale of 0 gives 1/e of this limit."""
         scale_input_limit: float | None = Field(default=10.0, gt=0)
-        """Limit of the absolute value of raw scales before the exponential. null: no limit
-        (TokenGS)."""
+        """Limit of the absolute value of raw scales before the exponential. null means no limit, as
+        in TokenGS."""
         opacity_bias: float = -2.0
         """Number added to the raw opacity before the sigmoid."""
         quat_eps: float = Field(default=1e-4, gt=0)
@@ -110,9 +110,10 @@ def posact(
 ) -> Tensor:
     """Compute sign(t) (exp|t| - 1), linear near 0 and exponential far out (TokenGS release).
 
-    input_limit: largest |t|, to which t is clamped. output_limit: largest absolute result. None
-        means no limit. The LocusGS release uses limits 100 and 1000, the TokenGS release none. The
-        slope is 1 at t = 0, so that a head that starts at zero can learn; it is 0 beyond a limit.
+    input_limit: largest |t|, to which t is clamped; None means no limit.
+    output_limit: largest absolute result; None means no limit.
+    The LocusGS release uses limits 100 and 1000, the TokenGS release none. The slope is 1 at t = 0,
+    so that a head that starts at zero can learn; it is 0 beyond a limit.
     """
     # Exp of a stray output would be infinite.
     if input_limit is not None:
@@ -135,11 +136,11 @@ class FreeCenters(Centers):
         z_offset: float = 1.0
         """Number added to z, in world units (1 in TokenGS, 0 in LocusGS's free-centre ablation)."""
         input_limit: float | None = Field(default=100.0, gt=0)
-        """Limit of the absolute value of raw offsets. null: no limit (LocusGS 100, TokenGS
-        null)."""
+        """Limit of the absolute value of raw offsets. null means no limit. LocusGS has 100, TokenGS
+        null."""
         output_limit: float | None = Field(default=1000.0, gt=0)
-        """Limit of the absolute value of posact(offset), in world units. null: no limit (LocusGS
-        1000, TokenGS null)."""
+        """Limit of the absolute value of posact(offset), in world units. null means no limit.
+        LocusGS has 1000, TokenGS null."""
 
     config: Config
 

@@ -35,7 +35,7 @@ class OneCycleAdamW(Optimizer):
         """Peak learning rate, at the end of the warm-up. A schedule given here replaces the whole
         cycle of warm-up and fall."""
         warmup: int = Field(default=2000, ge=0)
-        """Optimiser steps until the learning rate reaches its peak. 0: start at the peak."""
+        """Optimiser steps until the learning rate reaches its peak. 0 starts at the peak."""
         warmup_shape: Literal["cosine", "linear"] = "cosine"
         """Shape of the learning rate's rise to its peak."""
         initial_divisor: float = Field(default=25.0, ge=1)
