@@ -206,7 +206,7 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], b
 
 
 def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) -> tuple[str, str]:
-    """Return reason and fix if `reader` reads fields (`missing`) that no earlier component gives."""
+    """Return reason and fix for fields (`missing`) that `reader` reads before they are written."""
     named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
     reason = f"`{reader.type}` needs {named}, which no earlier component provides"
     for name in missing:
