@@ -13,7 +13,7 @@ from qgs.train.tracking import Tracker
 
 
 class _OfAccelerate(Tracker):
-    """Base class of trackers that log by a tracker of the package `accelerate`, `_tracker`."""
+    """Base class of trackers that pass everything on to a tracker of `accelerate`."""
 
     _tracker: Any
     _of_pictures: ClassVar[Mapping[str, str]] = {}

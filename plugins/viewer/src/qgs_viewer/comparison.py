@@ -60,10 +60,10 @@ POOR = 1.0
 def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) -> list[Window]:
     """Choose at most `count` windows: input photos, with the photos that renders are compared to.
 
-    The first window is the best of `ranked_windows`; the others are good and far from the windows
-    chosen before. inputs: number of input photos in a window. trained_on: measurements of the
-    cameras of the training data, by which windows are ranked. Raises ValueError if the scene has
-    fewer photos than `inputs`.
+    The first window is the best of `ranked_windows`. The other windows are good too, and far from
+    the windows chosen before them. inputs: number of input photos in a window. trained_on:
+    measurements of the cameras of the training data, by which windows are ranked. Raises ValueError
+    if the scene has fewer photos than `inputs`.
     """
     frusta = Frusta(scene, trained_on)
     ranked = ranked_windows(frusta, inputs)
@@ -76,7 +76,11 @@ def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) ->
 
 
 class PhotoWindows(Span):
-    """View sampler that chooses at most WINDOWS windows of each scene once, by `spread_windows`."""
+    """View sampler that chooses at most WINDOWS windows of each scene by `spread_windows`.
+
+    A window is a set of input photos with the photos that renders are compared to. The choice is
+    made once for each scene.
+    """
 
     def __init__(self, trained_on: Domain) -> None:
         super().__init__(Span.Config())
@@ -84,9 +88,10 @@ class PhotoWindows(Span):
         self._known: dict[str, list[Window]] = {}
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
-        """Return the windows of a scene; an empty list for a moving scene, whose photos have times.
+        """Return pairs (input photos, photos to compare with) of a scene.
 
-        Raises ValueError if all photos are inputs, so that no photo is left to compare with.
+        The list is empty for a moving scene, whose photos have times. Raises ValueError if all
+        photos are inputs, so that no photo is left to compare with.
         """
         if scene.times is not None:
             # a moment of a moving scene has few views; the recipe's sampler knows which
@@ -147,7 +152,7 @@ class Model:
 
     @property
     def network(self) -> QueryGaussianModel:
-        """The network as a module."""
+        """The network of the model, as a PyTorch module."""
         return self.search.model
 
     @cached_property
@@ -292,7 +297,8 @@ def recipes_alike(
 def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dict[str, Any]:
     """Return a recipe section `data` that reads `photos` in a size that all `recipes` take.
 
-    Some photos are held out as targets, unless `photos` are the training data of a recipe.
+    Some photos are held out to compare renders with. Photos that were training data of a recipe
+    keep their held-out photos.
     """
     sources = installed_sources()
     trained = [recipe.data_config for recipe in recipes]

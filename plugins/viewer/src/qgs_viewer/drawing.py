@@ -33,7 +33,7 @@ SOLID = 0.1
 
 @dataclass(frozen=True)
 class Choice:
-    """What the user of the viewer has chosen to show.
+    """Choices of what the viewer shows.
 
     query: index of the picked query; None for all. by_query: whether to colour Gaussians by query.
     layer: decoder layer whose anchors and attention are shown; 0 is before the first layer. others:

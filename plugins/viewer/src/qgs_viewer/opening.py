@@ -140,8 +140,9 @@ def open_model(
     """Open a model on a scene of `photos`, by default on a test scene of the recipe's data.
 
     The other arguments are the options of `qgs view` with these names. scene: name of the scene;
-    None takes the first. frames: indices or files of the input photos; None chooses `inputs` of the
-    photos. size: (H, W) of the photos in pixels. overrides: settings of `views`, as `KEY=VALUE`.
+    None takes the first. frames: indices or files of the input photos; None chooses them. inputs:
+    number of photos to choose; None takes the number in the recipe. size: (H, W) of the photos in
+    pixels. overrides: settings of `views`, as `KEY=VALUE`.
     """
     with CheckpointFile(name) as file:
         model = file.model(device)
@@ -175,10 +176,10 @@ def open_model(
 
 
 def _scene(recipe: Recipe, photos: str | None, size: Size | None, name: str | None) -> Scene:
-    """Return a scene of the folder `photos`; if it is None, a scene of the recipe's data.
+    """Return a scene of the folder `photos`; if `photos` is None, a scene of the recipe's data.
 
     name: name of the scene; None takes the first test scene. Raises ValueError if `photos` is None
-    and the recipe has no data or `size` is given.
+    and the recipe has no data, or if `photos` is None and `size` is given.
     """
     if photos is not None:
         return chosen_scene(recipe, photos, size, name)[0]
@@ -237,9 +238,10 @@ class FinishedScene(Scene):
         return to_tensor(np.stack(pictures))
 
     def label(self, frame: int) -> str:
-        """Return the file of a photo; if unknown, its frame number in the original scene.
+        """Return the file name of a photo; without one, text with its frame number.
 
-        frame: index of the view in cameras.json, which may differ from the frame number.
+        frame: index of the view in cameras.json. It may differ from the frame number, which counts
+        in the original scene.
         """
         view = self._views[frame]
         return str(view.get("photo") or f"frame {view['frame']}")
@@ -264,7 +266,7 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(
             f"{path} does not describe a reconstruction ({type(error).__name__}: {error}); repeat "
-            "`qgs reconstruct`, or view the PLY alone"
+            "`qgs reconstruct`, or view its PLY file alone"
         ) from error
     plain = QueryScene(gaussians, photos, inputs, background=(red, green, blue))
     return plain, scene, record

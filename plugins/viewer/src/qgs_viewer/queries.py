@@ -57,8 +57,7 @@ def outline(support: SpatialSupport, query: int, cameras: Cameras) -> Tensor | N
 def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
     """Return the pixels (P, 2) of P world points (P, 3) in the first of V cameras (1, V).
 
-    Depths in the camera below 0.001 are set to 0.001, so that points behind the camera have a pixel
-    too.
+    Depths in the camera below 0.001 are set to 0.001, so that points behind the camera have pixels.
     """
     in_camera = to_camera(points[None], cameras)[0, 0]
     in_camera = torch.cat([in_camera[:, :2], in_camera[:, 2:].clamp_min(1e-3)], -1)

@@ -178,7 +178,7 @@ def explained(
     """Reconstruct a scene from V views (1, V) by `model`, with its queries after each layer.
 
     frames: indices of the views in their scene. placement: transform from the model's world into
-    the viewer's; by default both worlds are equal.
+    the viewer's world; by default both worlds are equal.
     """
     memory = model.encoder(views)
     start = model.queries(memory, views)

@@ -24,10 +24,11 @@ from qgs_research.studies.study import Study
 
 
 def planned(study: Study, folder: Path) -> Plan:
-    """Check the recipes of all variants and the whole study. Nothing is written or trained.
+    """Check the recipes of all variants and return the plan of the study.
 
-    Raises the errors of `composed` and of data sources. Raises ValueError if `folder` has results
-    of a variant or an evaluation whose recipe has changed since they were made.
+    Nothing is written or trained. Raises the errors of `composed` and of data sources. Raises
+    ValueError if `folder` has results of a variant or an evaluation whose recipe has changed since
+    they were made.
     """
     plan = Plan(study, folder, composed(study))
     check_data(plan)
@@ -69,10 +70,10 @@ def composed(study: Study) -> dict[str, Recipe]:
 
 @contextmanager
 def _collected(problems: Problems, place: str, origin: Origin) -> Iterator[None]:
-    """Add the faults of a RecipeError raised inside the block to `problems`, and go on.
+    """Add the faults of a RecipeError raised inside the block to `problems`; do not raise it.
 
-    place: name of the checked part in the study file. origin: its file and line, used for faults
-    without a line.
+    place: name of the checked part in the study file. origin: file and line of this part, used for
+    faults without a line of their own.
     """
     try:
         yield
@@ -93,7 +94,7 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
 
 
 def _build(recipe: Recipe) -> None:
-    """Build model, losses and optimiser to find errors; the model's weights take no memory."""
+    """Build model (on the meta device), losses and optimiser, to find errors."""
     recipe.build_optimizer()
     # Use the meta device, because published models would not fit into a laptop's memory.
     recipe.rate_factors(recipe.build_model("meta"))
@@ -117,7 +118,11 @@ INDEX = "evaluation.index"
 
 
 def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Add a problem for each difference of a variant to the reference that is not in `differs`."""
+    """Add a problem for each option in which a variant differs from the reference.
+
+    Options in the study's `differs`, and the sections model and optimizer, may differ. Adds a
+    problem too for each entry of `differs` that is the same in all variants.
+    """
     settings = study.settings
     first = recipes[settings.reference]
     used = set[str]()
@@ -194,7 +199,7 @@ def check_data(plan: Plan) -> None:
 
 
 def refuse_changed(plan: Plan) -> None:
-    """Raise ValueError if a recipe has changed since runs or results were made by it."""
+    """Raise ValueError if a recipe has changed since existing results were made by it."""
     for variant, name in product(plan.recipes, plan.evaluations):
         recipe = plan.evaluation_recipe(variant, name)
         file = recipe_file(plan.folder, variant, name)

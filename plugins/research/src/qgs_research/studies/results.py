@@ -54,7 +54,8 @@ class Judgement(NamedTuple):
 class Results(Scores):
     """All finished results of a study.
 
-    missing: runs without all results. failed: those of the missing runs that stopped with an error.
+    missing: runs without results in at least one evaluation. failed: runs of `missing` that stopped
+    with an error.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -184,7 +185,7 @@ def _verdict(results: Results) -> str:
 
 
 def notes(results: Results) -> list[str]:
-    """Return the notes to show below the tables of a study."""
+    """Return the notes to show below the tables of a study, such as missing runs."""
     # Readers see the table of the recipes' own evaluation first.
     found = [*interval_notes([*results.differences().values()]), *training_notes(results)]
     if (count := len(results.settings.hypotheses)) > 1:

@@ -132,7 +132,10 @@ class Scores:
         return [result for runs in parts for result in runs.values()]
 
     def unlike(self, terms: Terms) -> bool:
-        """Return True if a sum compares scores of one evaluation by different protocols."""
+        """Return True if results of one evaluation are compared by different protocols.
+
+        terms: the weighted sum of mean scores that compares them.
+        """
         # Each evaluation may have its own protocol: `A@two - B@two < C - D` is a valid comparison.
         sums: dict[tuple[str, str], int] = defaultdict(int)
         for (model, evaluation), weight in terms.items():

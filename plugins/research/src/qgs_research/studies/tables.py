@@ -147,7 +147,7 @@ def training_notes(scores: Scores) -> Iterator[str]:
 
 
 def interval_notes(differences: Iterable[Estimate]) -> Iterator[str]:
-    """Yield notes that say for what the confidence intervals hold: new trainings, new scenes."""
+    """Yield notes on whether intervals hold for new trainings, or only for new scenes."""
     seeds = {len(estimate.seeds) for estimate in differences}
     if max(seeds, default=0) > 1:
         yield "95 % intervals cover trainings and scenes; sd is the standard deviation over seeds"

@@ -47,8 +47,8 @@ def _seam(x, width):
 def _grid(x, y, shift, seed, softness):
     """Return tone and joint of tiles at (x, y), both from 0 to 1. Tiles have size 1.
 
-    tone: random brightness, which differs from tile to tile. joint: `softness` between two tiles,
-    else 0. shift: offset of every second row.
+    tone: random brightness, which differs from tile to tile. joint: 0 on a tile, `softness` in the
+    gap between two tiles. shift: offset of every second row.
     """
     row = math.floor(y)
     x = x + shift * (row & 1)

@@ -59,7 +59,7 @@ def _on_relief(field, p, unit):
 def _on_primitive(primitive, heights, face, p):
     """Return normal, texture coordinates u and v, and face number of a point on a primitive.
 
-    face: face that was hit, as in an interval. p: the point in the primitive's frame.
+    face: number of the face that the ray hit. p: the point in the primitive's frame.
     """
     kind = primitive.kind
     extra = primitive.extra

@@ -76,9 +76,10 @@ def _views(
 
 @inner
 def _seen(shadows, k, own, p):
-    """Return the share of light that reaches point p, by shadow map number k.
+    """Return the share of light that reaches point p, by shadow map number k; 1 outside the map.
 
-    It is 1 outside the map. own: see `lit`.
+    own: index of the shape on which p lies, if this shape cannot cast a shadow on itself; otherwise
+    -1.
     """
     view = shadows.maps[k]
     side = view.side
@@ -175,8 +176,8 @@ def visible(shapes, around, own, point, normal, strength, reach, footprint):
 
     Distances from two heights above the point to other shapes are compared with the heights, after
     Evans 2006, "Fast approximations for global illumination on dynamic scenes". around: see
-    `surroundings`. own: index of the shape on which the point lies. strength: 0
-    for no occlusion. reach: distance at which shapes darken points. footprint: distance between
+    `surroundings`. own: index of the shape on which the point lies. strength: amount of darkening;
+    0 for none. reach: distance at which shapes darken points. footprint: distance between
     neighbouring pixels at the point. Lengths are in metres.
     """
     x, y, z = narrow(point)

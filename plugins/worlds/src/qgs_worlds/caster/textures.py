@@ -137,7 +137,7 @@ def _glyphs(x, y, seed):
 
 @inner
 def _mean(kind, width):
-    """Return the share of the pattern's own colour, as a mean over the whole pattern."""
+    """Return the mean share of the pattern's own colour, over the whole pattern."""
     if kind == s.CHECKER:
         return 0.5
     if kind == s.TILES:

@@ -125,9 +125,9 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
-    """Return cameras within 1 cm of one point, the freest of some random points.
+    """Return cameras within about 1 cm of one point; used if all random paths fail.
 
-    They are used if all random paths fail.
+    The point is the one of 64 random points that is farthest from fixed shapes.
     """
     # any point is better than one inside a wall
     points = rng.uniform(place.low, place.high, (64, 3))
@@ -195,7 +195,7 @@ def _stand(
 
 
 def _walk(rng: np.random.Generator, path: Path) -> Motion:
-    """Return a walk along a bent line.
+    """Return camera centres on a bent line, and the points that the cameras look at.
 
     If the field of view is wide, cameras may look ahead, not only at the target.
     """
@@ -210,7 +210,10 @@ def _walk(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _orbit(rng: np.random.Generator, path: Path) -> Motion:
-    """Return a path around the target, with small changes of height and distance."""
+    """Return camera centres around the target, which all cameras look at.
+
+    Height and distance change a little along the path.
+    """
     base, target, length, s, _ = path
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
@@ -224,7 +227,10 @@ def _orbit(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _round(rng: np.random.Generator, path: Path) -> Motion:
-    """Return cameras that turn almost on the spot, so that views overlap."""
+    """Return camera centres near one point, and the points that the cameras look at.
+
+    The viewing direction turns from camera to camera, by so little that views overlap.
+    """
     base, target, length, s, fov = path
     angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
     way = np.stack([*_turned(target - base, angles), np.full(len(s), (target - base)[2])], 1)
@@ -233,7 +239,7 @@ def _round(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _gather(rng: np.random.Generator, path: Path) -> Motion:
-    """Return cameras that look at the target from random positions around one point."""
+    """Return random camera centres around one point; all cameras look at the target."""
     base, target, length, s, _ = path
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
     # the square root spreads them nearly evenly over the disc
