@@ -113,7 +113,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def domain(self) -> Domain:
-        """Ranges of camera measurements in the model's training; empty if unknown."""
+        """Ranges of measurements of the training cameras, such as distances; empty if unknown."""
         key = _EXTRA + KEY
         if key not in self.metadata:
             return Domain()

@@ -57,7 +57,7 @@ class TensorFile:
         self._file.__exit__(*exception)
 
     def read(self) -> dict[str, Tensor]:
-        """Return all tensors, memory-mapped. They stay valid after the file is closed."""
+        """Return all tensors by name, memory-mapped. They stay valid after the file is closed."""
         with self._whole():
             return {name: self._file.get_tensor(name) for name in self._file.keys()}  # noqa: SIM118
 

@@ -27,7 +27,7 @@ class CommandGroup(TyperGroup):
         return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command `cmd_name` of the core or a plug-in; ValueError if there is none."""
+        """Return the command `cmd_name` of the core or a plug-in; raise ValueError if missing."""
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own

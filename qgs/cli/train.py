@@ -84,7 +84,7 @@ def _report(result: TrainingResult, console: Console) -> None:
 
 
 def with_absolute_path(recipe: Recipe) -> Recipe:
-    """Make the recipe's paths of data and evaluation index absolute.
+    """Return the recipe with absolute paths of data and evaluation index.
 
     Then `qgs eval` works in every directory.
     """

@@ -31,7 +31,7 @@ class Scene(ABC):
 
     name: str
     held_out: Sequence[int] = ()
-    """Frames that training never sees. Evaluation can use them as targets."""
+    """Frames that training never uses. Evaluation can use these frames as targets."""
     missing: Sequence[str] = ()
     """Names of images that the data lists but that do not exist. They get no frame number."""
     times: Tensor | None = None

@@ -33,12 +33,12 @@ class WorldsConfig(DrawnConfig):
     to `complexity`. An object consists of a few shapes."""
     cameras: Variety = "varied"
     """Camera paths. `plain`: level walks along a line, with fields of view of 60 to 75 degrees.
-    `varied`: walks, orbits, turns on the spot, and scattered cameras that look at one point. These
-    have pitch, roll, tiny to wide baselines, and fields of view of 18 to 90 degrees. Fields of view
-    are measured along the longer side of an image."""
+    `varied`: walks, orbits, turns on the spot, and scattered cameras that look at one point. Varied
+    cameras have pitch, roll, tiny to wide baselines, and fields of view of 18 to 90 degrees. Fields
+    of view are measured along the longer side of an image."""
     shapes: Variety = "varied"
-    """Shapes of objects. `plain`: upright boxes, balls and cylinders in closed rooms.
-    `varied`: freely turned composites of all primitives, with cuts, bars, wires and height
+    """Shapes of objects. `plain`: upright boxes, balls and cylinders in closed rooms. `varied`:
+    randomly rotated composites of all kinds of primitives, with cuts, bars, wires and height
     fields; the scenes are rooms with openings, outdoor scenes, and objects on plain ground."""
     textures: Variety = "varied"
     """Textures. `plain`: uniform surfaces and simple patterns. `varied`: warped noise with a
@@ -50,7 +50,7 @@ class WorldsConfig(DrawnConfig):
     """Range [min, max] of the median depth of a scene, in metres. Each scene is scaled to a random
     median depth from this range, log-uniform. Null means that scenes are not scaled."""
     rooms: float = Field(default=0.0, ge=0, le=1)
-    """Share of scenes, from 0 to 1, that are furnished rooms of `rooms/procedural`."""
+    """Share of scenes, from 0 to 1, that are furnished rooms from the source `rooms/procedural`."""
     effects: bool = True
     """Vary exposure, white balance, tone curve, vignette, noise and JPEG quality from scene to
     scene. False means the same neutral camera for all scenes."""
@@ -78,7 +78,7 @@ class WorldScene(DrawnScene):
 
     @cached_property
     def drawn(self) -> "Drawn":
-        """Shapes, textures, lights and cameras, generated at first use."""
+        """Shapes, textures, lights and cameras of the scene, generated at first use."""
         from qgs_worlds.worlds.drawing import draw
 
         return draw(self.key, self._config)

@@ -61,8 +61,8 @@ VARIED = Style(
 class Things:
     """Generator of random objects, about 2 units in size, around the origin.
 
-    textures: number of textures; a shape uses one, or six consecutive ones, one for each face.
-    maps: number of height maps.
+    textures: number of textures to choose from; a shape uses one texture, or six consecutive
+    textures, one for each face. maps: number of height maps to choose from.
     """
 
     def __init__(self, rng: Random, style: Style, textures: int, maps: int) -> None:

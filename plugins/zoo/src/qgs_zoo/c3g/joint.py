@@ -65,7 +65,7 @@ class JointLayer(DecoderLayer):
     def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:
         """Return attention (B, T, D) of each token to all tokens except masked queries.
 
-        It is a linear layer of softmax(q k / sqrt(d)) v.
+        The result is softmax(q k / sqrt(d)) v after a linear layer.
         """
         # Without a mask torch uses its fastest kernel.
         mask_B11T = None

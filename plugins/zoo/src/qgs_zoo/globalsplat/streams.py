@@ -1,6 +1,6 @@
 """`globalsplat/slots`, `globalsplat/round`: tokens with two streams, geometry and texture.
 
-In each round, both streams read the photos and are then mixed.
+In each round, both streams attend to the features of the photos, and are then mixed.
 """
 
 from collections.abc import Iterable

@@ -24,7 +24,7 @@ class Stages(NamedTuple):
 class ResidualBlock(nn.Module):
     """Residual block relu(skip(x) + relu(norm(conv(relu(norm(conv x)))))).
 
-    It maps (N, C, H, W) to (N, C', H/s, W/s), with s the stride.
+    It maps (N, C, H, W) to (N, C', H/s, W/s), with s the stride and C' = `outputs`.
     """
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:

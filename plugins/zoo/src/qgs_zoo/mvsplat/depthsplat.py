@@ -56,7 +56,7 @@ class DepthSplatConfig(ComponentConfig):
     second sweep has a quarter as many."""
     scales: Literal[1, 2] = 1
     """Number of sweeps. A second sweep has twice the resolution, and tries depths around the result
-    of the first."""
+    of the first sweep."""
     stride: Literal[4, 8] = 4
     """Side, in pixels of the image, of the square for which the first sweep finds a depth."""
     neighbours: int = Field(default=2, ge=1)
@@ -159,7 +159,7 @@ def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
 
 @full_precision
 def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) -> Tensor:
-    """Return inverse depths (N, D, 2h, 2w) for a second sweep, around the result of the first.
+    """Return inverse depths (B V, D, 2h, 2w) for a second sweep, around those of the first.
 
     coarse: inverse depths from the first sweep. first: number of depths in the first sweep. count:
     D, the number of depths in the second sweep.
@@ -208,7 +208,7 @@ class DepthPredictor(nn.Module):
         self.upsampler = dpt_head(sizes, depth=True)
 
     def candidates(self, scale: int) -> int:
-        """Return the number of depths that a sweep tries; scale 0 is the first sweep."""
+        """Return the number of depths that a sweep tries. Scale 0 is the first sweep."""
         return self.sizes.candidates // 4**scale
 
     def forward(
@@ -279,7 +279,7 @@ class DepthPredictor(nn.Module):
         return found, confidence
 
     def vit_maps(self, images_N3HW: Tensor) -> list[Tensor]:
-        """Return the tokens of the ViT blocks in `sizes.blocks` as maps (N, C, H/8, W/8)."""
+        """Return the tokens of the ViT blocks in `sizes.blocks` as maps (B V, C, H/8, W/8)."""
         height, width = images_N3HW.shape[-2:]
         grid = (height // PATCH, width // PATCH)
         # The ViT has patches of 14: the image shrinks to whole patches.

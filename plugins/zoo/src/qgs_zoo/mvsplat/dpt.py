@@ -40,7 +40,8 @@ class Fusion(nn.Module):
     def forward(self, coarse: Tensor | None, skip: Tensor, size: Sequence[int]) -> Tensor:
         """Return the sum of the maps `skip` and `coarse`, resized to `size`: (X, F, *size).
 
-        coarse: sum of all maps coarser than `skip`, or None if `skip` is the coarsest map.
+        X: number of images. F: channels. coarse: sum of all maps coarser than `skip`, or None if
+        `skip` is the coarsest map.
         """
         if self.resConfUnit1 is not None and coarse is not None:
             skip = coarse + self.resConfUnit1(skip)
@@ -64,7 +65,7 @@ class Scratch(nn.Module):
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
         """Return a full-size map from maps at 1/2, 1/4, 1/8 and 1/16 of the image size.
 
-        The map is (X, F, H, W), or with `ends_in_depth` (X, 1, H, W).
+        The map of X images is (X, F, H, W), or with `ends_in_depth` (X, 1, H, W). F: channels.
         """
         path = None
         # From coarse to fine: each fusion doubles the size.
@@ -127,8 +128,8 @@ class DptHead(nn.Module):
     ) -> Tensor:
         """Return a full-size map (X, F, H, W), or (X, 1, H, W) if the head ends in depth.
 
-        joined: maps of other networks, two lists for each of the sizes 1/2, 1/4 and 1/8: maps to
-        put before the ViT's channels, and maps to put after them.
+        X: number of images. F: channels. joined: maps of other networks, two lists for each of the
+        sizes 1/2, 1/4 and 1/8: maps to put before the ViT's channels, and maps to put after them.
         """
         own = [
             resize(project(x))

@@ -71,10 +71,10 @@ def feature_lenses(cameras: Cameras, size: Sequence[int]) -> Tensor:
 
 @full_precision
 def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
-    """Project pixels at D given depths into another view, and return positions (N, D, h, w, 2).
+    """Project pixels of N views at D depths into other views: positions (N, D, h, w, 2).
 
     Positions are in the units of torch's `grid_sample`. depth: camera-frame z of pixels, in world
-    units. lens: fx, fy, cx, cy in pixels, used for both views. pose: transform from the frame of
+    units. lens: fx, fy, cx, cy in pixels, used for both cameras. pose: transform from the frame of
     the pixels' camera to the frame of the other camera.
     """
     height, width = depth_NDhw.shape[-2:]
@@ -97,7 +97,7 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
 
 
 def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
-    """Sample features of another view at the positions `grid`: (N, C, D, h, w).
+    """Sample features of N other views at the positions `grid`: (N, C, D, h, w).
 
     The result is 0 outside of the other view.
     """
@@ -141,7 +141,7 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlate features with features sampled from another view, part by part: (N, D, h, w)."""
+    """Correlate features of N views with samples of other views, in parts: (N, D, h, w)."""
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
@@ -153,7 +153,7 @@ def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Te
 
 
 def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlate all pairs of pixels of both views, then sample the correlations: (N, D, h, w).
+    """Correlate all pixels of N views with all pixels of other views, then sample: (N, D, h, w).
 
     The result equals the result of `_of_warped`, because sampling is linear in the features. All
     correlations are one matrix product, and sampling them handles one channel instead of C. This is

@@ -19,8 +19,8 @@ from qgs.types import ImageMemory, QueryState
 class Exchange(DecoderLayer):
     """Decoder layer that swaps a query's first and last feature: its final and its coarse depth.
 
-    The first feature is the depth at which the Gaussian is placed. The encoder needs
-    `coarse_depth: true`. With an even number of these layers, the last one has the final depth.
+    The first feature is the depth at which the Gaussian is placed. The encoder needs `coarse_depth:
+    true`. With an even number of these layers, the last layer places Gaussians at the final depth.
     """
 
     name = "exchange"
@@ -36,8 +36,8 @@ class Exchange(DecoderLayer):
 class DecayedSupervision(LayerSupervision):
     """Supervision in which the weight of each layer is `decay` times that of the next layer.
 
-    Weights add up to 1. In the released code, they add up to 1.9 for two depths. This factor of all
-    gradients does not affect Adam, but it affects gradient clipping.
+    Weights add up to 1. In the released code, they add up to 1.9 for two depths. This factor 1.9 of
+    all gradients does not affect Adam, but it affects gradient clipping.
     """
 
     name = "decayed"

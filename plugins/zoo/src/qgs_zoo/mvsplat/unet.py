@@ -36,7 +36,7 @@ def zeroed(module: nn.Module) -> nn.Module:
 
 
 def resized(x_BCHW: Tensor, size: Sequence[int]) -> Tensor:
-    """Resize maps bilinearly to `size` (H, W), with torch's `align_corners`."""
+    """Resize maps bilinearly to `size` (H, W), with `align_corners=True` of torch."""
     return F.interpolate(x_BCHW, tuple(size), mode="bilinear", align_corners=True)
 
 

@@ -173,7 +173,7 @@ class WindowTransformer(nn.Module):
     def forward(self, x_BVCHW: Tensor, neighbours_BVJ: Tensor) -> Tensor:
         """Return updated maps (B, V, C, H, W).
 
-        x: maps to which embeddings of positions are added. neighbours: indices (B, V, J) of the J
+        x: maps to which embeddings of positions were added. neighbours: indices (B, V, J) of the J
         views that each view reads.
         """
         size = (x_BVCHW.shape[-2], x_BVCHW.shape[-1])

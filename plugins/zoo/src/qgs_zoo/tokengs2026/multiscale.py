@@ -85,8 +85,8 @@ class MultiscaleReadout(PatchViT):
 
     class Config(PatchViT.Config):
         blocks: tuple[int, ...] = Field(default=(1, 2, 3), min_length=1)
-        """Numbers of the blocks whose outputs are read, ascending from 1 for the first block. The
-        largest must be `depth`."""
+        """Numbers of the ViT blocks whose outputs are read, in ascending order. The first block is
+        1. The largest number must be `depth`."""
         time_channels: int = Field(default=0, ge=0, multiple_of=2)
         """Number of channels that encode the time of a photo. 0 ignores the times of photos."""
 
@@ -229,8 +229,8 @@ class LatentBottleneck(MultiscaleReadout):
         depth: int = Field(default=12, ge=1, le=256)
         """Number of ViT blocks."""
         blocks: tuple[int, ...] = Field(default=(6, 8, 10, 12), min_length=1)
-        """Numbers of the blocks whose outputs are read, ascending from 1 for the first block. The
-        largest must be `depth`."""
+        """Numbers of the ViT blocks whose outputs are read, in ascending order. The first block is
+        1. The largest number must be `depth`."""
         latents: int = Field(ge=1)
         """L, the number of learned latents (TokenGS: 4096)."""
         latent_std: float = Field(default=0.02, ge=0)
