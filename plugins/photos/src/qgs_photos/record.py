@@ -21,11 +21,12 @@ CAMERAS = "cameras.json"
 class Record:
     """A finished reconstruction, in the world coordinates of its Gaussians.
 
-    model: checkpoint of the model, "" if unknown. tuning: settings of `--tune`; None without.
-    world: reference pose (4, 4) and scale that map the world of the photos to this one (see
-    `own_world`). inputs, compared: indices of the input frames and of the frames that it was
-    compared with. cameras: (1, V), first of the inputs, then of the compared frames. photos: files
-    by frame, where known. renderer: options with the background of the model.
+    model: checkpoint of the model, "" if unknown. tuning: settings of `--tune`; None without this
+    option. world: reference pose (4, 4) and scale that map the world of the photos to that of the
+    Gaussians (see `own_world`). inputs, compared: indices of the input frames and of the frames
+    with which renders were compared. cameras: (1, V), first of the inputs, then of the compared
+    frames. photos: file of each frame, by index, where known. renderer: options with the background
+    of the model.
     """
 
     folder: Path

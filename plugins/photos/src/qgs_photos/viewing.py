@@ -13,9 +13,9 @@ VIEWER = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0), far=1e4))
 
 
 def in_own_world(world: tuple[Tensor, Tensor], gaussians: Gaussians) -> Gaussians:
-    """Move Gaussians (1, G) from the photos' world into `world`; twin of `in_world` of cameras.
+    """Move Gaussians (1, G) from the photos' world into `world`.
 
-    world: reference pose (4, 4) and scale, see `own_world`.
+    world: reference pose (4, 4) and scale, see `own_world`. `in_world` does the same for cameras.
     """
     reference, scale = world
     pose = scaled(torch.linalg.inv(reference.double()), scale)

@@ -223,7 +223,7 @@ def test_single_files_are_data_sets_too(good):
 def test_nothing_passes_in_silence(good):
     room = UPath(good / "room")
     must_refuse(
-        "holds no chunks: leave --format out",
+        "holds no data of the format chunks: leave --format out",
         check,
         room,
         Options(format="chunks"),

@@ -1,4 +1,4 @@
-"""Studies, benchmarks, and import of published weights."""
+"""Tools for research: studies, benchmarks, and import of published weights."""
 
 import os
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def short_names(recipes: Sequence[str | Path]) -> list[str]:
-    """Return names of recipes without the folders they have in common and without suffixes."""
+    """Return names of recipe files without suffixes, relative to the folder that holds all."""
     files = [Path(recipe).absolute() for recipe in recipes]
     shared = os.path.commonpath([file.parent for file in files])
     return [os.path.relpath(file.with_suffix(""), shared) for file in files]

@@ -61,7 +61,7 @@ def test_shapes_without_a_recipe_are_refused():
     shapes = published_shapes(composed())
     for changes, why in (
         ({"gs_tokens": None}, "gs_tokens is missing"),
-        ({"activation_head.deconv.weight": (71, 48)}, "head: 71 is no multiple of 14"),
+        ({"activation_head.deconv.weight": (71, 48)}, "head: 71 must be a multiple of 14"),
         ({"gs_tokens": (10,)}, "without axis"),
     ):
         given = {name: shape for name, shape in (shapes | changes).items() if shape}

@@ -15,10 +15,7 @@ app = typer.Typer(help="Render a camera path through Gaussians as a video.")
 def video(
     source: Annotated[
         Path,
-        typer.Argument(
-            help="Gaussians to show: a folder that qgs reconstruct or qgs scene wrote, or a PLY "
-            "file."
-        ),
+        typer.Argument(help="Folder that qgs reconstruct or qgs scene wrote, or a PLY file."),
     ],
     photos: Annotated[
         str | None,
@@ -33,9 +30,8 @@ def video(
     path: Annotated[
         str,
         typer.Option(
-            help="Camera path: orbit, spiral, walk, or a file. A file is a camera path saved by "
-            "nerfstudio's viewer or a transforms file; its poses have the same world coordinates "
-            "as the poses of the photos."
+            help="Camera path: orbit, spiral, walk, or a file in the photos' world coordinates: a "
+            "path saved by nerfstudio's viewer, or a transforms file."
         ),
     ] = "orbit",
     size: Annotated[
@@ -53,10 +49,7 @@ def video(
     fov: Annotated[
         float | None,
         typer.Option(
-            min=1,
-            max=170,
-            help="Vertical angle of view in degrees. Default: that of the photos, or of a "
-            "path's file.",
+            min=1, max=170, help="Vertical angle of view in degrees. Default: that of the photos."
         ),
     ] = None,
     scene: SceneName = None,

@@ -107,10 +107,7 @@ class Record:
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """Return the scene stored in the entry `data` of the chunk `file`.
-
-    Raises ValueError if the entry is malformed.
-    """
+    """Return the scene in an entry `data` of a chunk `file`. Raises ValueError if it is invalid."""
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
             f"{file} holds {a_type(data)}, expected a mapping with 'key', 'cameras' and 'images': "
@@ -310,9 +307,8 @@ class Chunk:
         """Return the scene `key`. Raises ValueError if it is invalid or not in this chunk."""
         if key not in self.entries:
             raise ValueError(
-                f"{self.path} does not hold the scene {key!r}, although index.json says that it "
-                "does: pack the data set again, or remove index.json; without index.json, scenes "
-                "are listed from the chunks"
+                f"{self.path} does not hold the scene {key!r}, although index.json says so: pack "
+                "the data set again, or remove index.json to list the scenes from the chunks"
             )
         if key not in self._parsed:
             self._parsed[key] = parse_record(str(self.path), self.entries[key])
@@ -340,16 +336,15 @@ def read_chunk_index(path: UPath) -> dict[str, str]:
     index = read_json(path, "copy it again, or remove it, then scenes are listed from the chunks")
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
         raise ValueError(
-            f"{path} must map each scene's key to the name of its chunk file: correct the index, "
-            "or remove it; without an index, scenes are listed from the chunks"
+            f"{path} must map each scene's key to the name of its chunk file: correct or remove it"
         )
     inside = {name for name in set(index.values()) if stays_inside(name)}
     for key, name in index.items():
         if name not in inside:
             raise ValueError(
                 f"{path} names, for the scene {name_shown(key)}, the chunk {name_shown(name)!r} "
-                "outside the folder of the index: correct the index, or remove it; without an "
-                "index, scenes are listed from the chunks"
+                "outside the folder of the index: correct the index, or remove it to list the "
+                "scenes from the chunks"
             )
     return index
 

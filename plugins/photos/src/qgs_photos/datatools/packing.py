@@ -144,11 +144,10 @@ def pack(
     A chunk has at most `chunk_bytes` bytes, or holds one larger scene. index.json is written last.
     An interrupted packing continues after its last complete chunk if its settings are the same.
 
-    settings: options that decide which scenes the source has. leave_out_broken: leave out scenes
+    settings: options that decide what the source's scenes are. leave_out_broken: leave out scenes
     that cannot be read and name them in the result; False raises their error. progress: called with
     the name of each finished scene. Raises FileExistsError for a folder with other content,
-    ValueError for an unfinished packing with other settings, and ValueError and OSError from
-    reading scenes.
+    ValueError for an unfinished packing with other settings, and the errors of reading scenes.
     """
     encoding = encoding or Encoding()
     # chunks of two settings in one folder would be a data set that nobody asked for
@@ -179,10 +178,7 @@ def pack(
             files |= {entry["key"]: file for entry in chunk}
     if not any(written.values()):
         reasons = listed((f"{n}: {why}" for n, why in packed.left_out.items()), 3, "; ")
-        raise ValueError(
-            "there is no scene to pack, give a data set with readable scenes"
-            f"{': ' if reasons else ''}{reasons}"
-        )
+        raise ValueError(f"there is no scene to pack{': ' if reasons else ''}{reasons}")
     for split, files in written.items():
         packed.scenes[split] = len(files)
         if files:

@@ -41,12 +41,11 @@ def extract(
     """Write the sharpest frame of each interval of a video into `folder`.
 
     Files are upright JPEGs, numbered from 0. Frames that cannot be decoded are left out. Returns
-    remarks for the user, about a damaged video.
+    remarks on a damaged video.
 
-    count: number of intervals, all of the same duration. None makes intervals that are shorter in
-    fast motion, and keeps at most MOST frames (see `thinned`). progress: called with the stage, the
-    seconds done, and the seconds of the video. Raises PosesError for a file that is not a video or
-    has fewer than LEAST frames.
+    count: number of intervals, all of the same duration. None makes intervals shorter in fast
+    motion, and keeps at most MOST frames (`thinned`). progress: called with the stage, the seconds
+    done, and those of the video. Raises PosesError without a video of at least LEAST frames.
     """
     times, aspect, damaged = _times(video)
     if len(times) < LEAST:

@@ -15,14 +15,14 @@ _HELD = {"poses": 10.0, "colors": 0.1}
 
 
 class Adjustments:
-    """Corrections of the poses and colours of photos, optimised in steps on the respective photo.
+    """Corrections of the poses and colours of photos; each step optimises those of one photo.
 
     A pose has 6 parameters in the frame of its camera: half the rotation vector (radians), and the
     translation divided by `size`. An exposure has 3 x 4: the deviation from the identity of an
     affine map of rendered RGB.
 
-    photos: their number. poses, exposure: whether to optimise these. size: of the scene, in world
-    units. like: tensor whose type and device the parameters get.
+    photos: number of photos. poses, exposure: whether to optimise the poses, the exposures. size:
+    size of the scene in world units. like: tensor whose type and device the parameters get.
     """
 
     def __init__(self, photos: int, poses: bool, exposure: bool, size: float, like: Tensor) -> None:
@@ -56,7 +56,7 @@ class Adjustments:
         return Cameras(torch.cat(each, 1), cameras.intrinsics, cameras.size)
 
     def seen(self, photo: int, rgb: Tensor) -> Tensor:
-        """Return rendered `rgb` (1, 1, 3, H, W) with the exposure of the photo `photo`."""
+        """Apply the exposure of the photo with index `photo` to rendered `rgb` (1, 1, 3, H, W)."""
         if "colors" not in self._parts:
             return rgb
         change = self._parts["colors"][photo]
@@ -64,11 +64,14 @@ class Adjustments:
         return rgb + turned + change[:, 3, None, None]
 
     def cost(self, photo: int) -> Tensor | float:
-        """Return the term of the loss that keeps the corrections of a photo small."""
+        """Return the loss term that keeps the corrections of the photo with index `photo` small."""
         return sum(_HELD[k] * part[photo].square().sum() for k, part in self._parts.items())
 
     def step(self, used: float) -> None:
-        """Take an optimizer step. used: fraction of the time already spent, lowers the rate."""
+        """Take an optimizer step.
+
+        used: fraction of the optimisation's time already spent; the learning rate falls with it.
+        """
         if self._optimizer is not None:
             for group in self._optimizer.param_groups:
                 group["lr"] = _RATES[group["name"]] * _LAST**used

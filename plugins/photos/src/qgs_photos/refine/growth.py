@@ -1,4 +1,4 @@
-"""Add Gaussians during the optimisation: split opaque Gaussians, and relocate dead ones to them.
+"""Add Gaussians during the optimisation: split opaque ones, and turn dead ones into copies of them.
 
 Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024). The paper adds
 noise to positions. Here a copy is displaced by a fraction of its parent's size, so that copy and
@@ -83,8 +83,9 @@ class FreeGaussians:
         """Turn dead Gaussians into copies of opaque ones, and add further copies up to `count`.
 
         Parents are sampled with probabilities proportional to opacity. Parent and copies become
-        smaller and more transparent, so that together they render like the parent before. Their
-        moments of Adam restart at 0. If all Gaussians are below DEAD, none is relocated.
+        smaller and more transparent, so that together they render like the parent before. The Adam
+        moments of parent and copies restart at 0. If all opacities are below DEAD, no Gaussian
+        counts as dead.
         """
         opacities = self.values["opacity_logits"].sigmoid()
         faint = (opacities < DEAD) & (opacities >= DEAD).any()

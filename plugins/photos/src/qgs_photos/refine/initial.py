@@ -37,11 +37,12 @@ _FIXED = struct.Struct("<Q3d3BdQ")
 
 @dataclass(frozen=True)
 class Initialisation:
-    """Start of the optimisation.
+    """Start of the optimisation: a model's Gaussians, or only a world to place Gaussians in.
 
     model: name of the model, or "none". world: reference pose (4, 4) and scale of the world of the
-    Gaussians, see `own_world`. gaussians: (1, G) of the model; None places Gaussians by the photos.
-    frames: names of the model's input photos, separated by commas; None without a model.
+    Gaussians, see `own_world`. gaussians: (1, G) of the model; None if Gaussians are to be placed
+    from the photos. frames: names of the model's input photos, separated by commas; None without a
+    model.
     """
 
     model: str
@@ -58,7 +59,10 @@ def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisati
     """
     of_model = options.frames is not None or options.scale is not None
     if options.model == NONE and of_model:
-        raise ValueError("--frames and --scale need a model: leave them out, or --model none")
+        raise ValueError(
+            "--frames and --scale need a model: leave out --frames and --scale, or leave out "
+            "--model none"
+        )
     enough = not of_model and len(photos.frames) >= ENOUGH
     if options.model == NONE or (options.model is None and enough):
         return Initialisation(NONE, photos_world(photos))
@@ -107,9 +111,10 @@ def photos_start(
 ) -> Gaussians:
     """Return Gaussians (1, G) at COLMAP's points, if the scene has any, and at pixels of photos.
 
-    world: of the Gaussians, see `own_world`. views: photos (1, V). count: number of Gaussians at
-    the end of the optimisation, which these do not exceed. most: largest number at pixels; without
-    COLMAP's points there are at least TIMED.
+    world: reference pose (4, 4) and scale of the Gaussians' world, see `own_world`. views: photos
+    (1, V). count: number of Gaussians at the end of the optimisation. most: largest number of
+    Gaussians at pixels; without COLMAP's points, at least TIMED are placed. Points and pixels
+    together give at most `count`, or TIMED.
     """
     parts = list[Gaussians]()
     if isinstance(scene, PhotoScene) and (points := sparse_points(scene.folder)):
@@ -125,8 +130,8 @@ def photos_start(
 def sparse_points(folder: UPath) -> tuple[Tensor, Tensor] | None:
     """Return COLMAP's points: positions (N, 3) in the cameras' world, and colours (N, 3) in [0, 1].
 
-    Both are float64. folder: the scene's. None if the cameras are not from a COLMAP model, or if it
-    has no points. Raises ValueError for points that cannot be read.
+    Both are float64. folder: folder of the scene. Returns None if the cameras are not from a COLMAP
+    model, or if the model has no points. Raises ValueError for points that cannot be read.
     """
     # other formats go first, and have a world of their own
     if formats_of(folder)[:1] != ["colmap"]:
@@ -171,7 +176,8 @@ def from_points(
     """Return Gaussians (1, G) at points, each as large as the mean distance to its neighbours.
 
     points: positions and colours, see `sparse_points`. world: reference pose (4, 4) and scale of
-    the Gaussians' world, see `own_world`. most: largest number; of more points some are sampled.
+    the Gaussians' world, see `own_world`. most: largest number of Gaussians; of more points, a
+    random subset is used.
     """
     means, colors = points
     reference, scale = world

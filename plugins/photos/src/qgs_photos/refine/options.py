@@ -1,4 +1,4 @@
-"""Hold the options of `qgs scene`, first as the user gives them, then with all values chosen."""
+"""Options of `qgs scene`, as the user gives them, or with all values that the command chooses."""
 
 import shlex
 from dataclasses import dataclass
@@ -14,9 +14,10 @@ NONE = "none"
 class Options:
     """Options of `qgs scene`; None lets the command choose.
 
-    frames: input photos of the model, separated by commas. scale: of camera positions for the
-    model. size: (H, W) of the photos in pixels. gaussians: their number. seconds: time of the
-    optimisation alone. holdout: N to hold out every Nth photo, or NONE. scene: name among several.
+    model: name of the model that makes the first Gaussians, or NONE. frames: input photos of the
+    model, separated by commas. scale: factor on camera positions for the model. size: (H, W) of the
+    photos in pixels. gaussians: number of Gaussians. seconds: time of the optimisation alone.
+    holdout: N to hold out every Nth photo, or NONE. scene: name of the scene if there are several.
     extras: further quantities to optimise. masks: treat pixels outside masks as background.
     """
 
@@ -33,7 +34,7 @@ class Options:
     masks: bool = False
 
     def command(self, photos: str, out: str) -> str:
-        """Return a command line that makes the scene again. `size` and `seconds` must be set."""
+        """Return a command line that repeats `qgs scene`. `size` and `seconds` must be set."""
         assert self.size is not None
         assert self.seconds is not None
         height, width = self.size

@@ -30,12 +30,12 @@ def opened_reconstruction(
     """Open the reconstruction that `qgs reconstruct` wrote into `folder`, and its photos.
 
     Returns the reconstruction, the scene with photos of `size`, and the indices of the photos on
-    which its model was trained.
+    which the reconstruction's model was trained.
 
-    size: (H, W) of the photos in pixels; None takes that of the reconstruction. name: scene among
-    several; None takes that of the reconstruction. Raises FileNotFoundError if `folder` holds no
-    reconstruction, ValueError if its model is unknown or the photos are others, and what the
-    readers of model and photos raise.
+    size: (H, W) of the photos in pixels; None takes that of the reconstruction. name: name of the
+    scene if `photos` holds several; None takes that of the reconstruction. Raises FileNotFoundError
+    if `folder` holds no reconstruction, ValueError if its model is unknown or it was made from
+    other photos, and the errors of the readers of model and photos.
     """
     if not has_record(folder):
         raise FileNotFoundError(
@@ -70,7 +70,7 @@ def opened_reconstruction(
 def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
     """Raise ValueError unless the photos and poses of `scene` are those of the reconstruction.
 
-    photos: name of their folder for the message.
+    photos: name of the photos' folder, for the message.
     """
     frames = (*record.inputs, *record.compared)
     expected = [record.photos.get(frame, str(frame)) for frame in frames]
@@ -81,7 +81,8 @@ def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
             return
     raise ValueError(
         f"{photos} does not hold the photos from which {record.folder} was made, or their poses "
-        f"have changed; it was made from {listed(expected, 3)}: give these, or reconstruct again"
+        f"have changed; the photos were {listed(expected, 3)}: give these photos, or reconstruct "
+        "again"
     )
 
 
@@ -111,8 +112,9 @@ def refine_reconstruction(
     """Refine the Gaussians of the reconstruction `start` on photos of `scene`.
 
     seen: indices of photos on which the model was trained. seconds: time of the optimisation.
-    count: number of Gaussians in the result; None keeps their number. inputs_only: optimise only on
-    the input photos; False: on all photos that are neither compared with nor held out of training.
+    count: number of Gaussians in the result; None keeps the number of `start`. inputs_only:
+    optimise only on the input photos; False takes all photos except those held out of training and
+    those with which the result is compared.
     """
     frames, targets = _chosen_frames(scene, start, inputs_only)
     every = views_in(start.sample.world, scene, (*frames, *targets)).to(

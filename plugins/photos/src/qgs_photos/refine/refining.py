@@ -111,11 +111,11 @@ def refine(
     finishes the step and returns the result so far.
 
     seconds: time of the optimisation, without the first step, in which kernels compile. count:
-    number of Gaussians at the end, reached in the first part of the time; None keeps their number.
-    swept: fraction of new Gaussians at the start, from 0 to 1. renderer: by default `qgs/auto`.
-    console: shows progress; None shows none. extras: further quantities to optimise.
+    number of Gaussians at the end, reached in the first part of the time; None keeps the given
+    number. swept: fraction of new Gaussians at the start, from 0 to 1. renderer: by default
+    `qgs/auto`. console: shows progress; None shows none. extras: further quantities to optimise.
 
-    Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
+    Raises ValueError for more than one scene, no photo, no time, or Gaussians that are not finite.
     """
     wanted = gaussians.count if count is None else count
     _refuse_unusable(gaussians, views, seconds, wanted)
@@ -139,8 +139,8 @@ def seconds_of_step(
 ) -> float:
     """Measure the time in seconds of a step of `refine` on these Gaussians and photos (1, V).
 
-    It is the least of three steps with all spherical harmonics, after a step in which kernels
-    compile.
+    The result is the least time of three steps with all spherical harmonics, after a step in which
+    kernels compile.
     """
     run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras)
     run.levels = run.levels[-1:]
@@ -213,7 +213,7 @@ class _Run:
             self.free.grow(self.wanted, self.generator)
 
     def optimise(self) -> tuple[float, float]:
-        """Take a step on one photo, and add Gaussians if it is time for that.
+        """Take a step on one photo, and add Gaussians if their next addition is due.
 
         Returns the loss and the PSNR before the step.
         """
@@ -248,7 +248,7 @@ class _Run:
         return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))
 
     def _grow(self, used: float) -> None:
-        """Relocate and add Gaussians at regular steps. used: fraction of the time already spent."""
+        """Relocate and add Gaussians every few steps. used: fraction of the time already spent."""
         regular = self.step - self.grown >= _STEPS_BETWEEN_GROWTHS and used < _SETTLED
         if regular or (used >= _GROWN and self.free.count < self.wanted):
             self.grown = self.step
@@ -262,9 +262,9 @@ def partly_swept(
 ) -> Gaussians:
     """Return the most opaque of the given Gaussians and new ones at pixels, together (1, count).
 
-    part: fraction of new Gaussians, from 0 to 1. Their depth comes from a plane sweep, and their
-    spherical harmonics and features are 0. With a single photo, which gives no depth, there are no
-    new Gaussians.
+    part: fraction of new Gaussians, from 0 to 1. The depth of new Gaussians comes from a plane
+    sweep; their spherical harmonics and features are 0. With a single photo, which gives no depth,
+    there are no new Gaussians.
     """
     new = int(part * count) if views.images.shape[1] > 1 else 0
     # faint Gaussians of a model are fog, which hides more than it shows
@@ -275,7 +275,10 @@ def partly_swept(
 
 
 def joined(gaussians: Gaussians, others: Gaussians) -> Gaussians:
-    """Return all Gaussians (1, G); the others get zeros as harmonics and features if missing."""
+    """Join two sets of Gaussians (1, G). `others` get zeros as spherical harmonics and features.
+
+    They get these only if `gaussians` have harmonics or features.
+    """
     for name in ("sh", "features"):
         given = getattr(gaussians, name)
         if given is not None:
@@ -285,7 +288,7 @@ def joined(gaussians: Gaussians, others: Gaussians) -> Gaussians:
 
 
 def distance(gaussians: Gaussians, views: Views) -> float:
-    """Return the median distance of Gaussians (1, G) from their nearest camera, at least 1e-6."""
+    """Return the median distance of Gaussians (1, G) from the nearest camera, at least 1e-6."""
     distances = torch.cdist(gaussians.means[0], views.cameras.c2w[0, :, :3, 3])
     return float(distances.amin(1).median().clamp_min(1e-6))
 
@@ -314,7 +317,8 @@ def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: 
         raise ValueError(
             "refinement takes Gaussians (1, G) and photos (1, V) of one scene; got "
             f"{scenes} scenes of {given} Gaussians, {photographed} scenes of {photos} photos, "
-            f"{seconds:g} seconds, count={count}: give at least one of each"
+            f"{seconds:g} seconds, count={count}: give one scene with at least one Gaussian and "
+            "one photo, and positive seconds and count"
         )
     if not all(bool(tensor.isfinite().all()) for _, tensor in named_tensors(gaussians)):
         raise ValueError(

@@ -41,8 +41,8 @@ class Result:
     """An optimised scene with its photos.
 
     command: command line that makes the scene again. world: reference pose (4, 4) and scale of the
-    world of the Gaussians, see `own_world`. views: photos (1, V) of the optimisation. judged:
-    held-out photos (1, H), on which the scene is scored.
+    world of the Gaussians, see `own_world`. views: the V photos of the optimisation, (1, V).
+    judged: the H held-out photos on which the scene is scored, (1, H).
     """
 
     command: str
@@ -58,7 +58,7 @@ class Result:
         return moved(gaussians, reference, 1 / float(scale))
 
     def read_back(self, file: Path) -> "Result":
-        """Return the result with the Gaussians that `file` holds, so that the file is scored."""
+        """Return a copy with the Gaussians that `file` holds, so that the scores are the file's."""
         gaussians = in_own_world(self.world, load_ply(file).to(self.world[0].device))
         return replace(self, refined=replace(self.refined, gaussians=gaussians))
 
@@ -125,7 +125,7 @@ def write_scene(
 
 
 def scores(result: Result) -> dict[str, Any]:
-    """Return the contents of metrics.json: command, optimisation, scores on held-out photos."""
+    """Return what metrics.json holds: command, facts on the optimisation, held-out scores."""
     refined = result.refined
     rows = list[dict[str, Any]]()
     for place, frame in enumerate(result.photos.held_out):
@@ -172,9 +172,9 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
 
 
 def page_writer(console: Console) -> PageWriter | None:
-    """Return the viewer's function that makes an HTML page.
+    """Return the viewer's function that makes an HTML page; None if the viewer is not installed.
 
-    If the viewer is not installed, print this and return None.
+    In the latter case a line on the console says how to install the viewer.
     """
     try:
         from qgs_viewer.page import gaussians_html
@@ -189,10 +189,10 @@ def page_writer(console: Console) -> PageWriter | None:
 
 @torch.no_grad()
 def plain(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
-    """Return Gaussians (1, G) without `sh`, in the mean of the colours that cameras (1, V) see.
+    """Return Gaussians (1, G) without `sh`: colours are means over the cameras (1, V).
 
-    The mean is over the cameras in whose image the Gaussian's centre lies; if it lies in none, over
-    all cameras.
+    A Gaussian's mean is over the cameras in whose image its centre lies, or over all cameras if its
+    centre lies in no image.
     """
     if gaussians.sh is None:
         return gaussians

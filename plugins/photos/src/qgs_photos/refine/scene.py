@@ -1,4 +1,4 @@
-"""Run `qgs scene`: make the files of the best scene from photos in a given time."""
+"""Run `qgs scene`: make the best scene of Gaussians from photos that a given time allows."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -95,7 +95,7 @@ def make_scene(
 
 
 def faults_of_given_poses(photos: ScenePhotos) -> Sequence[Finding]:
-    """Return errors of poses that came with the photos; none for poses that COLMAP made here."""
+    """Return errors of poses that came with the photos; [] for poses computed by `qgs`."""
     path = opened_path(photos.path)
     # Poses of a video or of photos without cameras lie in a folder beside them.
     if isinstance(photos.small, PhotoScene) and not is_inside(path, photos.small.folder):
@@ -104,7 +104,7 @@ def faults_of_given_poses(photos: ScenePhotos) -> Sequence[Finding]:
 
 
 def with_start(options: Options, start: Initialisation) -> Options:
-    """Return the options that choose this start again."""
+    """Return `options` with the model, frames and scale that lead to the same `start` again."""
     scale = float(start.world[1]) if start.frames else None
     return replace(options, model=start.model, frames=start.frames, scale=scale)
 
@@ -116,12 +116,12 @@ def masked(views: Views) -> Views:
     without masks.
     """
     if views.masks is None:
-        raise ValueError("--masks: these photos have no masks: leave --masks out, or add masks")
+        raise ValueError("--masks: the photos have no masks: leave --masks out, or add masks")
     return replace(views, images=views.masks * views.images)
 
 
 def timed_sweep(views: Views) -> tuple[Gaussians, float]:
-    """Return TIMED Gaussians (1, G) at pixels of photos (1, V), and the seconds for each."""
+    """Return TIMED Gaussians (1, G) at pixels of photos (1, V), and the seconds per Gaussian."""
     began = perf_counter()
     found = swept(views, TIMED, 1.0, torch.Generator().manual_seed(0))
     return found, (perf_counter() - began) / found.count

@@ -62,14 +62,15 @@ class ScenePhotos:
 def judged_frames(scene: Scene, holdout: str) -> Frames:
     """Return the indices of the held-out photos, which are scored and never optimised on.
 
-    holdout: NONE, or N to hold out every Nth photo, unless the photos have a split of their own.
-    Raises ValueError for another text.
+    holdout: NONE holds out no photo. A number N of at least 2 holds out every Nth photo, or the
+    photos that the data set itself lists as held out. Raises ValueError for another text.
     """
     if holdout == NONE:
         return ()
     if not holdout.isdecimal() or int(holdout) < 2:
         raise ValueError(
-            f"--holdout must be none, or N of at least 2 for every Nth photo; got {holdout!r}"
+            "--holdout must be none, or a number N of at least 2 to hold out every Nth photo; got "
+            f"{holdout!r}"
         )
     return tuple(scene.held_out) or held_out_frames(len(scene), int(holdout))
 
@@ -77,7 +78,7 @@ def judged_frames(scene: Scene, holdout: str) -> Frames:
 def sized(scene: Scene, side: int) -> Size:
     """Return (H, W) of uncropped photos whose shorter side has `side` pixels.
 
-    Photos are never enlarged.
+    The result is never larger than the stored photos.
     """
     stored = scene.stored_size(0) or scene.cameras.size
     # enlarged photos show nothing more and take longer
@@ -92,8 +93,8 @@ def affordable(
     """Return the largest photo size (H, W) that time and memory allow, and a number of Gaussians.
 
     step: measured seconds of a step with TIMED Gaussians on a photo of size `timed` (H, W).
-    seconds: time of the optimisation. options: a size or a number in them is kept. If even the
-    smallest size is too large, it is returned.
+    seconds: time of the optimisation. options: a size or a number of Gaussians given in the options
+    is kept. If even the smallest size is too large, the smallest size is returned.
     """
     steps = max(LEAST_STEPS, STEPS_OF_PHOTO * len(photos.frames))
     available = available_bytes()

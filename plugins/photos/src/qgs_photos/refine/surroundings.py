@@ -1,4 +1,4 @@
-"""Surroundings: the colour behind a scene, as far Gaussians that every viewer shows."""
+"""Surroundings: the background colour of a scene, as distant Gaussians that every viewer shows."""
 
 from collections.abc import Sequence
 
@@ -28,9 +28,10 @@ def edge_color(views: Views) -> tuple[float, float, float]:
 
 @torch.no_grad()
 def surrounded(gaussians: Gaussians, views: Views, color: Sequence[float]) -> Gaussians:
-    """Add Gaussians of one colour, far outside of all others, wherever photos (1, V) look.
+    """Add Gaussians of one colour behind all others, in every direction in which photos look.
 
-    A file of Gaussians holds no background colour, and viewers show their own where nothing is.
+    views: photos (1, V). A file of Gaussians holds no background colour; without these Gaussians,
+    viewers show a colour of their own where the scene is empty.
     """
     cameras = views.cameras
     centres = cameras.c2w[0, :, :3, 3]

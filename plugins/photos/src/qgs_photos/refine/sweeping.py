@@ -40,7 +40,7 @@ _PIXELS = 2.0
 def swept(views: Views, count: int, size: float, generator: torch.Generator) -> Gaussians:
     """Return Gaussians (1, count) at random pixels of photos (1, V), in the colours of the pixels.
 
-    size: approximate distance of the scene from the cameras. It is the depth of pixels that no
+    size: approximate distance of the scene from the cameras, used as the depth of pixels that no
     other photo shows. generator: samples the pixels.
     """
     height, width = views.cameras.size
@@ -56,7 +56,7 @@ def swept(views: Views, count: int, size: float, generator: torch.Generator) -> 
 
 
 def balls(means: Tensor, scales: Tensor, opacity: float, colors: Tensor) -> Gaussians:
-    """Return round Gaussians (1, G), all of one opacity. means, scales, colors: (1, G, 3)."""
+    """Return unrotated Gaussians (1, G) of one opacity. means, scales, colors: (1, G, 3)."""
     quats = means.new_tensor([1.0, 0, 0, 0]).expand(*means.shape[:2], 4)
     return Gaussians(means, scales, quats, torch.full_like(means[..., 0], opacity), colors)
 
@@ -88,9 +88,9 @@ def pixel_rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> T
 
 
 def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float) -> Tensor:
-    """Return the depths (n,) of pixels of one photo: of the depths tried, those of least cost.
+    """Return the depths (n,) of pixels of one photo, chosen among depths around `size`.
 
-    The cost is the difference of colours from other photos.
+    Each pixel gets the depth at which its colours differ least from those in other photos.
     """
     cameras = views.cameras
     height, width = cameras.size

@@ -13,7 +13,7 @@ InputViews: TypeAlias = Annotated[
     int | None, typer.Option(min=1, help="Number of input photos. Default: that of the recipe.")
 ]
 Memory: TypeAlias = Annotated[
-    bool, typer.Option("--memory", help="Also measure peak memory, in fresh processes.")
+    bool, typer.Option("--memory", help="Also measure peak memory, each in a new process.")
 ]
 Report: TypeAlias = Annotated[
     Path | None, typer.Option(metavar="FILE", help="New file for a JSON report with all times.")
@@ -23,7 +23,7 @@ Report: TypeAlias = Annotated[
 @app.command()
 def bench(
     recipes: Annotated[
-        list[Path], typer.Argument(help="Recipe files. Ratios are relative to the first.")
+        list[Path], typer.Argument(help="Recipe files. Ratios are relative to the first recipe.")
     ],
     overrides: Overrides = None,
     views: InputViews = None,
@@ -33,8 +33,8 @@ def bench(
     step: Annotated[bool, typer.Option("--step", help="Also measure training steps.")] = False,
     memory: Memory = False,
     renderer: Annotated[bool, typer.Option("--renderer", help="Also measure rendering.")] = False,
-    rounds: Annotated[int, typer.Option(min=1, help="Number of measured calls.")] = 10,
-    warmup: Annotated[int, typer.Option(min=0, help="Number of calls before measuring.")] = 2,
+    rounds: Annotated[int, typer.Option(min=1, help="Measured calls of each operation.")] = 10,
+    warmup: Annotated[int, typer.Option(min=0, help="Unmeasured calls at the start.")] = 2,
     json: Report = None,
     threads: Threads = None,
     device: Device = "auto",

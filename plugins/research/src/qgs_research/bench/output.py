@@ -71,7 +71,7 @@ def _memory_cells(peak: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def _cells(found: Mapping[str, float], scale: float) -> tuple[str, str]:
-    """Format the median, and the range of the quartiles, with four digits."""
+    """Format a median, and the range from lower to upper quartile, with four digits."""
     shown = []
     for quartile in ("lower_quartile", "median", "upper_quartile"):
         value = found[quartile] * scale

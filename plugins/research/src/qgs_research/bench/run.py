@@ -120,7 +120,7 @@ def forward_flops(recipe: Recipe, workload: Workload) -> int:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """Return the device, processor, number of threads and versions for the report."""
+    """Return the report's entry on the machine: device, processor, threads, torch and qgs."""
     return {
         "device": device,
         "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
@@ -131,7 +131,7 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def quartiles(samples: Sequence[float]) -> dict[str, float]:
-    """Return lower quartile, median and upper quartile of `samples`, by name."""
+    """Return the lower quartile, the median and the upper quartile of `samples`, by name."""
     names = ("lower_quartile", "median", "upper_quartile")
     return dict(zip(names, np.quantile(samples, (0.25, 0.5, 0.75)).tolist(), strict=True))
 

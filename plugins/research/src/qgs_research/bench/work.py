@@ -23,7 +23,7 @@ from qgs.types import Cameras, Gaussians, Views
 
 @dataclass(frozen=True)
 class Workload:
-    """Size of the inputs of a measurement.
+    """Inputs of a measured call, and where and how it runs.
 
     views: number of input photos per scene. targets: number of rendered photos per scene. size: (H,
     W) of all photos in pixels. batch: scenes per call. precision: float32, or bf16 for autocast.
@@ -43,8 +43,8 @@ def workload_of(
     """Return the workload for `recipe`.
 
     views: number of input photos; None takes that of the recipe. size: (H, W) in pixels; None takes
-    `data.image_size`. more: values of other fields of `Workload`. Raises ValueError if the image
-    size is unknown.
+    `data.image_size`. more: the remaining fields of `Workload`, by name. Raises ValueError if the
+    image size is unknown.
     """
     if size is None and recipe.data_config:
         size = recipe.data_config.image_size
@@ -153,7 +153,10 @@ def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, thread
 
 
 def measure(tree: dict[str, Any], operation: Operation, workload: Workload, threads: int) -> Peak:
-    """Run `operation` in this process and return its peak memory; see `peak_memory`."""
+    """Run `operation` in this process and return its peak memory.
+
+    tree: recipe as a mapping. threads: number of CPU threads.
+    """
     torch.set_num_threads(threads)
     recipe = resolve(tree)
     on_gpu = workload.device == "cuda"
@@ -176,8 +179,8 @@ def measure(tree: dict[str, Any], operation: Operation, workload: Workload, thre
 def resident_bytes(field: str) -> int:
     """Return the resident memory of this process in bytes.
 
-    field: VmRSS for the present memory, VmHWM for the peak. Other systems than Linux always return
-    the peak.
+    field: VmRSS for the present memory, VmHWM for the peak. Systems without /proc always give the
+    peak.
     """
     status = Path("/proc/self/status")
     if status.exists():

@@ -103,7 +103,7 @@ def import_weights(
 
 
 def _without_prefix(file: WeightFile) -> WeightFile:
-    """Remove a common prefix of all names if the remaining names are known, and note it.
+    """Remove a prefix that all names share, if a layout knows the rest; add a note on it.
 
     Training frameworks prepend the attribute that holds the model, such as `model.` or `module.`.
     """
@@ -133,7 +133,7 @@ def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list
     if strange:
         raise PublishedError(
             f"{file.path} holds weights that are not floating-point numbers: {listed(strange)} "
-            f"({report})"
+            f"({report}); save the weights as float32"
         )
     tensors: dict[str, Tensor] = {}
     stored: set[int] = set()
@@ -168,9 +168,9 @@ def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool)
 
 
 def new_checkpoint_path(path: str | Path) -> Path:
-    """Return `path`, after a check that it is free and ends in .safetensors.
+    """Return `path`, after a check that no such file exists and that it ends in .safetensors.
 
-    Raises ValueError if the suffix is another, and FileExistsError for an existing file.
+    Raises ValueError for another suffix, and FileExistsError for an existing file.
     """
     path = Path(path)
     if path.suffix.lower() != ".safetensors":

@@ -29,9 +29,9 @@ class PublishedError(ValueError):
 class Names:
     """Parameter names of a recipe's model, in qgs and in the published weights.
 
-    shapes: shapes by name in qgs. published: published names by name in qgs. unnamed: names in qgs
-    without a published name. unused: names of tensors that a published file may hold, but that the
-    published code ignores.
+    shapes: shapes of the parameters by name in qgs. published: published names by name in qgs.
+    unnamed: names in qgs without a published name. unused: names of tensors that a published file
+    may hold, but that the published code ignores.
     """
 
     layout: WeightLayout
@@ -43,7 +43,7 @@ class Names:
     def from_published(
         self, weights: Mapping[str, Tensor], origin: object = "the file"
     ) -> dict[str, Tensor]:
-        """Rename the tensors of a published state dict as in qgs; leave out those in `unused`.
+        """Rename the tensors of a published state dict as in qgs; leave out `unused` tensors.
 
         origin: name of the published file, for the error message. Raises PublishedError that lists
         all differences in names and shapes.
@@ -72,7 +72,10 @@ def names_of(recipe: Recipe) -> Names:
         if not found:
             return _names_in(recipe, layout)
         reasons += [f"\n  {layout.name}: {line}" for line in found]
-    raise PublishedError("this model fits no published layout:" + "".join(reasons))
+    raise PublishedError(
+        "the model of this recipe fits no published layout, use a recipe with the components of "
+        "one:" + "".join(reasons)
+    )
 
 
 def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
@@ -108,7 +111,7 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
 
 
 def recognise(shapes: Shapes) -> WeightLayout | None:
-    """Return the layout whose marks are all in a state dict, or None."""
+    """Return the layout whose identifying names are all in a state dict; None if there is none."""
     found = [layout for layout in LAYOUTS if set(layout.marks) <= set(shapes)]
     # A later release of a codebase has all names of the earlier one.
     return max(found, key=lambda layout: len(layout.marks), default=None)
@@ -124,7 +127,7 @@ def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str,
     if layout is None:
         names = "; ".join(f"{one.name} has {', '.join(one.marks)}" for one in LAYOUTS)
         raise PublishedError(
-            f"{origin} is not from a known published model ({names}); its tensors are named "
+            f"{origin} is not from a known published model ({names}); the file's tensors are named "
             f"{listed(shapes, 3)}"
         )
     try:

@@ -50,7 +50,9 @@ def _unet_levels(shapes: Shapes, name: str) -> int:
     """
     numbers = {key[len(name) :].split(".")[1] for key in shapes if key.startswith(name + "output")}
     if not numbers or len(numbers) % 2:
-        raise LayoutError(f"{name}output_blocks has {len(numbers)} blocks, not two for each level")
+        raise LayoutError(
+            f"{name}output_blocks has {len(numbers)} blocks, expected two for each level"
+        )
     return len(numbers) // 2
 
 
@@ -125,7 +127,9 @@ def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
     raw = size_at(shapes, _HEAD, 0)
     two = encoder["scales"] == 2
     if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
-        raise LayoutError(f"{_HEAD}: {raw} channels are not 10 + 3 (degree + 1)^2")
+        raise LayoutError(
+            f"{_HEAD} has {raw} channels, expected 10 + 3 (degree + 1)^2 for a degree of harmonics"
+        )
     # One layer for each depth, so that both depths can be supervised.
     decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
     supervision = {"type": "mvsplat/decayed", "layers": [1, 2]}

@@ -46,7 +46,8 @@ def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
     scales = layer_count(shapes, READOUT)
     if scales > depth:
         raise LayoutError(
-            f"{READOUT}: {scales} norms, one for each used block, do not fit {depth} blocks"
+            f"{READOUT} has {scales} norms, one for each used block, but there are only {depth} "
+            "blocks"
         )
     # files do not say which blocks are read: the release reads every second one
     step = 2 if 2 * scales <= depth + 1 else 1

@@ -18,7 +18,7 @@ NESTING = ("model", "state_dict", "module")
 
 @dataclass(frozen=True)
 class WeightFile:
-    """Flat state dict of a file.
+    """State dict that was found in a file.
 
     tensors: tensors by name, memory-mapped if the format allows it. notes: lines that say how the
     state dict was found in the file.
@@ -38,13 +38,14 @@ def read_weight_file(path: str | Path) -> WeightFile:
     path = Path(path)
     notes = list[str]()
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file of weights {path}")
+        raise FileNotFoundError(f"there is no file of weights {path}; correct the path")
     if path.suffix.lower() == ".safetensors":
         with TensorFile(path) as file:
             # An import would lose its recipe.
             if "qgs.recipe" in file.metadata:
                 raise CheckpointError(
-                    f"{path} is already a qgs checkpoint, so there is nothing to import"
+                    f"{path} is already a qgs checkpoint, so there is nothing to import; use it as "
+                    "it is"
                 )
             tensors = file.read()
     elif path.suffix.lower() in TORCH:
@@ -53,7 +54,7 @@ def read_weight_file(path: str | Path) -> WeightFile:
         known = ", ".join((".safetensors", *TORCH))
         raise CheckpointError(f"{path}: the name of a file of weights must end in one of {known}")
     if not tensors:
-        raise CheckpointError(f"{path} holds no tensors")
+        raise CheckpointError(f"{path} holds no tensors; save `model.state_dict()` to this file")
     return WeightFile(path, tensors, tuple(notes))
 
 
@@ -78,7 +79,10 @@ def _read_torch(path: Path, notes: list[str]) -> dict[str, Tensor]:
 def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]:
     """Return the state dict in `content`: `content` itself, or the value of a key in NESTING."""
     if not isinstance(content, Mapping):
-        raise CheckpointError(f"{path} holds a {type(content).__name__}, not a state dict")
+        raise CheckpointError(
+            f"{path} holds a {type(content).__name__}, not a state dict; save only "
+            "`model.state_dict()`"
+        )
     # A training script stores other values too, usually one level above the weights.
     others = [str(key) for key, value in content.items() if not isinstance(value, Tensor)]
     if not others:

@@ -35,11 +35,11 @@ class WeightLayout:
 
     name: name of the published model. plugin: qgs plugin with the model's components.
     source: where the weights are published.
-    components: component types that the codebase has, by slot. Slots that are not listed may hold
-        any component.
+    components: component types that the codebase has, by slot of the model, such as `encoder`. A
+        slot that is not listed may hold any component.
     renames: rules from names in qgs to published names, see `renamed`. The first rule that matches
         is used.
-    marks: published names that identify this codebase. All its files contain all of them.
+    marks: published names that identify this codebase. Every file of its weights has all of them.
     unused: rules from a published name to a second stored parameter, which the published code
         ignores.
     read: function that takes names and shapes of a state dict and returns a recipe that fits, as a
@@ -93,16 +93,16 @@ def size_at(shapes: Shapes, name: str, axis: int) -> int:
     Raises LayoutError if the parameter or the axis is missing.
     """
     if name not in shapes:
-        raise LayoutError(f"{name} is missing; its shape determines a size of the model")
+        raise LayoutError(f"the weight {name} is missing; its shape determines a size of the model")
     if not -len(shapes[name]) <= axis < len(shapes[name]):
-        raise LayoutError(f"{name} has the shape {shapes[name]}, without axis {axis}")
+        raise LayoutError(f"the weight {name} has the shape {shapes[name]}, without axis {axis}")
     return shapes[name][axis]
 
 
 def whole_ratio(size: int, unit: int, what: str) -> int:
     """Return size / unit. Raises LayoutError about `what` if the ratio is not an integer."""
     if unit < 1 or size % unit or not size:
-        raise LayoutError(f"{what}: {size} is no multiple of {unit}")
+        raise LayoutError(f"{what}: {size} must be a multiple of {unit}, and not 0")
     return size // unit
 
 
@@ -112,7 +112,7 @@ def real_ratio(size: int, unit: int, what: str) -> float:
     Raises LayoutError about `what` if `size` or `unit` is 0.
     """
     if unit < 1 or not size:
-        raise LayoutError(f"{what}: {size} is no multiple of {unit}")
+        raise LayoutError(f"{what}: {size} and {unit} have no ratio, since one of them is 0")
     # A published width need not be a multiple; rounding down must give it back.
     ratio = size / unit
     return ratio if int(ratio * unit) == size else math.nextafter(ratio, math.inf)

@@ -18,13 +18,15 @@ diff_app = typer.Typer(help="Compare recipes.")
 @compare_app.command()
 def compare(
     runs: Annotated[
-        list[str], typer.Argument(metavar="RUN...", help="Run folders, or folders of `qgs eval`.")
+        list[str],
+        typer.Argument(metavar="RUN...", help="Run folders, or folders that `qgs eval` wrote."),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for comparison.json and comparison.md.")
+        Path | None, typer.Option(help="Write comparison.json and comparison.md to this folder.")
     ] = None,
     across_protocols: Annotated[
-        bool, typer.Option("--across-protocols", help="Allow results of different protocols.")
+        bool,
+        typer.Option("--across-protocols", help="Also compare results of different protocols."),
     ] = False,
 ) -> None:
     """Compare every RUN with the first one, scene by scene.
@@ -53,13 +55,13 @@ def study(
     ],
     out: Annotated[Path, typer.Option(help="Folder of the study. Finished runs in it are kept.")],
     workers: Annotated[
-        int, typer.Option(min=0, help="Runs in parallel. 0: train nothing, only report.")
+        int, typer.Option(min=0, help="Number of parallel runs. 0 trains nothing and only reports.")
     ] = 1,
     threads: Annotated[
         int | None, typer.Option(min=1, help="CPU threads per run. Default: cores / workers.")
     ] = None,
     only: Annotated[
-        int | None, typer.Option(min=0, help="Train only this run, a number from 0.")
+        int | None, typer.Option(min=0, help="Train only the run with this number, from 0.")
     ] = None,
     device: Device = "auto",
 ) -> None:

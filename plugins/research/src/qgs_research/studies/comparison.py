@@ -1,7 +1,7 @@
 """Comparison of stored results for `qgs compare`. The first result is the reference.
 
-Trainings of one recipe with several seeds count as one side; intervals then cover trainings as well
-as scenes.
+Trainings of one recipe with several seeds count as one side of the comparison; intervals then cover
+trainings as well as scenes.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -22,18 +22,23 @@ from qgs_research.studies.tables import (
 
 
 def compare(results: Sequence[StoredResults], across_protocols: bool = False) -> Scores:
-    """Return the scores of `results`. The side of the first result is the reference.
+    """Return the scores of `results`, grouped by model. The first result's model is the reference.
 
-    Raises ValueError for fewer than two results, for a folder given twice, and if no scene is
-    common. Unless `across_protocols` is True, raises ValueError for different protocols or frames.
+    Raises ValueError for fewer than two results, for a folder given twice, and if a model has no
+    scene in common with the reference. Unless `across_protocols` is True, raises ValueError for
+    different protocols or frames.
     """
     names = [result.name for result in results]
     if len(names) < 2 or len(set(names)) < len(names):
-        raise ValueError(f"a comparison takes two or more different results, got {names}")
+        raise ValueError(
+            f"a comparison takes two or more different results, got {names}: name each folder once"
+        )
     reference, *others = sides = _sides(results)
     for name in others:
         if not common_scenes([*sides[reference].values(), *sides[name].values()]):
-            raise ValueError(f"{reference} and {name} have no common scene")
+            raise ValueError(
+                f"{reference} and {name} have no common scene: evaluate both on the same scenes"
+            )
         if not across_protocols:
             _refuse_unlike(reference, sides[reference], name, sides[name])
         sides[name] = _paired(sides[reference], sides[name])
@@ -47,9 +52,9 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
 
 
 def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
-    """Group results by side and seed.
+    """Group results by side of the comparison, and then by seed.
 
-    Trainings of one recipe are one side. If all results are of one recipe, each is its own side.
+    Trainings of one recipe are one side. If all results are of one recipe, each result is a side.
     """
     groups: dict[Any, list[StoredResults]] = {}
     for number, result in enumerate(results):
@@ -68,10 +73,9 @@ def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
 
 
 def _paired(reference: Runs, runs: Runs) -> Runs:
-    """Return `runs` by the seed of the reference with which each is paired.
+    """Pair `runs` with those of `reference`; return them by the seed of their partner.
 
-    Runs keep their own seeds if enough of them are seeds of the reference. Otherwise they are
-    paired in order.
+    Runs are paired by equal seeds if enough seeds are equal. Otherwise runs are paired in order.
     """
     # Trainings with equal seeds saw the same data in the same order.
     if len(reference.keys() & runs.keys()) >= min(2, len(reference), len(runs)):
@@ -82,7 +86,10 @@ def _paired(reference: Runs, runs: Runs) -> Runs:
 
 
 def _refuse_unlike(reference: str, first: Runs, name: str, second: Runs) -> None:
-    """Raise ValueError if two sides were evaluated by other protocols or on other frames."""
+    """Raise ValueError if two sides were evaluated by different protocols or on different frames.
+
+    reference, name: names of the sides. first, second: their runs.
+    """
     results = [*first.values(), *second.values()]
     ours = results[0].protocol
     theirs = results[-1].protocol
@@ -133,7 +140,10 @@ def _notes(scores: Scores) -> Iterator[str]:
 
 
 def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
-    """Return the runs and scenes that the difference of a side leaves out, by reason."""
+    """Return runs and scenes, by reason, that the difference from the reference leaves out.
+
+    name: model of the difference.
+    """
     runs = scores.stored[name, MAIN]
     reference = scores.stored[scores.reference, MAIN]
     results = [*reference.values(), *runs.values()]

@@ -29,8 +29,9 @@ Runs: TypeAlias = Mapping[int, StoredResults]
 class Estimate:
     """Mean over seeds and scenes, or a weighted sum of such means.
 
-    values: scores (S, C) by seed and scene. interval: confidence interval of the mean; None for one
-    scene. For one seed it covers only the choice of scenes, not that of the training.
+    values: scores (S, C) of S seeds and C scenes. interval: confidence interval of the mean; None
+    for one scene. For one seed, the interval covers only the choice of scenes, not that of the
+    training.
     """
 
     seeds: Sequence[int]
@@ -65,9 +66,9 @@ class Estimate:
         return " and ".join(reason for reason, count in reasons.items() if count < 2)
 
     def clear(self, sign: int) -> bool:
-        """Return True if the whole interval has the sign `sign`, 1 or -1.
+        """Return whether the whole interval has the sign `sign`, 1 or -1.
 
-        False for an interval from one training or one scene.
+        Always False for an interval from one training or one scene.
         """
         # An interval over scenes alone does not hold for other trainings.
         ends = () if self.too_small else self.interval or ()
@@ -90,7 +91,10 @@ def sign_of(column: Column) -> int:
 
 
 def shown(column: Column, value: float | None, sign: str = "") -> str:
-    """Format a value with one digit more than `qgs eval` shows. sign: "+" for differences."""
+    """Format a value with one digit more than `qgs eval` shows; None as a dash.
+
+    sign: "+" writes the sign of positive values too, for differences.
+    """
     # Differences are small compared with the means that an evaluation prints.
     return "–" if value is None else f"{value:{sign}.{column.digits + 1}f}"
 
@@ -106,8 +110,8 @@ def interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float,
     """Return a confidence interval of the mean of `values` (S, C): S trainings, C scenes.
 
     Trainings and scenes count as random samples, so the interval holds for new trainings and
-    scenes; see `crossed_error`. For one training it is a 95 % percentile bootstrap over scenes
-    only, with a fixed random seed. None for one scene.
+    scenes; see `crossed_error`. For one training, the interval is a 95 % percentile bootstrap over
+    scenes only, with a fixed random seed. Returns None for one scene.
     """
     trainings, scenes = values.shape
     if scenes < 2:

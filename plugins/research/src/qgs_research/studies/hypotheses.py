@@ -20,8 +20,8 @@ _TERM = re.compile(rf"\s*([+-]?)\s*({NAME})(?:@({NAME}))?\s*")
 class Contrast(NamedTuple):
     """Hypothesis as a weighted sum of mean scores: left side minus right side.
 
-    terms: coefficient of each mean, by (variant, evaluation). sign: sign of the sum that the
-    hypothesis claims, 1 for `>` and -1 for `<`.
+    terms: coefficient of each mean, by (variant, evaluation). sign: sign that the sum has if the
+    hypothesis is true, 1 for `>` and -1 for `<`.
     """
 
     text: str
@@ -59,7 +59,7 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
         )
     terms = {term: coefficient for term, coefficient in terms.items() if coefficient}
     if not terms:
-        raise OptionError(f"both sides of `{text}` are the same", _FORM)
+        raise OptionError(f"both sides of `{text}` are equal, so nothing is compared", _FORM)
     return Contrast(text, terms, -1 if comparison == "<" else 1)
 
 
