@@ -116,7 +116,7 @@ class PatchEncoder(Encoder):
         count, _, height, width = views.images.shape[1:]
         if height % patch or width % patch:
             raise ValueError(
-                f"images of {height} x {width} cannot be cut into patches of {patch} pixels a side; "
+                f"images of {height} x {width} cannot be cut into patches of {patch} pixels; "
                 "resize the views, or build the model with another patch_size"
             )
         return count, height // patch, width // patch

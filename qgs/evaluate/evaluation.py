@@ -38,12 +38,10 @@ def evaluate(
 ) -> Evaluation:
     """Score `model` with the metrics of `recipe` on the recipe's test views.
 
-    The model stays on its device and in its mode (training or evaluation). If a scene fails, the
-    result has the reason in place of a score.
+    The model keeps its device and its mode. For a scene that fails, the result has the reason.
     step: number of optimiser steps after which the weights were saved. observe: called after each
-        scene with the numbers of finished scenes and of all scenes. views_of: see `EvaluationPlan`.
-        sampler: view sampler, by default the recipe's. show: called with each sample and its
-        rendered targets.
+    scene with the numbers of finished and of all scenes. views_of: see `EvaluationPlan`. sampler:
+    view sampler, by default the recipe's. show: called with each sample and its rendered targets.
 
     Raises the errors of the data source, of `read_index` and of `Measures`, and ValueError if no
     scene could be scored.

@@ -265,9 +265,8 @@ def _store_sums(state, sums, y0, x0, rows, columns):
 def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
     """Blend all G splats (G, 9) of one image in the tile rows [tile_rows[0], tile_rows[1]).
 
-    If `backward` is false, this fills sums (5, H, W). If `backward` is true, it reads the sums and
-    adds the gradients of the splats to out (G, 10). slopes: gradients of `sums`. options: see
-    `_take`.
+    If `backward` is false, fill sums (5, H, W). If it is true, read the sums and add the gradients
+    of the splats to out (G, 10). slopes: gradients of `sums`. options: see `_take`.
     """
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)

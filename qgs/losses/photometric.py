@@ -31,7 +31,7 @@ class Photometric(Loss):
         ssim_weight: float = Field(default=0.2, ge=0)
         """Factor of (1 - SSIM) / 2. With 0, this term is not computed."""
         padding: Padding = "same"
-        """How SSIM handles image borders. "same" pads images with zeros, as the TokenGS and LocusGS
+        """Rule for image borders in SSIM. "same" pads images with zeros, as the TokenGS and LocusGS
         releases do. "valid" uses only windows that lie inside the image."""
 
     config: Config

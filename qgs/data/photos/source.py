@@ -215,10 +215,7 @@ class PhotoScene(Scene):
 
 
 def whole_mask(frame: PhotoFrame) -> Image.Image:
-    """Read the whole mask of a photo, as stored; raise ValueError for an unreadable file.
-
-    The photo must have a mask.
-    """
+    """Read a photo's whole mask, as stored; raise ValueError for an unreadable file."""
     assert frame.mask is not None
     decode = decode_alpha if frame.mask == frame.path else decode_mask
     return Image.fromarray(read_image(frame.mask, decode))
@@ -363,10 +360,7 @@ def _swapped(size: Size) -> Size:
 
 
 def _quarters(size: Size, frame: PhotoFrame) -> int:
-    """Return by how many clockwise quarter turns a file of `size` (H, W) must be turned.
-
-    0 if the size is that of the upright photo.
-    """
+    """Return how many clockwise quarter turns bring a file of `size` (H, W) upright."""
     fits, fits_turned = (not any(size_problems(own, frame.size)) for own in (size, _swapped(size)))
     return 0 if frame.turns % 2 and fits and not fits_turned else frame.turns
 
