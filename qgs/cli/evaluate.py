@@ -62,9 +62,7 @@ def evaluate(
         option = setting.split("=")[0]
         if option not in free and option.split(".")[0] not in free:
             allowed = ", ".join(free)
-            raise ValueError(
-                f"{setting} would change the trained model; `qgs eval` can only change {allowed}"
-            )
+            raise ValueError(f"{setting} would change the trained model; change only {allowed}")
     with CheckpointFile(run) as file:
         checkpoint = file.path
         recipe = file.recipe

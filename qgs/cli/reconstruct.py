@@ -32,16 +32,13 @@ def reconstruct(
     photos: Annotated[
         str, typer.Argument(help="Folder or URL of photos or a data set; or a video file.")
     ],
-    out: Annotated[
-        Path, typer.Option(help="Folder for all results, or .ply or .splat file for Gaussians.")
-    ],
+    out: Annotated[Path, typer.Option(help="Folder for results; or .ply or .splat file.")],
     inputs: Inputs = None,
     frames: Frames = None,
     holdout: Annotated[
         str | None,
         typer.Option(
-            help="Photos to score, or `none`. Default: held-out photos (every eighth) near the "
-            "inputs."
+            help="Photos to score, or `none`. Default: held-out photos (every 8th) near inputs."
         ),
     ] = None,
     tune: Tune = None,
