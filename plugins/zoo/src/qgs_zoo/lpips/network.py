@@ -178,7 +178,6 @@ class Lpips(Metric):
         self.network = PerceptualDistance()
 
     def load_pretrained(self) -> None:
-        """Read the weights of VGG-16 and of LPIPS."""
         self.network.load(self.config.weights)
 
     def forward(self, given: MetricInput) -> Tensor:
