@@ -1,4 +1,4 @@
-"""Show Gaussians of a file as viewers do, in a world that suits a renderer."""
+"""Show a file of Gaussians as other viewers do, after a move into a world for the renderer."""
 
 import torch
 from torch import Tensor

@@ -73,7 +73,7 @@ class Record:
         return len(self.images)
 
     def place(self, frame: int) -> str:
-        """Return text for messages: chunk and scene of a frame, and the frame's number and name."""
+        """Return text that names a frame in messages: its chunk, its scene, its number and name."""
         return f"{self.where}, frame {frame} ({self.names[frame]})"
 
     @cached_property
@@ -85,7 +85,7 @@ class Record:
 
     @cached_property
     def image_sizes(self) -> list[Size]:
-        """(H, W) of every image, as the chunk lists it, or else that of the first image for all."""
+        """(H, W) of every image in the chunk's list; without a list, all have the first's size."""
         if self.sizes is not None:
             return [(int(height), int(width)) for height, width in self.sizes.tolist()]
         return [self.stored_size(0)] * len(self)

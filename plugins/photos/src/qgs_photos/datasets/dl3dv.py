@@ -85,8 +85,8 @@ class Dl3dvSource(LazySource):
     def recognises(cls, path: UPath) -> bool:
         """Return whether `path`, or a folder in it such as 1K, holds archives or scenes of DL3DV.
 
-        The folder of a scene is named by a hash, or has the layout of DL3DV's benchmark. False for
-        a folder that lists its own photos, which `qgs/photos` reads.
+        The folder of a scene is named by a hash, or has the layout of DL3DV's benchmark. A folder
+        that lists its own photos is not recognised, since `qgs/photos` reads it.
         """
         if path.is_file():
             return path.suffix == ".zip"

@@ -103,8 +103,8 @@ class Bounded(ViewSampler):
         if high < low:
             raise ValueError(
                 f"scene {scene.name!r} has {len(usable)} frames for inputs, but the inputs and the "
-                f"margin need {low + 1} in one gap: lower views.inputs or margin, raise max_gap, "
-                "or remove the scene"
+                f"margin need {low + 1} frames in one gap: lower views.inputs or margin, raise "
+                "max_gap, or remove the scene"
             )
         gap = int(rng.integers(low, high + 1))
         first = int(rng.integers(0, len(usable) - gap))

@@ -143,7 +143,7 @@ def _photo_format(options: Options) -> str:
 
 
 def check_scene(candidate: Candidate, options: Options, most_photos: int) -> SceneReport:
-    """Check one scene; every fault becomes a finding of the report.
+    """Check one scene, and return a report in which every fault is a finding.
 
     most_photos: largest number of photos to match with each other to check the cameras; 0 matches
     none.

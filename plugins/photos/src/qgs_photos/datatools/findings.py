@@ -34,7 +34,7 @@ class Finding:
 
     @property
     def place(self) -> str:
-        """Text that names the photos, such as "frames 0-3 (a.jpg to d.jpg)"; "" for a scene."""
+        """Text that names the photos, such as "frames 0-3 (a.jpg to d.jpg)"; "" without photos."""
         names = [name for name in self.names if name]
         numbers = [number for number in self.numbers if number is not None]
         if not numbers:
@@ -56,9 +56,9 @@ def errors_of(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """Return numbers as text with runs joined, such as "0-3, 7".
+    """Return numbers as text, with consecutive numbers joined, such as "0-3, 7".
 
-    After eight runs, only the number of further runs is given.
+    After eight such runs, only the number of further runs is given.
     """
     # numbers of one run are all equally far ahead of their places
     grouped = groupby(enumerate(sorted(set(numbers))), lambda item: item[1] - item[0])

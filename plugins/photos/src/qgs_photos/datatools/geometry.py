@@ -62,9 +62,9 @@ class Geometry:
 
     @property
     def fraction(self) -> float:
-        """Median distance of matches from epipolar lines over all pairs; 0 without pairs.
+        """Median distance of matches from epipolar lines, as a share of the photo's diagonal.
 
-        Unit: the photo's diagonal.
+        The median is over all pairs; 0 without pairs.
         """
         return float(np.median([distance for _, distance in self.pairs])) if self.pairs else 0.0
 
@@ -198,7 +198,7 @@ class _Matcher:
     def distance(self, first: int, second: int) -> float | None:
         """Return the median distance of two photos' matches from their epipolar lines.
 
-        Unit: the photo's diagonal. None if the photos have too few matches.
+        The distance is a share of the photos' diagonal. None if they have too few matches.
         """
         one, lens_of_one, diagonal = self._features(first)
         two, lens_of_two, _ = self._features(second)

@@ -63,7 +63,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Poses:
-    """Names of photos by result.
+    """Result of `make_poses`: names of the photos.
 
     posed: photos with a pose. without: photos for which no pose was found. faulty: photos that
     cannot be read, with the reason. remarks: sentences for the user.

@@ -43,7 +43,7 @@ def path_of(kind: str, cameras: Cameras, depth: float, frames: int) -> Cameras:
 def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
     """Return poses (frames, 4, 4) that circle the mean of `c2w` (V, 4, 4) and look at one point.
 
-    While they circle, they move forward and back, as in LLFF's spirals (Mildenhall et al., 2019).
+    While circling, the poses move forward and back, as in LLFF's spirals (Mildenhall et al., 2019).
     The point lies `depth` in front of the mean pose.
     """
     right, down, forward, centre = mean_camera(c2w)[:3].unbind(-1)
@@ -69,7 +69,7 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
     """Read a camera path: camera-to-world (T, 4, 4), OpenCV axes, and intrinsics (T, 4), float64.
 
     file: a camera path of nerfstudio's viewer, or a transforms file. size: (H, W) of the video, for
-    the intrinsics in pixels. fov: vertical angle of view in degrees; None takes that in the file.
+    the intrinsics in pixels. fov: vertical angle of view in degrees; None takes the file's angle.
     Raises ValueError for any other file.
     """
     try:

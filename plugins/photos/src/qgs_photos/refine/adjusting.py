@@ -18,8 +18,8 @@ class Adjustments:
     """Corrections of the poses and colours of photos; each step optimises those of one photo.
 
     A pose has 6 parameters in the frame of its camera: half the rotation vector (radians), and the
-    translation divided by `size`. An exposure has 3 x 4: the deviation from the identity of an
-    affine map of rendered RGB.
+    translation divided by `size`. An exposure has 3 x 4 parameters: the deviation from the identity
+    of an affine map of rendered RGB.
 
     photos: number of photos. poses, exposure: whether to optimise the poses, the exposures. size:
     size of the scene in world units. like: tensor whose type and device the parameters get.

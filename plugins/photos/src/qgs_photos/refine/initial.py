@@ -52,10 +52,11 @@ class Initialisation:
 
 
 def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisation:
-    """Choose between a model and the photos alone, and run the model.
+    """Choose between a model and the photos alone as the start; if a model is chosen, run it.
 
-    Without --model, --frames and --scale, the photos alone are used if there are at least ENOUGH.
-    Raises ValueError for --frames or --scale with --model none, and if no model is installed.
+    Without --model, --frames and --scale, the photos alone are used if there are at least ENOUGH
+    photos. Raises ValueError for --frames or --scale with --model none, and if a model is needed
+    but none is installed.
     """
     of_model = options.frames is not None or options.scale is not None
     if options.model == NONE and of_model:
@@ -112,9 +113,9 @@ def photos_start(
     """Return Gaussians (1, G) at COLMAP's points, if the scene has any, and at pixels of photos.
 
     world: reference pose (4, 4) and scale of the Gaussians' world, see `own_world`. views: photos
-    (1, V). count: number of Gaussians at the end of the optimisation. most: largest number of
-    Gaussians at pixels; without COLMAP's points, at least TIMED are placed. Points and pixels
-    together give at most `count`, or TIMED.
+    (1, V). count: number of Gaussians at the end of the optimisation; the result has no more. most:
+    largest number of Gaussians at pixels. Without COLMAP's points, there are at least TIMED
+    Gaussians, whatever `count` and `most` are.
     """
     parts = list[Gaussians]()
     if isinstance(scene, PhotoScene) and (points := sparse_points(scene.folder)):

@@ -275,9 +275,9 @@ def partly_swept(
 
 
 def joined(gaussians: Gaussians, others: Gaussians) -> Gaussians:
-    """Join two sets of Gaussians (1, G). `others` get zeros as spherical harmonics and features.
+    """Join two sets of Gaussians (1, G).
 
-    They get these only if `gaussians` have harmonics or features.
+    If `gaussians` have spherical harmonics or features, those of `others` become 0.
     """
     for name in ("sh", "features"):
         given = getattr(gaussians, name)

@@ -174,7 +174,7 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
 def page_writer(console: Console) -> PageWriter | None:
     """Return the viewer's function that makes an HTML page; None if the viewer is not installed.
 
-    In the latter case a line on the console says how to install the viewer.
+    Without the viewer, a line on the console says how to install it.
     """
     try:
         from qgs_viewer.page import gaussians_html

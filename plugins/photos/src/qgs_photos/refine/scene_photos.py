@@ -54,7 +54,7 @@ class ScenePhotos:
         self.small.held_out = self.held_out
 
     def at(self, size: Size | None) -> Scene:
-        """Return the scene with photos of `size` (H, W); None takes the reader's default."""
+        """Return the scene with photos of `size` (H, W); None takes the reader's default size."""
         source, _ = open_for(self.path, size, None, self._sources)
         return named_scene(source, self.path, self.name)
 

@@ -107,7 +107,8 @@ def _sizes(model: QueryGaussianModel) -> dict[str, Any]:
 def forward_flops(recipe: Recipe, workload: Workload) -> int:
     """Return the number of floating-point operations in a forward pass.
 
-    Matrix products and convolutions are counted, from shapes. A multiply-add counts as two.
+    Only matrix products and convolutions are counted, from their shapes. A multiply-add counts as
+    two operations.
     """
     # On the meta device nothing is computed, and attention is matrix products, which are counted;
     # kernels of our own would not be. The counter hooks into modules, which needs gradients to be

@@ -26,7 +26,7 @@ def import_(
 
     `--recipe auto` also writes the derived recipe, with all options of --set, to a .yaml file
     beside the checkpoint. A recipe without data has no image size: give `--set data.type=qgs/photos
-    --set data.path=PHOTOS --set data.image_size=[256,256]`, or later `qgs reconstruct --size`.
+    --set data.path=PHOTOS --set data.image_size=[256,256]`, or later give `qgs reconstruct --size`.
     """
     from qgs.recipe import resolve
     from qgs_research.published.importing import import_weights

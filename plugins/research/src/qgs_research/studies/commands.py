@@ -51,7 +51,8 @@ def compare(
 @app.command()
 def study(
     file: Annotated[
-        str, typer.Argument(metavar="STUDY", help="Study file, or name of a study in qgs.")
+        str,
+        typer.Argument(metavar="STUDY", help="Study file, or name of a study that comes with qgs."),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the study. Finished runs in it are kept.")],
     workers: Annotated[

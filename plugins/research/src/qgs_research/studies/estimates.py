@@ -27,7 +27,7 @@ Runs: TypeAlias = Mapping[int, StoredResults]
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over seeds and scenes, or a weighted sum of such means.
+    """Mean score over seeds and scenes, or a weighted sum of such means.
 
     values: scores (S, C) of S seeds and C scenes. interval: confidence interval of the mean; None
     for one scene. For one seed, the interval covers only the choice of scenes, not that of the
