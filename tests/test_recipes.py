@@ -73,7 +73,7 @@ def document(name):
 
 
 PAGE = document("docs/experiments.md")
-NAMED = set(re.findall(r"[\w-]+/[\w-]+\.yaml", PAGE))
+NAMED = set(re.findall(r"[\w-]+/[\w-]+\.yaml", PAGE + document("docs/api/mvsplat.md")))
 SHOWN = dict(re.findall(r"`(ablations/\w+\.yaml)`.* \| ([\d,]+) \|$", PAGE, re.MULTILINE))
 
 
