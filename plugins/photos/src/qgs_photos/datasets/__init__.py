@@ -1,4 +1,4 @@
-"""Readers of published data sets: chunks in pixelSplat's format, and DL3DV's archives."""
+"""Readers of data sets (chunks of pixelSplat, DL3DV, camera files) and samplers of views."""
 
 from qgs.contracts import Plugin
 from qgs_photos.datasets.chunks import ChunksSource

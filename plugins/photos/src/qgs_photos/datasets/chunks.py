@@ -173,8 +173,8 @@ class ChunkScene(Scene):
 class ChunksSource(LazySource):
     """Source of the scenes in the chunk files of a folder.
 
-    The folder holds chunks in train/ and test/, or chunks of its own, all of which are for
-    training. A data set without test chunks is evaluated on the held-out frames of its training
+    The folder holds train/ and test/ with chunks, or it holds chunks directly, all of which are
+    for training. A data set without test chunks is evaluated on the held-out frames of its training
     scenes, if they have any. Scenes whose chunk is named by index.json but does not exist are left
     out; a warning counts and names them.
     """

@@ -43,15 +43,15 @@ _PLACES = (
     "dense/sparse",
     "dense/*/sparse",
 )
-_LONGER = "a file goes on after the number of records that it announces"
+_LONGER = "a file has more data than the number of records that it announces"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 
 class Colmap(PhotoReader):
     """Reader of the posed images of a COLMAP model, sorted by name.
 
-    Models are searched in the folders of `_PLACES`, in this order. In a folder with both kinds, the
-    binary model is read and not the text model.
+    Models are searched in the folders of `_PLACES`, in this order. In a folder with a binary
+    and a text model, the binary one is read.
     """
 
     listing = "sparse/0/{cameras,images}.{bin,txt}"
@@ -92,7 +92,7 @@ class Colmap(PhotoReader):
 def _read(model: UPath, suffix: str) -> Listing:
     """Read the posed photos of a model, sorted by name.
 
-    model: folder of the model. suffix: that of its files. Raises ValueError if they are unreadable.
+    model: folder of the model. suffix: bin or txt. Raises ValueError for unreadable files.
     """
     read_cameras, read_images = _READ[suffix]
     try:
@@ -183,7 +183,7 @@ def _is_points(line: str) -> bool:
 
 
 def _number(word: str) -> float:
-    """Return the number that `word` spells; NaN if it is none, such as -nan(ind) on Windows."""
+    """Return the number that `word` spells; NaN for other words, such as -nan(ind)."""
     # Python reads 1_000
     with suppress(ValueError):
         return float(word.replace("_", "?"))
@@ -191,7 +191,7 @@ def _number(word: str) -> float:
 
 
 def _lines(file: UPath) -> Iterator[str]:
-    """Yield the lines of a file that are neither blank nor a comment, without outer spaces."""
+    """Yield the lines of a file that are neither blank nor a comment, stripped of spaces."""
     with io.TextIOWrapper(open_file(file), encoding="utf-8-sig") as lines:
         for line in lines:
             if (line := line.strip()) and not line.startswith("#"):

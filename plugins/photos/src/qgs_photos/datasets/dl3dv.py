@@ -155,8 +155,9 @@ def scene_folder(place: UPath) -> UPath:
             folders = (item for item in top.iterdir() if item.is_dir())
             tops = [top, *(item for item in folders if item.name not in _INSIDE)]
         except (zipfile.BadZipFile, OSError) as error:
-            reason = f"{place} is not a zip archive, or is cut off ({error})"
-            raise ValueError(f"{reason}: download it again") from error
+            raise ValueError(
+                f"{place} is not a zip archive, or is cut off ({error}): download it again"
+            ) from error
     for top in tops:
         for inside in _INSIDE:
             folder = top / inside if inside else top

@@ -18,10 +18,10 @@ from qgs_photos.image_files import image_files
 class Llff(PhotoReader):
     """Reader of LLFF's scenes. The Nth row of the file belongs to the Nth photo by name.
 
-    A row has 17 numbers: a (3, 5) matrix, then near and far. The columns of the matrix are the
-    axes down, right and back of the camera-to-world pose, the camera's centre, and height, width
-    and focal length. The principal point is the middle of the photo. Near and far are checked, but
-    not used.
+    A row has 17 numbers: a (3, 5) matrix, then near and far. Columns of the matrix: the camera's
+    axes down, right and back, and its centre, all in world coordinates; the last column is height,
+    width and focal length in pixels. The principal point is the middle of the photo. Near and far
+    are checked, but not used.
     """
 
     listing = "poses_bounds.npy"

@@ -88,7 +88,7 @@ class Bounded(ViewSampler):
     def span(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int, parts: int = 1
     ) -> list[Frames]:
-        """Return the moments of a random gap from first to last, each as the frames of one time.
+        """Return the frames in a random gap of the video, as one tuple of frames for each time.
 
         parts: number by which the bounds of the gap are divided. Raises ValueError for a scene with
         too few frames.
@@ -115,7 +115,7 @@ class Bounded(ViewSampler):
     ) -> list[int]:
         """Return the frames from which targets are sampled: those in `span` without its margins.
 
-        In a scene that moves, only the frames of one random moment of these are returned.
+        In a scene that moves, all returned frames are of one time, chosen at random.
         """
         margin = self.options(step).margin
         inside = span[margin : len(span) - margin]
@@ -219,7 +219,7 @@ class Overlapping(ViewSampler):
     class Config(ComponentConfig):
         apart: tuple[float, float] = (0.5, 2.0)
         """[least, largest] factor by which training multiplies distances and angles between
-        inputs. [1, 1] keeps those of `qgs demo`."""
+        inputs. [1, 1] takes inputs as `qgs demo` does."""
 
         @field_validator("apart")
         @classmethod
@@ -263,7 +263,7 @@ class Overlapping(ViewSampler):
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
         """Return inputs and target of each evaluation window, one window for each target photo.
 
-        A scene that moves has none.
+        Returns [] for a scene that moves: its windows follow from `views.gap`.
         """
         if scene.times is not None:
             return []
@@ -287,7 +287,7 @@ class Overlapping(ViewSampler):
 
 
 def apart(domain: Domain, factor: float) -> Domain:
-    """Return `domain` with the distances and the angles between inputs multiplied by `factor`."""
+    """Return the trained `domain` with distances and angles between inputs times `factor`."""
     low, high, turn = trained_ratios(domain)
     ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
     return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)

@@ -56,7 +56,7 @@ def bytes_of(image: Tensor) -> np.ndarray:
 def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
     """Yield each frame of a scene with its image file, and whether the file is copied unchanged.
 
-    Raises ValueError for an image that cannot be decoded, and what the scene raises.
+    Raises ValueError for an image that cannot be decoded, and the errors of reading the scene.
     """
     for index in range(len(scene)):
         if isinstance(scene, PhotoScene | ChunkScene) and not encoding.resized:

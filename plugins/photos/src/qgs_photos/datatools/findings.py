@@ -18,10 +18,10 @@ _FEW = 3
 class Finding:
     """A fault of a scene or a file, and its remedy.
 
-    scene: name of the scene or of the file. frames, names: indices in the data set's list, and file
-    names, of the photos with this fault; empty if the whole scene has it. severity: an error makes
-    results wrong, a warning may make them wrong. numbers: frame numbers of the photos as messages
-    show them, see `DecodedScene.numbers`.
+    scene: name of the scene or of the file. frames: indices, in the data set's list, of the photos
+    with this fault; names: their file names; both empty if the whole scene is at fault. severity:
+    an error makes results wrong, a warning may make them wrong. numbers: frame numbers of these
+    photos for messages, see `DecodedScene.numbers`.
     """
 
     scene: str
@@ -58,7 +58,7 @@ def errors_of(findings: Iterable[Finding]) -> list[Finding]:
 def spans(numbers: Iterable[int]) -> str:
     """Return numbers as text, with consecutive numbers joined, such as "0-3, 7".
 
-    After eight such runs, only the number of further runs is given.
+    After eight runs of consecutive numbers, the text only counts the further runs.
     """
     # numbers of one run are all equally far ahead of their places
     grouped = groupby(enumerate(sorted(set(numbers))), lambda item: item[1] - item[0])
@@ -131,6 +131,6 @@ class CheckReport:
 
     @property
     def findings(self) -> list[Finding]:
-        """All findings: first errors, then warnings; files come before scenes in both groups."""
+        """All findings: errors, then warnings; in each group, files precede scenes."""
         found = [*self.general, *(f for scene in self.scenes for f in scene.findings)]
         return sorted(found, key=lambda finding: finding.severity != "error")

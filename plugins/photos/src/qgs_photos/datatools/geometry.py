@@ -177,7 +177,7 @@ class _Matcher:
         self._known: dict[int, tuple[Features, np.ndarray, float]] = {}
 
     def pairs(self) -> Pairs:
-        """Match each frame with the next, and with the first of its partners that has matches."""
+        """Match each frame with the next, and with the first of `partners` that has matches."""
         found: dict[tuple[int, int], float | None] = {}
         for start in range(len(self.frames)):
             # the next shares most and says least; a farther one has a baseline

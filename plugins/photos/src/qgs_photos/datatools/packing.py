@@ -144,8 +144,8 @@ def pack(
     A chunk has at most `chunk_bytes` bytes, or holds one larger scene. index.json is written last.
     An interrupted packing continues after its last complete chunk if its settings are the same.
 
-    settings: options that decide what the source's scenes are. leave_out_broken: leave out scenes
-    that cannot be read and name them in the result; False raises their error. progress: called with
+    settings: options of the source on which its scenes depend. leave_out_broken: leave out scenes
+    that cannot be read and name them in the result; False raises the error. progress: called with
     the name of each finished scene. Raises FileExistsError for a folder with other content,
     ValueError for an unfinished packing with other settings, and the errors of reading scenes.
     """

@@ -178,5 +178,5 @@ def _is_black(image: Image.Image) -> bool:
 
 
 def error_text(error: Exception) -> str:
-    """Return an exception's message, after its type unless it is an error of reading files."""
+    """Return an exception's message; its type precedes it except for read errors."""
     return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)

@@ -25,8 +25,8 @@ _SIZE = (256, 256)
 def _imported(format: str) -> tuple[Registry, list[str]]:
     """Import plugins; return their components, and a note on each that cannot be imported.
 
-    format: "auto" imports all plugins; another format imports those in OF_FILES, and PLUGIN if it
-    has the form PLUGIN/NAME.
+    format: "auto" imports all plugins, PLUGIN/NAME the plugin PLUGIN and those listed in OF_FILES,
+    any other format only those in OF_FILES.
     """
     if format == "auto":
         return load_usable_plugins()
@@ -37,7 +37,7 @@ def _imported(format: str) -> tuple[Registry, list[str]]:
 def sources(format: str = "auto") -> dict[str, type[Component]]:
     """Return the data sources that have an option `path`, by PLUGIN/NAME.
 
-    format: "auto" for the sources of all plugins; PLUGIN/NAME for those of OF_FILES and of PLUGIN.
+    format: "auto" takes the sources of all plugins, PLUGIN/NAME those of OF_FILES and of PLUGIN.
     Raises PluginError if PLUGIN cannot be imported.
     """
     found = _imported(format)[0].components("data")
@@ -50,7 +50,7 @@ def left_out(format: str = "auto") -> list[str]:
 
 
 def kind_of(path: UPath) -> str:
-    """Return PLUGIN/NAME of the data source that reads `path`, or NAME for plugins in OF_FILES."""
+    """Return PLUGIN/NAME of the data source that reads `path`; if PLUGIN is in OF_FILES, NAME."""
     kind = recognised(path, sources())
     plugin, _, name = kind.partition("/")
     return name if plugin in OF_FILES else kind
@@ -60,7 +60,7 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
     """Yield the scenes of a plugin's data source to check, with images as the source returns them.
 
     kind: PLUGIN/NAME. images: value of the source's option `images`; None keeps its default. Raises
-    ValueError if the source has no such option, and what the source raises.
+    ValueError if the source has no such option, and the errors of the source.
     """
     source = sources(kind)[kind]
     assert issubclass(source, SceneSource)

@@ -36,8 +36,8 @@ _HEIGHT = 480
 class FilmScene(NamedTuple):
     """Gaussians (1, G) and the cameras (1, V) of the scene's photos, in the same world.
 
-    world: the reference pose (4, 4) and the scale that map the world of the photos into this world,
-    see `own_world`.
+    world: the reference pose (4, 4) and the scale that map the photos' world frame to that of the
+    Gaussians, see `own_world`.
     """
 
     gaussians: Gaussians
@@ -47,7 +47,7 @@ class FilmScene(NamedTuple):
 
 
 def film(scene: FilmScene, path: Cameras, file: Path, rate: int, console: Console) -> None:
-    """Render a scene from the cameras (1, T) of the path's T frames, and write a video.
+    """Render a scene from the cameras (1, T) of a path of T frames, and write a video.
 
     rate: frames per second.
     """
@@ -132,7 +132,7 @@ def _film_size(photos: tuple[int, int]) -> tuple[int, int]:
 def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
     """Return intrinsics (1, T, 4) for pictures of `size` (H, W), with centred principal points.
 
-    fov: vertical angle of view in degrees; None keeps all that `path` shows along the shorter side.
+    fov: vertical angle of view in degrees; None keeps the view of `path` along the shorter side.
     """
     height, width = size
     fx, fy, _, _ = path.intrinsics.unbind(-1)

@@ -45,7 +45,7 @@ def extract(
 
     count: number of intervals, all of the same duration. None makes intervals shorter in fast
     motion, and keeps at most MOST frames (`thinned`). progress: called with the stage, the seconds
-    done, and those of the video. Raises PosesError without a video of at least LEAST frames.
+    done, and the video's length. Raises PosesError without a video of at least LEAST frames.
     """
     times, aspect, damaged = _times(video)
     if len(times) < LEAST:
@@ -110,10 +110,10 @@ def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
 class Intervals:
     """Division of a video into intervals; one frame is taken from each.
 
-    An interval ends after 1 / `rate` seconds, or earlier, when the picture has moved by STEP.
-
-    start, length: first time and duration of the video in seconds. count: number of intervals, all
-    of the same duration whatever the motion; None lets motion end intervals earlier.
+    An interval ends after 1 / `rate` seconds, or earlier, when the picture has moved by the
+    fraction STEP of its sides. start, length: first time and duration of the video in seconds.
+    count: number of intervals, all of the same duration whatever the motion; None sets `rate` to
+    at least PER_SECOND and lets motion end intervals earlier.
     """
 
     def __init__(self, start: float, length: float, count: int | None) -> None:
@@ -174,9 +174,9 @@ def _opened(video: Path) -> Any:
 
 
 def _times(video: Path) -> tuple[list[Fraction], float, bool]:
-    """Return a video's ascending frame times in seconds, its pixel aspect, and if it is damaged.
+    """Return frame times of a video in seconds, its pixel aspect, and whether it is damaged.
 
-    The pixel aspect is the width of a pixel over its height. Packets are read, but not decoded.
+    Times ascend. The pixel aspect is width over height. Packets are read, but not decoded.
     """
     times = list[Fraction]()
     broken = False

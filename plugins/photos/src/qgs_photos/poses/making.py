@@ -105,7 +105,7 @@ def fingerprint(source: Path) -> dict[str, Any]:
 def make_poses(source: Path, out: Path, options: Options, console: Console) -> Poses:
     """Compute the poses of `source`, photos or a video, and write them to the new folder `out`.
 
-    `out` gets sparse/0 (a COLMAP model), images/ and poses.json; any reader of COLMAP opens it.
+    `out` gets sparse/0 (a COLMAP model), images/ and poses.json. COLMAP's readers open `out`.
     Raises PosesError if no poses are found, FileExistsError if `out` is not empty, and OSError if
     files cannot be read or written.
     """

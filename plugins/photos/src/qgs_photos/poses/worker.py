@@ -160,7 +160,7 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
 def _centred(model: Any, threads: int) -> Any:
     """Refine the principal points of `model` if many photos share a camera and the error decreases.
 
-    COLMAP keeps principal points in the middle of the image, so poses of cropped photos are turned.
+    COLMAP keeps principal points in the image's middle, so it rotates poses of cropped photos.
     With long lenses a principal point cannot be measured: for photos with an angle of view of 19
     degrees, refinement would leave the error unchanged and turn the cameras by half a degree.
     """
