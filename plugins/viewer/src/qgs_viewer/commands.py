@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class FigureName(StrEnum):
-    """Names of the figures that `qgs figures` draws, in the order of its file figures.md."""
+    """Names of the figures that `qgs figures` draws, in the order in which figures.md has them."""
 
     NOVEL_VIEWS = auto()
     QUERIES = auto()
@@ -70,8 +70,8 @@ Query = Annotated[
 Page = Annotated[
     Path | None,
     typer.Option(
-        help="Write a page with the scene, which can be turned, to this new HTML file and start no "
-        "server. A query cannot be picked in the page: choose it with --query."
+        help="New HTML file to write the scene to, as a page in which a reader can turn the scene; "
+        "no server is started. The page cannot change the query: choose it with --query."
     ),
 ]
 Host = Annotated[

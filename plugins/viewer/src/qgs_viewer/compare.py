@@ -41,9 +41,9 @@ def compare_models(
 ) -> None:
     """Evaluate `models` (default: some that come with qgs), and write a report into `target`.
 
-    photos: folder or video; None evaluates on unseen scenes of the models' data. size: of the
-    photos, in the form of the option --size. scale: factor by which camera positions are
-    multiplied; None searches for a factor.
+    photos: folder or video; None evaluates on unseen scenes of the models' data. size: text of the
+    option --size, the size of the photos. scale: factor by which camera positions are multiplied;
+    None searches for a factor.
     """
     pixels = parse_size(size)
     # models of 128 pixels need photos of that size at least

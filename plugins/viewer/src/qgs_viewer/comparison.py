@@ -60,8 +60,8 @@ POOR = 1.0
 def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) -> list[Window]:
     """Choose at most `count` windows: input photos, with the photos that renders are compared to.
 
-    The first window is the best of `ranked_windows`. The other windows are good too, and far from
-    the windows chosen before them. inputs: number of input photos in a window. trained_on:
+    The first window is the best of `ranked_windows`. Each further window is nearly as good, and far
+    from the windows chosen before it. inputs: number of input photos in a window. trained_on:
     measurements of the cameras of the training data, by which windows are ranked. Raises ValueError
     if the scene has fewer photos than `inputs`.
     """
@@ -76,7 +76,7 @@ def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) ->
 
 
 class PhotoWindows(Span):
-    """View sampler that chooses at most WINDOWS windows of each scene by `spread_windows`.
+    """View sampler that chooses at most six windows of each scene by `spread_windows`.
 
     A window is a set of input photos with the photos that renders are compared to. The choice is
     made once for each scene.
@@ -138,9 +138,9 @@ class Model:
     """A trained model in a comparison.
 
     name: short and unique. file: checkpoint of the model. recipe: recipe of the training, but with
-    the data of the comparison. search: the network, and the scales found for it. step: number of
-    training steps; None if unknown. windows: chooses inputs and compared photos from a user's
-    photos; None if the scenes are those of the recipe.
+    the data of the comparison. search: the network, and the scales found for its scenes. step:
+    number of training steps; None if unknown. windows: sampler that chooses the inputs and compared
+    photos from a user's photos; None if the scenes come from the recipe's data.
     """
 
     name: str
@@ -212,8 +212,8 @@ def open_models(
 ) -> list[Model]:
     """Load models for a comparison on unseen scenes of their data, or on held-out `photos`.
 
-    names: run folders, checkpoints, URLs or shipped models. The other arguments and the errors are
-    those of `recipes_alike`.
+    names: run folders, checkpoints, URLs or shipped models. photos, size, overrides: passed on to
+    `recipes_alike`. Raises ValueError if models cannot be compared under one protocol.
     """
     files = checkpoints(names)
     recipes = recipes_alike(files, photos, size, overrides)
@@ -234,8 +234,8 @@ def open_models(
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
     """Return checked recipes by short name, all with one time budget (seconds) and one seed.
 
-    Raises ValueError if two recipes differ in anything but model, losses and the options in
-    OF_THE_METHOD.
+    Raises ValueError if two recipes differ in data, views, evaluation, metrics, optimizer or
+    training, except in the options OF_THE_METHOD, such as `views.scale`.
     """
     # a number of steps that no time budget reaches
     overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
@@ -248,7 +248,7 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
 def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> None:
     """Raise ValueError if two recipes differ in one of `sections`.
 
-    The options in OF_THE_METHOD may differ.
+    The options in OF_THE_METHOD, such as `views.scale`, may differ.
     """
 
     def compared(section: str, recipe: Recipe) -> dict[str, Any]:
@@ -278,8 +278,8 @@ def recipes_alike(
     (H, W) of the photos in pixels; by default a size that all models take and that crops no photo.
     overrides: settings of `views` for photos, such as a scale.
 
-    Raises ValueError if recipes differ in how models are evaluated, and what `CheckpointFile` and
-    the readers of photos raise.
+    Raises ValueError if recipes differ in how models are evaluated. Errors of `CheckpointFile` and
+    of the readers of photos pass through.
     """
     recipes = dict[str, Recipe]()
     for name, path in files.items():
@@ -297,8 +297,8 @@ def recipes_alike(
 def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dict[str, Any]:
     """Return a recipe section `data` that reads `photos` in a size that all `recipes` take.
 
-    Some photos are held out to compare renders with. Photos that were training data of a recipe
-    keep their held-out photos.
+    Some photos are held out to compare renders with. If a recipe was trained on `photos`, the
+    photos that its training held out are used.
     """
     sources = installed_sources()
     trained = [recipe.data_config for recipe in recipes]

@@ -37,8 +37,8 @@ class Choice:
 
     query: index of the picked query; None for all. by_query: whether to colour Gaussians by query.
     layer: decoder layer whose anchors and attention are shown; 0 is before the first layer. others:
-    how the Gaussians of queries that are not picked look. patches: number of lines from the picked
-    query to the photo patches that it attends to most. anchors, photos: whether to show them.
+    look of the Gaussians of queries that are not picked, such as "faint". patches: number of lines
+    from the picked query to the patches that it attends to most. anchors, photos: False hides them.
     """
 
     query: int | None = None
@@ -142,7 +142,7 @@ class Drawing:
         self.update(scene, choice)
 
     def update(self, scene: QueryScene, choice: Choice) -> None:
-        """Draw everything again but photos and background, which do not depend on `choice`."""
+        """Draw all again except photos and background, which do not depend on `choice`."""
         self._draw_gaussians(scene, choice)
         if (views := self.api.get_handle_by_name("/views")) is not None:
             views.visible = choice.photos

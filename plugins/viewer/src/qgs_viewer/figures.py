@@ -1,4 +1,4 @@
-"""Draw sections of the report by Matplotlib as figures for papers, in PDF and PNG."""
+"""Draw sections of the report with Matplotlib as figures for papers, in PDF and PNG."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -100,7 +100,7 @@ def grid(section: Section) -> Figure:
 
 
 def write_figure(figure: Figure, folder: Path, name: str) -> None:
-    """Write NAME.pdf, in which text is stored as text, and NAME.png.
+    """Write a figure to NAME.pdf, which stores text as text, and to NAME.png.
 
     Equal figures give files of equal bytes.
     """

@@ -34,7 +34,7 @@ def hex_color(color: Color) -> str:
 
 
 def categorical(index: int) -> Color:
-    """Return the RGB colour number `index` of six for series and queries; colours repeat."""
+    """Return a colour from a palette of six RGB colours; index 6 is the first colour again."""
     return CATEGORICAL[index % len(CATEGORICAL)]
 
 

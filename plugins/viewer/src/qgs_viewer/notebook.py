@@ -21,9 +21,9 @@ def model_html(model: QueryGaussianModel) -> str:
 
 @torch.no_grad()
 def prediction_png(prediction: Prediction) -> bytes | None:
-    """Return a PNG of the first scene's colours and depth, rendered from its world's origin.
+    """Return a PNG with colours and depth of the first scene, rendered from its world origin.
 
-    The origin is the first input camera or the mean of all input cameras, as the recipe says.
+    The recipe puts the origin at the first input camera or at the mean of all input cameras.
     Returns None if no Gaussian lies in front of the origin, or if positions are not finite.
     """
     gaussians = prediction.gaussians[:1]

@@ -41,7 +41,7 @@ SAME = 0.02
 
 @dataclass
 class Source:
-    """Content of the viewer: here, fixed Gaussians without a model.
+    """Content of the viewer. This class shows fixed Gaussians without a model.
 
     The derived class `ModelSource` reconstructs a scene from photos that the user chooses. title:
     heading of the viewer. notes: remarks for the user. fixed: the Gaussians to show; None in
@@ -56,7 +56,7 @@ class Source:
     labels: Sequence[str] = ()
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
-        """Return the scene reconstructed from the photos `frames`; always `fixed` without a model.
+        """Return the scene reconstructed from the photos `frames`; without a model, `self.fixed`.
 
         Raises ValueError for frames that a model cannot take.
         """
@@ -250,7 +250,7 @@ class FinishedScene(Scene):
 def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str, Any]]:
     """Read the Gaussians, the photos and cameras.json of a finished reconstruction.
 
-    Queries are not stored there. Raises ValueError that names the broken file.
+    The files do not store queries. Raises a ValueError that names the broken file.
     """
     path = folder / CAMERAS
     gaussians = load_ply(folder / PLY)
@@ -275,8 +275,8 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
 def open_finished(folder: Path, device: str) -> Source:
     """Open a finished reconstruction, with its queries if its model is known.
 
-    The model must make the same Gaussians again. Otherwise the Gaussians of the PLY file are shown
-    without queries, with a note on the reason.
+    If the model no longer makes the Gaussians of the PLY file, these are shown without queries, and
+    a note says why.
     """
     plain, scene, record = read_finished(folder)
     title = f"{scene.name} ({folder.name})"
@@ -302,7 +302,7 @@ def _with_queries(
     """
     for change in ("refinement", "tuning"):
         if record.get(change):
-            raise ValueError(f"the Gaussians were changed by {change} after the model made them.")
+            raise ValueError(f"{change} changed the Gaussians after their queries made them.")
     name = str(record.get("model") or "")
     # nothing is fetched because a file says so
     if not name or "://" in name:

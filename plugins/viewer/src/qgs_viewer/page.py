@@ -142,7 +142,7 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
 def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
     """Return an HTML page of `scene`, which a reader can turn and film.
 
-    The page has 0.8 MB and 40 bytes for each Gaussian. choice: what is shown; by default all
+    The page takes 0.8 MB plus 40 bytes for each Gaussian. choice: what is shown; by default all
     Gaussians in their own colours, and the anchors after the last layer.
     """
     with quiet_server() as server:

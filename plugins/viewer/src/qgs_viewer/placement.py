@@ -103,7 +103,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
     """Return the index of the Gaussian with the largest blending weight on a ray.
 
-    Returns None if all weights are below LEAST_WEIGHT. The alpha of a Gaussian is its greatest
+    Returns None if all weights are below 0.02. The alpha of a Gaussian is its greatest
     value along the ray; alphas are blended from near to far. origin, direction: start and direction
     of the ray, both (3,).
     """

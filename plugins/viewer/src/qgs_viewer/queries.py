@@ -30,7 +30,7 @@ FARTHEST = 1e4
 
 @full_precision
 def outline(support: SpatialSupport, query: int, cameras: Cameras) -> Tensor | None:
-    """Return the outline of a query's support ellipsoid in a photo: pixels (OUTLINE_POINTS, 2).
+    """Return the outline of a query's support ellipsoid in a photo: 96 pixel positions (96, 2).
 
     Returns None if a part of the ellipsoid lies behind the camera. cameras: (1, 1), the camera of
     the photo.

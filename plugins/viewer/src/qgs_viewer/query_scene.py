@@ -102,8 +102,8 @@ class QueryScene:
     def support(self, layer: int) -> SpatialSupport | None:
         """Return the support ellipsoids of all N queries in the viewer's world, (1, N), float64.
 
-        layer: decoder layer after which the supports are taken; 0 is before the first layer.
-        Returns None if the queries have no anchors, or if the model is not known.
+        layer: number of the decoder layer after which the supports are taken; 0 means before the
+        first layer. Returns None if the queries have no anchors, or if the model is not known.
         """
         if self.inside is None:
             return None
@@ -152,7 +152,7 @@ class QueryScene:
         """Return the `count` photo patches that a query attends to most, averaged over heads.
 
         depth: distance from a camera at which its photo is drawn, in the viewer's world. Returns
-        None if `attention` does.
+        None where `attention` returns None.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:

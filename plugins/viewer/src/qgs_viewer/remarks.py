@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
-    """Yield one sentence with the scales that a search found; nothing without a search."""
+    """Yield a sentence with the scales that a search found; without a search, yield nothing."""
     parts = []
     for model in models:
         if found := model.search.found.values():
@@ -72,8 +72,8 @@ def next_commands(
     """Return shell commands that a reader may run next, by command, with what each command does.
 
     names: the models as given on the command line. target: folder of the report, into which the
-    commands write. photos: the user's photos; None without. options: options of the report about
-    its photos, such as --size.
+    commands write. photos: folder or video of the user; None for unseen scenes. options: options
+    of the report that concern `photos`, such as --size.
     """
     first, column = next(iter(models[0].evaluation.columns.items()))
     scores = [model.evaluation.mean(f"model_{first}") for model in models]

@@ -40,7 +40,7 @@ class ModelScenes:
         return self.samples[0].targets.cameras[:, :1]
 
     def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
-        """Return the query `query`, or for None the `count` best visible queries.
+        """Return the query with the index `query`; if it is None, `count` well visible queries.
 
         cameras: (1, V); only the first camera is used (see `notable_queries`). Raises ValueError
         for a query that does not exist.
@@ -57,8 +57,8 @@ def model_scenes(
 ) -> list[ModelScenes]:
     """Reconstruct the scenes of the evaluation by each model, on the device of the model.
 
-    most: number of scenes, with one sample for each scene; by default all samples of the
-    evaluation. scene: name of the scene to put first. Raises ValueError for a scene that is not
+    most: number of scenes to reconstruct, from one sample of views each; None takes all samples of
+    the evaluation. scene: name of the scene to put first. Raises ValueError if this scene is not
     evaluated.
     """
     first = models[0].recipe

@@ -66,8 +66,8 @@ class Section:
     """A section of the report: pictures in rows.
 
     name: key of the section's texts in sections.toml. rows: tiles by label of the row; None leaves
-    a gap. figure: the figure that `qgs figures` writes; None draws the tiles. width: least width of
-    a tile in CSS pixels.
+    a gap. figure: Matplotlib figure for `qgs figures`; if it is None, the command draws the tiles.
+    width: least width of a tile in CSS pixels.
     """
 
     name: str
@@ -128,7 +128,7 @@ def queries(models: Shown, detail: Detail) -> Section:
 def anchors(models: Shown, detail: Detail) -> Section:
     """Return a section with anchors and support ellipsoids of queries on the first input photo.
 
-    The columns are the start and some decoder layers. Models without anchors are left out.
+    Columns: at the start and after some decoder layers. A model without anchors has no row.
     """
     rows = {}
     for model in models:
@@ -184,8 +184,8 @@ def training_curves(models: Shown, detail: Detail) -> Section:
 def novel_views(models: Shown, detail: Detail) -> Section:
     """Return a section with the middle target view of up to three scenes.
 
-    Each scene has three rows: renders, their errors, depths. The columns are the inputs, the truth
-    and the models.
+    Each scene has three rows: renders, their errors, depths. The columns are the inputs, the real
+    photos (truth) and the models.
     """
     rows: dict[str, Sequence[Tile | None]] = {}
     for place, sample in enumerate(models[0].samples[:NOVEL_SCENES]):

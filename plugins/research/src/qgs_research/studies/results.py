@@ -74,7 +74,7 @@ class Results(Scores):
 
     @property
     def shared(self) -> str | None:
-        """Name of the first evaluation in which all runs have the same protocol.
+        """Name of the first evaluation whose runs were all scored by one protocol.
 
         None if there is no such evaluation.
         """
@@ -110,8 +110,8 @@ class Results(Scores):
     def rank_correlation(self) -> float | None:
         """Return Spearman's rank correlation of measured means and published values, by variant.
 
-        The means are from the default evaluation. Returns None for fewer than five variants with
-        both values, and if the variants were evaluated by different protocols.
+        The means are from the default evaluation. Returns None if fewer than five variants have
+        both values, or if the variants were evaluated by different protocols.
         """
         published = self.settings.published
         scores = {variant: self.score(variant, self.metric) for variant in published}
@@ -125,7 +125,7 @@ class Results(Scores):
 def write_files(results: Results) -> Path:
     """Write results.json and table.md into the study's folder; return the path of table.md.
 
-    If the whole study is trained again, only `times` in results.json may differ.
+    If the whole study is trained again, only the training times in results.json may differ.
     """
     study = results.plan.study
     head = "\n\n".join(filter(None, [f"# {study.title}", study.settings.question]))
@@ -148,10 +148,10 @@ def answer(results: Results) -> str:
 def _verdict(results: Results) -> str:
     """Return a sentence that says whether the best variant is better than the reference.
 
-    The scores are from the evaluation `Results.shared`. The best of n variants counts as better if
-    its interval at confidence 1 - 0.05 / n does not contain 0 (Bonferroni correction). The
-    statement that all variants are worse needs no correction, because it needs n intervals below 0
-    (intersection-union test).
+    The scores are from the evaluation `Results.shared`. A variant is better if the interval of its
+    difference to the reference, at confidence 1 - 0.05 / n for n variants, lies on the better side
+    of 0 (Bonferroni correction). "All variants are worse" needs no correction, because all n
+    intervals must lie on the worse side of 0 (intersection-union test).
     """
     if results.metric not in results.columns:
         return "Not known yet: no run is finished."

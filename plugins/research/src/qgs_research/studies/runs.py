@@ -115,7 +115,7 @@ def run_of(folder: Path, variant: str, seed: int) -> Run:
 def recipe_file(folder: Path, variant: str, evaluation: str = MAIN) -> Path:
     """Return the path of a variant's checked recipe in the study folder.
 
-    The recipe is that of the training by default, or that of the evaluation `evaluation`.
+    By default it is the recipe for training; with `evaluation`, the recipe for this evaluation.
     """
     # Names have no @, which separates variant and evaluation in hypotheses too.
     name = f"{variant}@{evaluation}" if evaluation else variant
@@ -140,7 +140,7 @@ def write_plan(plan: Plan) -> None:
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[str | None, str | None]]:
     """Return the options in which two recipes differ: both values, by path of the option.
 
-    A missing value is None. Options in BESIDE are left out, because they do not change the model.
+    A missing value is None. The options `seed` and `plugins` are left out.
     """
     found = differing_options(ours.tree, theirs.tree)
     return {path: values for path, values in found.items() if path not in BESIDE}

@@ -132,9 +132,9 @@ class Scores:
         return [result for runs in parts for result in runs.values()]
 
     def unlike(self, terms: Terms) -> bool:
-        """Return True if results of one evaluation are compared by different protocols.
+        """Return True if `terms` compares results of one evaluation that have different protocols.
 
-        terms: the weighted sum of mean scores that compares them.
+        terms: weights of mean scores in a sum, such as 1 and -1 for a difference.
         """
         # Each evaluation may have its own protocol: `A@two - B@two < C - D` is a valid comparison.
         sums: dict[tuple[str, str], int] = defaultdict(int)

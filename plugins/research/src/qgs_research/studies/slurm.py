@@ -1,4 +1,4 @@
-"""Command `qgs slurm`, which writes Slurm jobs that save before their time limit."""
+"""Command `qgs slurm`: write Slurm jobs that save their training before the time limit."""
 
 import shlex
 import sys
@@ -20,7 +20,7 @@ def train(
     words: Annotated[
         list[str],
         typer.Argument(
-            metavar="RECIPE --out RUN ...", help="Arguments and options of `qgs train`."
+            metavar="RECIPE --out RUN ...", help="Arguments and options for `qgs train`."
         ),
     ],
     gpus: Annotated[int, typer.Option(min=1, help="Number of GPUs, all on one node.")] = 1,

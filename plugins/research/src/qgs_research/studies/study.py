@@ -106,10 +106,10 @@ class StudySettings(ComponentConfig):
     question: str = ""
     """Question that the study answers, in one or more sentences."""
     base: Any = None
-    """Recipe file that the variants change. In a list, each recipe changes the recipes before
-    it."""
+    """Recipe file that the variants change, or a list in which each file changes the files before
+    it. Null means that every variant names its own recipe by `extends`."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Recipe options to set in all variants, as sections and options like in a recipe file."""
+    """Recipe options to set in all variants, written in sections as in a recipe file."""
     variants: dict[Name, dict[str, Any] | None] = Field(min_length=1, max_length=200)
     """Models to compare, by name. Each is a recipe file or a set of changes to `base`; null means
     `base` without changes."""
@@ -260,7 +260,7 @@ def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
 
 
 def _locate_index(node: MapNode) -> None:
-    """Make `evaluation.index` an absolute path if it is relative to the study file."""
+    """Make `evaluation.index` absolute if this path, taken from the study's folder, exists."""
     section = node.child("evaluation")
     index = section.get("index")
     if isinstance(index, str):

@@ -64,9 +64,9 @@ def table_rows(
 ) -> Rows:
     """Return a table of scores, with one row for each model and each baseline.
 
-    metric: shown with mean, standard deviation, difference to the reference, and its interval.
-    others: further metrics, shown with means only. published: published values of `metric`, by
-    model.
+    metric: the table shows its mean, standard deviation and difference to the reference model, and
+    the interval of this difference. others: metrics of which the table shows only means.
+    published: published values of `metric`, by model.
     """
     column = scores.columns[metric]
     head = [column.title, "sd", "difference", "95 % interval"]
