@@ -106,7 +106,7 @@ class Domain:
         return domain
 
     def differences(self, found: Domain) -> dict[str, str]:
-        """Describe, by name, each measurement whose range in `found` leaves this trained range."""
+        """Describe, by name, each measurement whose range in `found` exceeds the one in `self`."""
         phrases: dict[str, str] = {}
         seen = found.ranges
         for name, trained in self.ranges.items():

@@ -103,8 +103,10 @@ def replacing_entries(folder: AnyPath, mark: str) -> Iterator[Path]:
         names = sorted(entry.name for entry in fresh.iterdir())
         there = [name for name in names if (target / name).exists()]
         if there and mark not in there:
-            what = f"{target} holds {listed(there)}, which are no earlier result"
-            raise FileExistsError(f"{what}: choose another folder")
+            raise FileExistsError(
+                f"{target} holds {listed(there)}, which are no earlier result: choose another "
+                "folder"
+            )
         try:
             for name in names:
                 if name in there:

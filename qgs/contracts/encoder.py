@@ -28,7 +28,7 @@ MEMORY_FIELDS: Fields = {
 
 
 def memory_fields(*names: str) -> Fields:
-    """Return entries of MEMORY_FIELDS by short name, as in `memory_fields("keys", "values")`."""
+    """Return memory fields by full name: `memory_fields("keys")` has the key "memory.keys"."""
     return {f"memory.{name}": MEMORY_FIELDS[f"memory.{name}"] for name in names}
 
 

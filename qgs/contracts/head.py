@@ -19,9 +19,9 @@ GAUSSIAN_FIELDS: Fields = {
 class Head(ModelComponent):
     """Head: QueryState -> GaussianAttributes of K Gaussians per query, in their valid ranges.
 
-    `GaussianAttributes` gives these ranges. An untrained head keeps to them too, for nonzero
-    features. A head that outputs `sh` or `features` declares them in `writes`, see GAUSSIAN_FIELDS,
-    so that losses can require them.
+    `GaussianAttributes` gives these ranges. An untrained head keeps these ranges too if the
+    features are nonzero. A head that outputs `sh` or `features` declares them in `writes`, see
+    GAUSSIAN_FIELDS, so that losses can require them.
     """
 
     slot: ClassVar[str] = "head"
@@ -36,16 +36,16 @@ class Head(ModelComponent):
         """Return all attributes of the Gaussians except their means."""
 
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
-        """Return whether weight decay applies to `parameter`: False (TokenGS release)."""
+        """Return whether weight decay applies to `parameter`; default: False (TokenGS release)."""
         return False
 
 
 class Centers(ModelComponent):
     """Centers: (raw offsets (B, N, K, 3), QueryState) -> world-frame means (B, N, K, 3) in float32.
 
-    B, N and K are scenes, queries and Gaussians per query. The state is the decoder layer's output
-    after its refinement. Finite offsets give finite means. Raises KeyError for a field that the
-    state lacks; model construction prevents this by checking `reads`.
+    B, N and K are scenes, queries and Gaussians per query. The state is the output of a decoder
+    layer after the layer's refinement. Finite offsets give finite means. Raises KeyError for a
+    field that the state lacks; model construction prevents this by checking `reads`.
     """
 
     slot: ClassVar[str] = "centers"

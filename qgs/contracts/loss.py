@@ -19,7 +19,7 @@ class Loss(Component, torch.nn.Module):
     schedule. Training calls the loss for each supervised layer, with a rendering from the target
     cameras and all input views of the prediction. Training minimises the sum of all terms, weighted
     by layer. A term is one number to minimise; `history.jsonl` lists it under its name, which is
-    unique within a recipe. Every term has a gradient in the prediction or in the rendering.
+    unique within a recipe. Every term is differentiable in the prediction or in the rendering.
 
     renderings: the target views that one call needs; training may render few at a time
         (`training.render_views`). "each": a term is a mean over views, so training may call the
@@ -79,5 +79,6 @@ class Supervision(Component):
 
         Layer numbers start at 1 and are in ascending order. 0 is the initial state, which is
         supervised only in a decoder without layers.
-        rounds: numbers of the last layers of feedback rounds, which are supervised too.
+        rounds: the number of the last layer in each repetition of layers by feedback. These layers
+            are supervised too.
         """

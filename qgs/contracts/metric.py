@@ -88,8 +88,8 @@ class Metric(Component, torch.nn.Module):
     not_in_protocol: options that change no value, such as a path; they do not enter the hash.
     needs: fields of MetricInput that must not be None for the metric to have a value.
     column: display of the value in tables.
-    unavailable: reason why the metric has no values, such as a missing file of weights; "" if it
-        has.
+    unavailable: reason why the metric has no values, such as a missing file of weights; "" if the
+        metric has values.
     """
 
     slot: ClassVar[str] = "metrics"

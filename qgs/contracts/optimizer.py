@@ -71,13 +71,13 @@ class Optimizer(Component):
     def build(self, groups: Sequence[ParameterGroup]) -> torch.optim.Optimizer:
         """Return torch's optimiser for `groups`.
 
-        An override that splits a group must copy its `factor` to the new groups.
+        An override that splits a group must copy the group's `factor` to the new groups.
         """
 
     def learning_rate(self, step: int, seconds: float) -> float:
         """Return the learning rate of optimiser step `step`, `seconds` into training.
 
-        Step 0 is the first. Training calls this method with ascending steps, after it set `config`
+        Step 0 is the first. Training calls this method with ascending steps, after setting `config`
         to the option values of the step. The default returns the option `learning_rate`. An
         override should return this option too if `follows_schedule` is true.
         """

@@ -24,7 +24,7 @@ class Plugin:
         point names. Commands accept PLUGIN/NAME in place of a file's path. A Markdown file of the
         same name describes each model: models/mine.md for models/mine.safetensors.
     exemptions: checks of the contract that are known to fail, as {component class or options:
-        {check: reason}}. Give options as the key if the component passes with other options.
+        {check: reason}}. The key is options if the component fails only with these options.
     """
 
     name: str

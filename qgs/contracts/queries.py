@@ -40,13 +40,13 @@ class Queries(ModelComponent):
     def resized(
         self, learned: Mapping[str, Tensor], generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Return a state dict for these queries, made from one with another number of queries.
+        """Return a state dict for these queries, made from that of more or fewer queries.
 
         learned: the old state dict, on the CPU. Its shapes differ from the new ones only in the
-            first axis, the queries. If there are fewer new queries, N, the first N are kept. If
-            there are more, all n old queries are kept; new query i is a copy of old query i modulo
-            n, plus noise of standard deviation 0.01 on all parameters (LocusGS release,
-            finetuning).
+            first axis, the queries. If the new number N is smaller, the first N queries are kept.
+            If it is larger than the old number n, all n queries are kept; each further query i
+            copies query i modulo n and adds noise of standard deviation 0.01 to all parameters
+            (LocusGS release, finetuning).
         """
         own = {name: values.shape for name, values in self.state_dict().items()}
         return {

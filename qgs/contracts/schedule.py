@@ -29,7 +29,7 @@ class Schedule(ComponentConfig):
     def corners(self) -> tuple[int, ...]:
         """Steps after 0 at which the value may turn from rising to falling or back.
 
-        Between them the value is monotonic, so its extremes lie at one of them or at step 0.
+        Between these steps the value is monotonic, so its extremes lie at these steps or step 0.
         """
         return ()
 
@@ -57,6 +57,6 @@ def follow(parts: Iterable[object], step: int) -> None:
 
 
 def steps_followed(parts: Iterable[object]) -> int | None:
-    """Return the step that `follow` last set for `parts`; None if no option has a schedule."""
+    """Return the step last passed to `follow` for `parts`; None if no option has a schedule."""
     found = [x.followed for x in parts if isinstance(x, Component) and x.schedules]
     return found[0] if found else None

@@ -21,17 +21,17 @@ class ViewsConfig(ComponentConfig):
     view."""
     gap: tuple[int, int] = (10, 40)
     """Distance from the first to the last input view, as [min, max] in frames. Neighbouring frames
-    have distance 1. In scenes with times the unit is a distinct time, not a frame. A scene shorter
-    than max uses at most its own length; a scene shorter than min logs a warning."""
+    have distance 1. In scenes with times, neighbouring times have distance 1. A scene shorter than
+    max uses at most its own length; a scene shorter than min logs a warning."""
     frame: Literal["first_cam", "mean_cam", "given"] = "first_cam"
     """Camera whose pose becomes the identity: "first_cam" is the first input camera, "mean_cam" the
     mean of the input cameras. "given" changes no pose of the data."""
     scale: Literal["constant", "distance", "auto", "search"] = "constant"
     """Rule for scaling camera positions. "constant" multiplies them by `scale_factor`. "distance"
-    first divides them by the largest distance from the first input camera to any other camera, then
-    multiplies. "auto" computes one factor per scene, which brings the point nearest to all optical
-    axes to depth 1. "search" takes the factor at which the model renders photos best, and works
-    only for reconstructions."""
+    divides them by the largest distance from the first input camera to any other camera, and then
+    multiplies them by `scale_factor`. "auto" computes one factor per scene, which brings the point
+    nearest to all optical axes to depth 1. "search" takes the factor at which the model
+    renders photos best, and works only for reconstructions."""
     scale_factor: float = Field(default=0.15, gt=0)
     """Factor for all camera positions, see `scale`. It has no effect if `scale` is "auto" or
     "search"."""
@@ -75,7 +75,7 @@ class TrainingConfig(ComponentConfig):
     precision: Precision = "bf16"
     """Precision of the model's computations. bf16 uses torch's autocast; weights stay float32."""
     save_every: int = Field(default=1000, ge=0)
-    """Number of steps between checkpoints. 0 saves one only at the end and before evaluations."""
+    """Steps between checkpoints. 0: checkpoints only at the end and before evaluations."""
     collapse_window: int = Field(default=50, ge=10, le=100)
     """Stop training after this many steps in a row in which renderings are empty or the gradient
     vanishes."""
@@ -99,8 +99,8 @@ class TrainingConfig(ComponentConfig):
     """Number of steps between evaluations during training. An evaluation saves pictures, too. 0: no
     evaluations."""
     trackers: tuple[str, ...] = ()
-    """Trackers that get all numbers and pictures, which are written to the run's folder in any
-    case: tensorboard, wandb, or a tracker of a plugin."""
+    """Trackers that log the run: tensorboard, wandb, or a tracker of a plugin. Each gets all
+    numbers and pictures; the run's folder has them in any case."""
 
     def scenes_per_batch(self, processes: int) -> int:
         """Return the number of scenes per batch of one process.
@@ -139,7 +139,8 @@ class EvaluationConfig(ComponentConfig):
     {scene: null | {"context": [frames], "target": [frames]}}. Scenes with null are skipped. null:
     no file; views are chosen at random."""
     protocol: str | None = None
-    """Name of these evaluation settings in tables. null uses the name of the file in `index`."""
+    """Name of these evaluation settings in tables. null uses the name of the file in `index`,
+    or "drawn" without an index."""
     tuning: Literal["queries", "latents"] = "queries"
     """Part of the model's state that test-time tuning fits to a scene's input views: "queries", or
     the features of the image memory ("latents"). "latents" needs an encoder that can recompute keys

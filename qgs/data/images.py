@@ -129,8 +129,10 @@ def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
     file.seek(0)
     depth = load_array(file).squeeze() if plain else np.array(_decoded(file))
     if depth.ndim != 2 or depth.dtype.kind not in "fiu":
-        wanted = "a depth map must have one channel, as 16-bit images have"
-        raise OSError(f"{wanted}, got {depth.dtype} {depth.shape}")
+        raise OSError(
+            "a depth map must have one channel of numbers, as 16-bit images have, got "
+            f"{depth.dtype} of shape {depth.shape}"
+        )
     with np.errstate(over="ignore", invalid="ignore"):
         metric = (depth * unit).astype(np.float32)
     return np.where(np.isfinite(metric), metric, np.float32(0))

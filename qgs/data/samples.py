@@ -190,9 +190,9 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
 
     A point p in this frame is the point reference @ (p / scale) of the scene. With `scale: auto`,
     the point at which all cameras of the scene look gets depth 1. Without such a point (see
-    `look_at_depth`), a warning is logged, and the largest distance from the scene's first camera
-    becomes 1. Raises ValueError if a scale is needed but the cameras are at one point, and for
-    `scale: search`, which needs a model.
+    `look_at_depth`), a warning is logged, and the distance from the scene's first camera to the
+    farthest camera becomes 1. Raises ValueError if a scale is needed but the cameras are at one
+    point, and for `scale: search`, which needs a model.
     """
     if views.scale == "search":
         raise ValueError(
@@ -263,8 +263,8 @@ def collate(samples: Sequence[Sample]) -> Batch:
 def stack_views(views: Sequence[Views]) -> Views:
     """Join views (b, V) on the CPU along the first axis, to (B, V) with B the sum of all b.
 
-    If only some of them have masks or depths, the others get masks of 1 and depths of 0 (unknown).
-    Raises ValueError if only some have times.
+    If only some views have masks or depths, the others get masks of 1 and depths of 0 (unknown).
+    Raises ValueError if only some views have times.
     """
     others: list[dict[str, Any]] = [
         {"cameras": v.cameras, "times": v.times, "target_time": v.target_time} for v in views

@@ -90,9 +90,9 @@ def refuse_too_many(frames: int, scene: Scene) -> None:
 
 
 def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
-    """Return one frame of each moment in `chosen`: frame c of the moment, with c from `cameras`.
+    """Return one frame of each group of frames in `chosen`.
 
-    The numbers in `cameras` are used in turn, modulo the number of frames.
+    For group i it is number cameras[i], modulo the size of the group. `cameras` is cycled.
     """
     turns = zip(chosen, cycle(cameras), strict=False)
     return tuple(moment[camera % len(moment)] for moment, camera in turns)

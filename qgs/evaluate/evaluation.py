@@ -169,10 +169,10 @@ def _name(metric: str, key: str) -> str:
 
 @dataclass
 class _Scorer:
-    """Scorer of samples, which records facts about all scenes on the way.
+    """Scorer of samples.
 
-    seen: measurements of all cameras so far. gaussians: largest number of Gaussians per scene so
-        far.
+    seen: measurements of the cameras of all samples scored so far. gaussians: largest number of
+        Gaussians in a scene so far.
     """
 
     model: QueryGaussianModel
@@ -235,5 +235,5 @@ class _Scorer:
         values["gaussians_used"] = float((gaussians.opacities > OPACITY_USED).sum())
         # One NaN would spoil every mean over scenes.
         if broken := [name for name, value in values.items() if not math.isfinite(value)]:
-            raise ValueError(f"{', '.join(broken)} is not finite")
+            raise ValueError(f"the score {', '.join(broken)} is not finite (NaN or infinite)")
         return values

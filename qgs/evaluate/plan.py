@@ -20,7 +20,7 @@ FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field
 class IndexEntry(BaseModel):
     """Frames of one scene in an index file, as positions in the scene's list of frames.
 
-    Other keys in the file are ignored.
+    Other keys of a scene are ignored.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -187,7 +187,7 @@ def _named(scene: Scene, index: EvaluationIndex) -> Window:
     if scene.missing:
         raise ValueError(
             f"{len(scene.missing)} images of the scene do not exist, so the frame numbers in the "
-            f"evaluation index would mean other frames: {listed(scene.missing, 3)}"
+            f"evaluation index would mean other frames. Restore {listed(scene.missing, 3)}"
         )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:

@@ -27,9 +27,9 @@ METHODS = ("model", *BASELINES)
 class SceneScore:
     """Scores of one scene.
 
-    views: input and target frames of each sample. values: means over the samples by METHOD_METRIC,
-        such as "model_psnr", and "gaussians_used". A value is absent if the method or the scene
-        lacks an input of the metric. names: names of photos by frame number.
+    views: input and target frames of each sample. values: means over the samples by name, which is
+        "gaussians_used" or METHOD_METRIC, such as "model_psnr". A value is absent if the method or
+        the scene lacks an input of the metric. names: names of photos by frame number.
     """
 
     scene: str
@@ -71,7 +71,7 @@ class Evaluation:
     def mean(self, value: str) -> float | None:
         """Return the mean of a value over the scenes that have it; None if no scene has it.
 
-        value: METHOD_METRIC, such as "model_psnr", or "gaussians_used".
+        value: name of the value, "gaussians_used" or METHOD_METRIC such as "model_psnr".
         """
         found = self._values(value)
         return fmean(found) if found else None

@@ -16,8 +16,8 @@ from qgs.types import Gaussians, Views
 def tuning_settings(tune: str | None) -> list[str]:
     """Return recipe overrides for the value of --tune: "STEPS", "WHAT:STEPS" or "WHAT".
 
-    WHAT is queries or latents. STEPS is 50 by default (TokenGS). None gives no overrides. Raises
-    ValueError for any other text.
+    WHAT is queries or latents, by default that of the recipe. STEPS is 50 by default (TokenGS).
+    None gives no overrides. Raises ValueError for any other text.
     """
     if tune is None:
         return []
@@ -31,7 +31,8 @@ def tuning_settings(tune: str | None) -> list[str]:
 def tuning_loss(recipe: Recipe) -> Photometric:
     """Return the loss that test-time tuning minimises.
 
-    It is the first `qgs/photometric` among the losses of `recipe`, or one with default options.
+    It is the first `qgs/photometric` among the losses of `recipe`, or, without one, a
+    `qgs/photometric` with default options.
     Scheduled weights have their values at the end of training, so that equal protocols mean the
     same loss.
     """

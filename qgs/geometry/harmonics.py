@@ -23,7 +23,7 @@ _C3 = (
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
-    """Evaluate `count` (3, 8 or 15) real spherical harmonics, from degree 1 on, -> (..., count).
+    """Return the first `count` (3, 8, 15) real spherical harmonics from degree 1 on, (..., count).
 
     directions: unit vectors (..., 3).
     """

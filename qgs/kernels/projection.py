@@ -76,7 +76,7 @@ def _four(row):
 
 @kernel
 def _rotation(quat):
-    """Return a quaternion's rotation matrix, the normalised quaternion, and its former norm."""
+    """Return a quaternion's rotation matrix, the quaternion normalised, and its norm before."""
     w, x, y, z = _four(quat)
     norm = max(np.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
     w = w / norm
@@ -110,8 +110,8 @@ def _axis(axis, seen, turned, focal, principal, size, margin):
     """Return x/z of the mean, x/z clamped, and the row of J W R S of an image axis (0: x, 1: y).
 
     For the y axis, x stands for y. seen: mean (x, y, z) in the camera's frame. turned: rows of W R
-    S. margin: part of the image size by which x/z may lie outside of the image before it is
-    clamped.
+    S, symbols of the module. margin: part of the image size by which x/z may lie outside of the
+    image before it is clamped.
     """
     slope = seen[axis] / seen[2]
     low = (-margin * size - principal) / focal

@@ -83,7 +83,7 @@ def _by_depth(splats, top, bottom, width):
 
 @kernel
 def _touching_rows(order, splats, top, bottom, out):
-    """Write those indices of `order` whose splats touch rows [top, bottom) to `out`; count them."""
+    """Write the splats in `order` that touch rows [top, bottom) to `out`; return their number."""
     n = 0
     for i in range(order.shape[0]):
         g = order[i]

@@ -66,8 +66,8 @@ class Visibility(Loss):
 
     class Config(VisibilityOptions):
         infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
-        """Pixel coordinate of points at depth 0 beside the optical axis, with a minus on the left
-        or above. It has no effect if `clamp` is set."""
+        """Pixel coordinate u of a point at depth 0 if its camera-frame x > 0, and minus this for
+        x < 0; likewise v for y. It has no effect if `clamp` is set."""
 
     config: Config
 

@@ -19,7 +19,7 @@ def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
 
 
 def mean_colour(inputs: Views, targets: Cameras) -> Tensor:
-    """Return T images per scene (B, T, 3, H, W), filled with the mean RGB of its input views."""
+    """Return T images per scene (B, T, 3, H, W) with the mean RGB of the scene's input views."""
     colour = inputs.images.mean((1, 3, 4))
     return colour[:, None, :, None, None].expand(-1, targets.shape[1], -1, *targets.size)
 

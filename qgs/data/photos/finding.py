@@ -105,9 +105,9 @@ def found_files(
 def _resolved(
     place: UPath, parts: Sequence[str], indexed: Callable[[UPath], _Index]
 ) -> UPath | None:
-    """Return the file below `place` whose path fits `parts` in spelling; None if there is none.
+    """Return the file below the folder `place` that matches the path `parts`; None without one.
 
-    Raises ValueError if two files fit.
+    Names match by `_spellings`. Raises ValueError if two files match.
     """
     for part in parts:
         index = indexed(place)

@@ -115,7 +115,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
 
 
 def _flat(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return `values` with fl_x, fl_y, cx and cy from its matrix of intrinsics, if it has one."""
+    """Return `values` with fl_x, fl_y, cx, cy from a matrix of intrinsics in `values`, if any."""
     matrix = numbers(next((values[key] for key in _MATRICES if key in values), None))
     if matrix.shape != (3, 3):
         return values
@@ -134,9 +134,9 @@ class _Values(dict[str, Any]):
         self.problems.append(FrameProblem(reason, fix))
 
     def number(self, key: str) -> float | None:
-        """Return the finite number under `key`, or None.
+        """Return the finite number under `key`, or None if it is absent, null or invalid.
 
-        None if the value is absent or null, and if it is invalid, which is added to `problems`.
+        An invalid value is added to `problems`.
         """
         value = self.get(key)
         # Some programs write numbers as text.

@@ -301,7 +301,7 @@ def are_plausible(intrinsics: Intrinsics, size: Size) -> bool:
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
     """Yield a problem if an image of `size` (H, W) is no scaled copy of one of size `listed`.
 
-    None for `listed` is no problem.
+    If `listed` is None, there is no problem.
     """
     if listed is None or _alike(size, listed):
         return

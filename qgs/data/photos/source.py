@@ -62,8 +62,9 @@ class PhotosConfig(SceneSource.Config):
     """Allow listings to name files outside of the folder, by absolute paths or `..`. Links are
     always followed."""
     holdout: int = Field(default=8, ge=0)
-    """Number n: every nth frame, starting at frame n // 2, is held out for evaluation; in scenes of
-    fewer frames, the middle frame. 0 holds out no frame. Splits in the listing take precedence."""
+    """Number n: every nth frame, starting at frame n // 2, is held out for evaluation. In scenes
+    of fewer than n frames it is the middle frame. 0: none is held out. Splits in the listing take
+    precedence."""
     max_frames: int = Field(default=0, ge=0)
     """Number of frames to read from the start of a listing. 0 reads all frames."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -369,8 +370,8 @@ def _quarters(size: Size, frame: PhotoFrame) -> int:
 def _header(path: str, changed: int) -> tuple[Size, int]:
     """Return the stored (H, W) of an image file, and the quarter turns that make it upright.
 
-    For other files, return (1, 1) and 0. changed: time of the last change, part of the key of the
-    cache.
+    For a file that is no image, return (1, 1) and 0. changed: time when the file was last changed,
+    which makes the cache read a changed file again.
     """
     try:
         with open(path, "rb") as file, opened_image(file) as image:
