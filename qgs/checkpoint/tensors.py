@@ -73,7 +73,8 @@ class TensorFile:
             if kind := pickle_kind(self.path):
                 raise CheckpointError(
                     f"{self.path} is {kind}, which can run code when it is read; use the "
-                    "safetensors file of the run, or rename published weights to .pt"
+                    "safetensors file of the run; if these are published weights, rename the file "
+                    "to NAME.pt"
                 ) from error
             raise CheckpointError(
                 f"{self.path} is not a whole safetensors file ({name_shown(str(error))}); it may "

@@ -7,7 +7,9 @@ import typer
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="PLY file of 3DGS, or .splat.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="IN", help="File of Gaussians: 3DGS's PLY, or .splat.")
+    ],
     out: Annotated[
         Path,
         typer.Argument(

@@ -24,7 +24,7 @@ def evaluate(
     overrides: Overrides = None,
     index: Annotated[
         str | None,
-        typer.Option(help="JSON file of scenes and frames to score: the option evaluation.index."),
+        typer.Option(help="JSON file of scenes and frames to score: sets evaluation.index."),
     ] = None,
     tune: Tune = None,
     out: Annotated[

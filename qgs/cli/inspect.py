@@ -50,8 +50,8 @@ def recipes(
 ) -> None:
     """List the recipes that come with qgs, or print one of them.
 
-    All commands accept the names of these recipes. A file of the same name in the working
-    directory is preferred.
+    All commands accept the names of these recipes. If the working directory has a file
+    of the same name as a recipe, commands read the file.
     """
     from qgs.files import refuse_existing, write_text
     from qgs.recipe.files import files_of, recipe_folder

@@ -14,7 +14,7 @@ Checkpoint: TypeAlias = Annotated[
 Overrides: TypeAlias = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", help="Change an option of the recipe: model.queries.count=128. Repeatable."
+        "--set", help="Change an option of the recipe, such as model.queries.count=128. Repeatable."
     ),
 ]
 Threads: TypeAlias = Annotated[
@@ -23,7 +23,8 @@ Threads: TypeAlias = Annotated[
 Device: TypeAlias = Annotated[
     str,
     typer.Option(
-        help="auto, cpu or cuda. auto: cuda if there is a GPU and gsplat is installed, else cpu."
+        help="Device: auto, cpu or cuda. auto is cuda if there is a GPU and gsplat is installed, "
+        "else cpu."
     ),
 ]
 Size: TypeAlias = Annotated[
@@ -39,14 +40,18 @@ Inputs: TypeAlias = Annotated[
 ]
 Frames: TypeAlias = Annotated[
     str | None,
-    typer.Option(help="Input photos by number or file name: 0,8,x.jpg. Default: qgs chooses."),
+    typer.Option(help="Numbers or file names of input photos: 0,8,x.jpg. Default: qgs chooses."),
 ]
 SceneName: TypeAlias = Annotated[
     str | None, typer.Option("--scene", help="Name of the scene to use, if there are several.")
 ]
 ViewsSettings: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change an option of `views`: views.scale=auto. Repeatable."),
+    typer.Option(
+        "--set",
+        help="Change an option in the recipe's section `views`, such as views.scale=auto. "
+        "Repeatable.",
+    ),
 ]
 Scale: TypeAlias = Annotated[
     float | None,
@@ -60,7 +65,7 @@ Tune: TypeAlias = Annotated[
     typer.Option(
         metavar="[WHAT:]STEPS",
         help="Fit the queries to the input photos for STEPS steps before rendering. latents:STEPS "
-        "fits the features of the photos, not the queries. 0: no fitting.",
+        "fits the encoder's features of the photos, not the queries. 0: no fitting.",
     ),
 ]
 

@@ -30,15 +30,16 @@ if TYPE_CHECKING:
 def reconstruct(
     checkpoint: Checkpoint,
     photos: Annotated[
-        str, typer.Argument(help="Folder or URL of photos or a data set; or a video file.")
+        str, typer.Argument(help="Folder of photos or a data set, its URL, or a video file.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for results; or .ply or .splat file.")],
+    out: Annotated[Path, typer.Option(help="Folder for results, or .ply or .splat of Gaussians.")],
     inputs: Inputs = None,
     frames: Frames = None,
     holdout: Annotated[
         str | None,
         typer.Option(
-            help="Photos to score, or `none`. Default: held-out photos (every 8th) near inputs."
+            help="Photos to score besides the inputs, by number or file name, or `none`. Default: "
+            "held-out photos (usually every 8th) near the inputs."
         ),
     ] = None,
     tune: Tune = None,
@@ -105,7 +106,7 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
 
 
 def show(result: Reconstruction, console: Console) -> None:
-    """Print the PSNR of all views and of the baselines, means by kind of view, and remarks."""
+    """Print the PSNR of model and baselines in each view, means by kind of view, and remarks."""
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
     from qgs.reconstruction.result import KINDS

@@ -49,8 +49,8 @@ class ComponentConfig(BaseModel):
 class FieldSpec:
     """Description of a named tensor that one component writes and later components read.
 
-    shape: sizes of all axes but the first two, which are scene and item, such as query or token. A
-        str is a symbolic size, such as "D".
+    shape: sizes of all axes but the first two, which are scenes and queries (or tokens). A str
+        is a symbolic size, such as "D".
     frame: the coordinate frame of the tensor's numbers, "none", "world" or "camera".
     encoding: a name for the meaning of numbers that could be read in several ways. The writing and
         the reading component must use the same name.
@@ -150,8 +150,8 @@ class Component(metaclass=ABCMeta):
     must read them from `self.config` in every call, and nowhere else."""
 
     schedules: Mapping[str, Any] = MappingProxyType({})
-    """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name of the option.
-    `config` holds the values of these options after `followed` training steps."""
+    """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name of the option. The
+    attribute `followed` is the training step whose values of these options `config` holds."""
     followed: int = 0
 
     class Config(ComponentConfig):

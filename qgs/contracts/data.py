@@ -182,7 +182,7 @@ class ViewSampler(Component):
         """
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
-        """Return the input and target frames of each window that evaluation scores in a scene.
+        """Return the windows of a scene that evaluation scores: pairs of input and target frames.
 
         The default is an empty list: evaluation then makes windows around held-out frames, or calls
         `draw` if there are no held-out frames.

@@ -160,7 +160,7 @@ class Feedback(ModelComponent):
 
     A round renders the last layer's Gaussians from the cameras of the input photos, without
     gradients. Then it runs the last `layers` decoder layers again, which update the state once
-    more. The memory is the one that the first of these layers read in the first pass.
+    more. They start from the image memory that the first of them read in the first pass.
 
     layers: number of decoder layers that run again in each round.
     rounds: number of rounds in an evaluation; it may be changed on a built model.

@@ -31,7 +31,7 @@ def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> T
 def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
     """Return the rays of each part of images that are divided into rows x columns parts.
 
-    The rays are (B, V * rows * columns, 4, 3), encoded as PIXEL_ENCODING says.
+    Result (B, V * rows * columns, 4, 3): origin, corner direction, steps across and down a part.
     """
     height, width = cameras.size
     c2w = cameras.c2w

@@ -66,7 +66,7 @@ class WorldsConfig(DrawnConfig):
 
     @cached_property
     def of_rooms(self) -> RoomsConfig:
-        """Options of those scenes that are furnished rooms, from the source `rooms/procedural`."""
+        """Options of the source `rooms/procedural`, for the scenes that are furnished rooms."""
         alike = self.model_dump(include={"image_size", *DrawnConfig.model_fields})
         return RoomsConfig(**alike)
 

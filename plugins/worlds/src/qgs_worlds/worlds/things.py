@@ -206,7 +206,7 @@ class Things:
 
 
 def lowest(thing: Thing) -> float:
-    """Return a number below the z of all points of an object, but close to their least z."""
+    """Return a close lower bound of the z of all points of an object."""
     return min(shape.body.center[2] - shape.body.reach() for shape in thing)
 
 

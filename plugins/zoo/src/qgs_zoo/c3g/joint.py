@@ -63,7 +63,7 @@ class JointLayer(DecoderLayer):
         return state.replace(features=queries_BND), memory.replace(features=tokens_BMD)
 
     def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:
-        """Return attention (B, T, D) of each token to all tokens except masked queries.
+        """Return attention (B, T, D) of all T tokens to image tokens and unmasked queries.
 
         The result is softmax(q k / sqrt(d)) v after a linear layer.
         """

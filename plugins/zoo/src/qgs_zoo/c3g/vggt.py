@@ -1,9 +1,9 @@
 """`c3g/vggt_features`: image tokens of VGGT, with code and weights that the user installs.
 
-Code and weights have their own licences, so this package neither contains nor downloads them. It
-assumes that `vggt.models.aggregator.Aggregator()` takes images (B, V, 3, H, W). The aggregator must
-return a list with one tensor for each layer, P tokens of each view (B, V, P, 2048), and the index
-of the first patch token.
+Code and weights have their own licences, so this package neither contains nor downloads them. The
+module `vggt.models.aggregator.Aggregator()` must take images (B, V, 3, H, W) and return two things:
+a list of tensors (B, V, P, 2048), one for each layer, with the P tokens of each view; and the index
+of the first of these tokens that belongs to a patch.
 """
 
 from collections.abc import Mapping

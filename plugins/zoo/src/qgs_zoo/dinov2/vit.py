@@ -140,7 +140,7 @@ class DinoV2(nn.Module):
         return found
 
     def positions(self, rows: int, columns: int) -> Tensor:
-        """Return position embeddings (1, 1 + rows * columns, C): class token, then a grid."""
+        """Return position embeddings (1, 1 + rows * columns, C) of class token, then patches."""
         if rows == columns == GRID:
             return self.pos_embed
         # The class token has its own embedding, which is not a place.

@@ -105,7 +105,7 @@ class MergingHead(Head):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the field of harmonics that the head writes, or no field if `sh_degree` is 0."""
+        """Return the field of spherical harmonics; empty if `sh_degree` is 0."""
         sh = "gaussians.sh"
         return {sh: GAUSSIAN_FIELDS[sh]} if config.sh_degree else {}
 

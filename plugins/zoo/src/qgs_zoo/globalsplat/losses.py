@@ -137,7 +137,7 @@ class TwoPasses(Objective):
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Report fewer than three input views, with which both passes would be the same."""
+        """Report fewer than three input views, because both passes would read the same views."""
         if context.inputs is not None and context.inputs < LEAST_VIEWS:
             reason = (
                 f"it needs at least {LEAST_VIEWS} input views, got {context.inputs}: both passes "
@@ -170,8 +170,8 @@ class TwoPasses(Objective):
 def subset(count: int, part: int) -> list[int]:
     """Return indices of the first view, the last one, and every second view between them.
 
-    count: number of views. part: 0 takes the second view, the fourth and so on, 1 the third, the
-    fifth and so on.
+    count: number of views. part: 0 takes the second, fourth, ... view; 1 takes the third, fifth,
+    ... view.
     """
     return [0, *range(1 + part, count - 1, 2), count - 1]
 

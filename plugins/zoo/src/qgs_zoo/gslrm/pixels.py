@@ -129,11 +129,11 @@ class PixelQueries(Queries):
 
 @full_precision
 def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return world-frame origins (B, N, 1, 3) and directions (B, N, K, 3) of K = `count` rays.
+    """Return origins (B, N, 1, 3) and directions (B, N, K, 3) of K = `count` rays per patch.
 
-    Directions have z = 1 in the frame of their camera. The K rays of a patch go through the centres
-    of a grid of K equal cells, row by row. Cells are as nearly square as K allows. If K is the
-    number of pixels of the patch, its cells are the pixels.
+    Both are in the world frame; directions have z = 1 in the frame of their camera. The rays of a
+    patch go through the centres of a grid of K equal cells, row by row. Cells are as nearly square
+    as K allows. If K is the number of pixels of the patch, its cells are the pixels.
     """
     origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
     index_K = torch.arange(count, device=patch_BN43.device)

@@ -64,7 +64,7 @@ class PerceptualDistance(nn.Module):
         return total
 
     def _features(self, images: Tensor) -> list[Tensor]:
-        """Return the outputs of VGG-16's blocks, with each pixel normalised to length 1."""
+        """Return the features of VGG-16's blocks, with length 1 at each pixel."""
         x = images * 2 - 1
         shift, scale = (x.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
         x = (x - shift) / scale

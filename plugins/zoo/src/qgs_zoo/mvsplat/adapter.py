@@ -30,7 +30,7 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
 
     The functions of each degree l are in e3nn's order: m from -l to l, with y as the polar axis and
     azimuth from z to x. So degree 1 is (x, y, z). All functions are orthonormal up to one common
-    factor. K: their number.
+    factor. K: number of functions.
     """
     x, y, z = directions.unbind(-1)
     # cos and sin of m times the azimuth, by angle addition, without computing an angle.
@@ -58,9 +58,9 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
 
 
 def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return 64 directions, the pseudo-inverse of harmonics at them, and a change of basis.
+    """Return 64 directions, the pseudo-inverse of their e3nn harmonics, and a change of basis.
 
-    The change of basis is a matrix from coefficients of e3nn's harmonics to those of qgs's.
+    The change of basis is a matrix from coefficients in e3nn's basis to coefficients in qgs's.
     """
     generator = torch.Generator().manual_seed(0)
     double = {"dtype": torch.float64, "device": "cpu"}
@@ -92,7 +92,7 @@ def _fixed(degree: int, device: torch.device) -> tuple[Tensor, ...]:
 
 @full_precision
 def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
-    """Return the Wigner matrices (..., K, K) of rotations (..., 3, 3) in e3nn's basis.
+    """Return Wigner matrices (..., K, K) of rotations (..., 3, 3) for K harmonics of e3nn.
 
     The matrices map the coefficients of a function on the sphere to the coefficients of the rotated
     function. They are an exact fit, in float64, to values in 64 directions. The released code uses
@@ -116,7 +116,7 @@ def band_mask(degree: int, like: Tensor) -> Tensor:
 
 @full_precision
 def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
-    """Return matrices (..., K, K) from raw coefficients to coefficients in qgs's world frame.
+    """Return matrices (..., K, K) from raw to world-frame coefficients of K harmonics.
 
     Raw coefficients are in a camera's frame. rotation: camera to world (..., 3, 3). Degrees above
     SH_DEGREE stay in e3nn's basis. The matrix first rotates in e3nn's basis, then changes the

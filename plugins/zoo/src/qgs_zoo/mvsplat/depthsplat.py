@@ -90,7 +90,7 @@ class DepthSplatConfig(ComponentConfig):
         return blocks
 
     def level(self, scale: int) -> int:
-        """Return the level of a sweep's cost volume.
+        """Return the level of the cost volume in sweep `scale`, which is 0 for the first sweep.
 
         Level 0, 1 or 2 means 1/2, 1/4 or 1/8 of the image size.
         """
@@ -291,7 +291,7 @@ class DepthPredictor(nn.Module):
     def beside(
         self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None
     ) -> list[tuple[list[Tensor], list[Tensor]]]:
-        """Return the maps that a DPT head concatenates with the ViT's, at 1/2, 1/4 and 1/8 size.
+        """Return maps that a DPT head concatenates with the ViT's maps, at 1/2, 1/4 and 1/8 size.
 
         Each size has two lists: maps to put before the ViT's channels, and maps to put after them.
         """

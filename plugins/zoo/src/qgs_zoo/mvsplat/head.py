@@ -45,7 +45,7 @@ class PixelHead(Head):
         """Return scales (B, N, 1, 3) in world units, from raw scales and logarithms of depths."""
 
     def opacities(self, p: Tensor) -> Tensor:
-        """Return the opacities of Gaussians. p: sigmoids of their logits."""
+        """Return the opacities of Gaussians. p: sigmoids of raw opacities."""
         return p
 
     @property
@@ -92,8 +92,8 @@ class RayHead(PixelHead):
         """Largest scale of a Gaussian. The unit is 0.1 times the sum of width and height of a pixel
         at the Gaussian's depth."""
         opacity_exponent: float = Field(default=0.0, ge=-10, le=10)
-        """Base-2 logarithm of the exponent e in the formula of opacities. 0 gives the sigmoids of
-        the logits (published)."""
+        """Base-2 logarithm of e in the opacity (1 - (1 - p)^e + p^(1 / e)) / 2, with p the sigmoid
+        of the logit. 0 gives p (published)."""
 
     config: Config
 
@@ -140,7 +140,7 @@ def harmonics_of(features_BND: Tensor) -> Tensor:
 
 
 def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
-    """Return opacities (1 - (1 - p)^e + p^(1 / e)) / 2, with e = 2^exponent. Exponent 0 gives p."""
+    """Return opacities (1 - (1 - p)^e + p^(1 / e)) / 2 from sigmoids p, with e = 2^exponent."""
     if exponent == 0:
         return p
     # The mean of two curves, which is p for an exponent of 0 (published weights). The released code

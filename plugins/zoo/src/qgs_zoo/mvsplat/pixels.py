@@ -108,7 +108,7 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
 
 
 def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
-    """Return the state fields PIXEL_FIELDS of images of rows x columns pixels.
+    """Return the fields PIXEL_FIELDS of queries, for images of rows x columns pixels.
 
     Each field is (B, V * rows * columns, ...): rays of a pixel, or the rotation of its camera.
     """

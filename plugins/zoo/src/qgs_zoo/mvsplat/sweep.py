@@ -141,7 +141,7 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlate features of N views with samples of other views, in parts: (N, D, h, w)."""
+    """Correlate features of N views with samples of other views at D depths: (N, D, h, w)."""
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
@@ -211,9 +211,9 @@ class DepthRange(ComponentConfig):
 
 
 class SweepEncoder(Encoder):
-    """Base of encoders that predict depths by a plane sweep, with a token for each pixel.
+    """Base of encoders that predict depths by a plane sweep.
 
-    A token may stand for a square of pixels.
+    They make a token for each pixel, or for each square of pixels.
     """
 
     # Views are matched in their order. With three or more, the mask of shifted windows depends on
@@ -226,14 +226,14 @@ class SweepEncoder(Encoder):
     @classmethod
     @abstractmethod
     def multiple(cls, config: DepthRange) -> int:
-        """Return a number of pixels, of which the sides of images must be multiples.
+        """Return the number of pixels of which height and width of images must be multiples.
 
         The windows of the transformer and the levels of the U-Nets require this.
         """
 
     @abstractmethod
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        """Return C numbers of each pixel (B, V, C, H, W). near, far: depth bounds, world units."""
+        """Predict log depth and raw Gaussian per pixel (B, V, C, H, W). near, far: world units."""
 
     @classmethod
     def problems(cls, config: DepthRange, context: RecipeContext) -> Iterable[Problem]:

@@ -29,7 +29,7 @@ def two_convolutions(
 
 
 def zeroed(module: nn.Module) -> nn.Module:
-    """Set all parameters of `module` to zero, so that its first output is zero, and return it."""
+    """Return `module` with all parameters set to zero, so that it returns 0 before training."""
     for parameter in module.parameters():
         nn.init.zeros_(parameter)
     return module
@@ -95,7 +95,7 @@ class ViewAttention(nn.Module):
         zeroed(self.proj_out if pre_norm else self.norm)
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
-        """Return maps (B V, C, H, W). Each attends to all V = `views` maps of its scene."""
+        """Return maps (B V, C, H, W). Each map attends to all V = `views` maps of its scene."""
         x_NCT = x_NCHW.flatten(2)
         raw_NCT = self.qkv(self.norm(x_NCT) if self.pre_norm else x_NCT)
         # Rows of `qkv` are ordered head by head: q, k, v of the first head, then of the second ...

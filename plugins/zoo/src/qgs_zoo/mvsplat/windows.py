@@ -114,7 +114,7 @@ class Attention(nn.Module):
         neighbours_BVJ: Tensor | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """Return x (B, V, 4, L, C) after attention to windows of `source`.
+        """Return x (B, V, 4, L, C), 4 windows of L pixels, after attention to those of `source`.
 
         neighbours: indices (B, V, J) of the J views whose windows each view reads. None makes each
         view read its own windows.
@@ -140,7 +140,7 @@ class Attention(nn.Module):
 def _of_neighbours(x_BVWLC: Tensor, neighbours_BVJ: Tensor) -> Tensor:
     """Return the windows of each view's J neighbours (B, V, 4, L J, C).
 
-    Pixels are ordered by their position in the window, then by neighbour.
+    Pixels are ordered by position in the window, then by neighbour. L: pixels of a window.
     """
     scenes = torch.arange(len(x_BVWLC), device=x_BVWLC.device)[:, None, None]
     return rearrange(x_BVWLC[scenes, neighbours_BVJ], "n v j w l c -> n v w (l j) c")
