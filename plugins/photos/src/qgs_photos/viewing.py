@@ -1,4 +1,4 @@
-"""Show a file of Gaussians as other viewers do, after a move into a world for the renderer."""
+"""Render Gaussians as common viewers show them, and move them between world frames."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians
 
 VIEWER = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0), far=1e4))
-"""Renderer over black, however far Gaussians are, as in most viewers."""
+"""Renderer with a black background and a distant far plane, as in most viewers."""
 
 
 def in_own_world(world: tuple[Tensor, Tensor], gaussians: Gaussians) -> Gaussians:

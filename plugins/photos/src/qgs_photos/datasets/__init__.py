@@ -1,4 +1,4 @@
-"""Readers of data sets (chunks of pixelSplat, DL3DV, camera files) and samplers of views."""
+"""Readers of data sets (pixelSplat's chunks, DL3DV, camera files) and samplers of views."""
 
 from qgs.contracts import Plugin
 from qgs_photos.datasets.chunks import ChunksSource

@@ -85,7 +85,7 @@ class Record:
 
     @cached_property
     def image_sizes(self) -> list[Size]:
-        """(H, W) of every image in the chunk's list; without a list, all have the first's size."""
+        """(H, W) of every image, from the chunk's list; without a list, that of the first image."""
         if self.sizes is not None:
             return [(int(height), int(width)) for height, width in self.sizes.tolist()]
         return [self.stored_size(0)] * len(self)

@@ -268,7 +268,7 @@ def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Findi
 
 
 def frames_above(values: Pairs, limit: float) -> dict[int, float]:
-    """Return the frames whose pairs all have values above `limit`, each with its least value.
+    """Return frames whose pairs all have values above `limit`, each with the least such value.
 
     Frames in fewer than two pairs are left out. The worst frame is found first and its pairs are
     removed, so that they do not count against the frames paired with the worst one.

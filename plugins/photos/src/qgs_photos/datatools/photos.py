@@ -178,5 +178,5 @@ def _is_black(image: Image.Image) -> bool:
 
 
 def error_text(error: Exception) -> str:
-    """Return an exception's message; its type precedes it except for read errors."""
+    """Return an exception's message, preceded by its type unless a file could not be read."""
     return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)

@@ -123,7 +123,7 @@ def cameras_of(
 
 
 def _film_size(photos: tuple[int, int]) -> tuple[int, int]:
-    """Return (H, W) of a video of `photos` (H, W): even, as H.264 needs, and at least _HEIGHT."""
+    """Return even (H, W) of a video of `photos` (H, W); the shorter side is at least _HEIGHT."""
     factor = max(_HEIGHT / min(photos), 1.0)
     height, width = (round(side * factor / 2) * 2 for side in photos)
     return height, width

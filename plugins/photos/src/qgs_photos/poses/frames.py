@@ -176,7 +176,7 @@ def _opened(video: Path) -> Any:
 def _times(video: Path) -> tuple[list[Fraction], float, bool]:
     """Return frame times of a video in seconds, its pixel aspect, and whether it is damaged.
 
-    Times ascend. The pixel aspect is width over height. Packets are read, but not decoded.
+    Times ascend. The pixel aspect is a pixel's width over its height. Packets are not decoded.
     """
     times = list[Fraction]()
     broken = False

@@ -1,4 +1,4 @@
-"""Add Gaussians during the optimisation: split opaque ones, and turn dead ones into copies of them.
+"""Add copies of opaque Gaussians during the optimisation; replace nearly transparent Gaussians.
 
 Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024). The paper adds
 noise to positions. Here a copy is displaced by a fraction of its parent's size, so that copy and
@@ -84,8 +84,8 @@ class FreeGaussians:
 
         Parents are sampled with probabilities proportional to opacity. Parent and copies become
         smaller and more transparent, so that together they render like the parent before. The Adam
-        moments of parent and copies restart at 0. If all opacities are below DEAD, no Gaussian
-        counts as dead.
+        moments of parent and copies restart at 0. A Gaussian is dead if its
+        opacity is below DEAD; if all opacities are, none is dead.
         """
         opacities = self.values["opacity_logits"].sigmoid()
         faint = (opacities < DEAD) & (opacities >= DEAD).any()

@@ -37,7 +37,7 @@ _FIXED = struct.Struct("<Q3d3BdQ")
 
 @dataclass(frozen=True)
 class Initialisation:
-    """Start of the optimisation: a model's Gaussians, or only a world to place Gaussians in.
+    """Start of the optimisation: a model's Gaussians, or only the world frame of future Gaussians.
 
     model: name of the model, or "none". world: reference pose (4, 4) and scale of the world of the
     Gaussians, see `own_world`. gaussians: (1, G) of the model; None if Gaussians are to be placed
@@ -54,9 +54,9 @@ class Initialisation:
 def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisation:
     """Choose between a model and the photos alone as the start; if a model is chosen, run it.
 
-    Without --model, --frames and --scale, the photos alone are used if there are at least ENOUGH
-    photos. Raises ValueError for --frames or --scale with --model none, and if a model is needed
-    but none is installed.
+    Without --model, --frames and --scale, at least ENOUGH photos are used alone; with fewer photos,
+    a model is used. Raises ValueError for --frames or --scale with --model none, and if a model is
+    needed but none is installed.
     """
     of_model = options.frames is not None or options.scale is not None
     if options.model == NONE and of_model:

@@ -107,7 +107,7 @@ def refine(
     """Optimise `gaussians` (1, G) on the photos `views` (1, V) of their scene.
 
     The optimisation starts from the most opaque of the given Gaussians, and from new Gaussians at
-    pixels, at the depth on which photos agree. The world may have any unit. The first Ctrl-C
+    pixels, at the depth on which photos agree. Positions may have any unit. The first Ctrl-C
     finishes the step and returns the result so far.
 
     seconds: time of the optimisation, without the first step, in which kernels compile. count:

@@ -58,7 +58,7 @@ class Result:
         return moved(gaussians, reference, 1 / float(scale))
 
     def read_back(self, file: Path) -> "Result":
-        """Return a copy with the Gaussians that `file` holds, so that the scores are the file's."""
+        """Return a copy of this result with the Gaussians in `file`, so as to score the file."""
         gaussians = in_own_world(self.world, load_ply(file).to(self.world[0].device))
         return replace(self, refined=replace(self.refined, gaussians=gaussians))
 

@@ -104,7 +104,7 @@ def faults_of_given_poses(photos: ScenePhotos) -> Sequence[Finding]:
 
 
 def with_start(options: Options, start: Initialisation) -> Options:
-    """Return `options` with the model, frames and scale that lead to the same `start` again."""
+    """Return `options` with the model, input frames and scale that were used for `start`."""
     scale = float(start.world[1]) if start.frames else None
     return replace(options, model=start.model, frames=start.frames, scale=scale)
 
@@ -121,7 +121,7 @@ def masked(views: Views) -> Views:
 
 
 def timed_sweep(views: Views) -> tuple[Gaussians, float]:
-    """Return TIMED Gaussians (1, G) at pixels of photos (1, V), and the seconds per Gaussian."""
+    """Return Gaussians (1, TIMED) at pixels of photos (1, V), and the seconds for each."""
     began = perf_counter()
     found = swept(views, TIMED, 1.0, torch.Generator().manual_seed(0))
     return found, (perf_counter() - began) / found.count

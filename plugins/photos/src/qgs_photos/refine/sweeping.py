@@ -88,7 +88,7 @@ def pixel_rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> T
 
 
 def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float) -> Tensor:
-    """Return the depths (n,) of pixels of one photo, chosen among depths around `size`.
+    """Return depths (n,) of pixels of one photo, chosen around the scene's distance `size`.
 
     Each pixel gets the depth at which its colours differ least from those in other photos.
     """

@@ -13,7 +13,7 @@ InputViews: TypeAlias = Annotated[
     int | None, typer.Option(min=1, help="Number of input photos. Default: that of the recipe.")
 ]
 Memory: TypeAlias = Annotated[
-    bool, typer.Option("--memory", help="Also measure peak memory, each in a new process.")
+    bool, typer.Option("--memory", help="Measure peak memory too, each time in a new process.")
 ]
 Report: TypeAlias = Annotated[
     Path | None, typer.Option(metavar="FILE", help="New file for a JSON report with all times.")

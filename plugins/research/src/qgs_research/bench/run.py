@@ -43,8 +43,8 @@ def measure_recipes(
     All models are in memory at once, because each round runs all of them.
 
     Args:
-        names: recipes, as for `resolve`.
-        work: fields of the workload, as for `workload_of`.
+        names: names or files of recipes, see `resolve`.
+        work: arguments of `workload_of` by name, apart from the recipe.
         step, memory, renderer: True also measures training steps, peak memory or rendering.
         rounds: number of measured calls of each operation, after `warmup` unmeasured calls.
         overrides: options to set in all recipes.

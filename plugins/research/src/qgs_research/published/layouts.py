@@ -73,8 +73,8 @@ def names_of(recipe: Recipe) -> Names:
             return _names_in(recipe, layout)
         reasons += [f"\n  {layout.name}: {line}" for line in found]
     raise PublishedError(
-        "the model of this recipe fits no published layout, use a recipe with the components of "
-        "one:" + "".join(reasons)
+        "the model of this recipe fits no published layout; use a recipe with the components of "
+        "one layout" + "".join(reasons)
     )
 
 

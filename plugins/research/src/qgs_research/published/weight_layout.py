@@ -100,7 +100,7 @@ def size_at(shapes: Shapes, name: str, axis: int) -> int:
 
 
 def whole_ratio(size: int, unit: int, what: str) -> int:
-    """Return size / unit. Raises LayoutError about `what` if the ratio is not an integer."""
+    """Return size / unit; raise LayoutError if it is no integer. what: name of `size`."""
     if unit < 1 or size % unit or not size:
         raise LayoutError(f"{what}: {size} must be a multiple of {unit}, and not 0")
     return size // unit
@@ -109,7 +109,7 @@ def whole_ratio(size: int, unit: int, what: str) -> int:
 def real_ratio(size: int, unit: int, what: str) -> float:
     """Return a ratio such that int(ratio * unit) equals `size`.
 
-    Raises LayoutError about `what` if `size` or `unit` is 0.
+    what: name of `size`, for messages. Raises LayoutError if `size` or `unit` is 0.
     """
     if unit < 1 or not size:
         raise LayoutError(f"{what}: {size} and {unit} have no ratio, since one of them is 0")

@@ -142,7 +142,7 @@ def _notes(scores: Scores) -> Iterator[str]:
 def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
     """Return runs and scenes, by reason, that the difference from the reference leaves out.
 
-    name: model of the difference.
+    name: the model that is compared with the reference.
     """
     runs = scores.stored[name, MAIN]
     reference = scores.stored[scores.reference, MAIN]

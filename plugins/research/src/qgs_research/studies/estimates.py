@@ -30,8 +30,8 @@ class Estimate:
     """Mean score over seeds and scenes, or a weighted sum of such means.
 
     values: scores (S, C) of S seeds and C scenes. interval: confidence interval of the mean; None
-    for one scene. For one seed, the interval covers only the choice of scenes, not that of the
-    training.
+    for one scene. For one seed, the interval covers only variation between scenes, not
+    between trainings.
     """
 
     seeds: Sequence[int]
