@@ -28,7 +28,7 @@ def _scrambled(i, j, seed):
 
 @kernel
 def _curve(gamma):
-    """Return the tone curve as a table: entry i is for light whose square root is i * _STEP."""
+    """Return the tone curve as a table: entry i is the output for a light of (i * _STEP)^2."""
     table = np.empty(_ENTRIES)
     for i in range(_ENTRIES):
         value = (i * _STEP) ** (2.0 / gamma)
@@ -62,9 +62,9 @@ def _develop(image, light, gains, gamma, vignette, grain, seed, frame):
 class Effects(NamedTuple):
     """Camera effects that turn linear light into a photo.
 
-    gains: factors (3,) of the light in R, G and B. gamma: exponent of the tone curve. vignette:
-    share of light lost at the corners. noise: standard deviation as a share of full brightness.
-    seed: seed of the noise. quality: JPEG quality; 0 for no JPEG compression.
+    gains: factors (3,) of the light in R, G and B. gamma: the tone curve raises light to the
+    power 1 / gamma. vignette: share of light lost at the corners. noise: standard deviation as a
+    share of full brightness. seed: seed of the noise. quality: JPEG quality; 0 for no compression.
     """
 
     gains: np.ndarray

@@ -107,7 +107,7 @@ def _on_round(body, part, p):
     """Return the normal and four texture coordinates of a point on a ball or a cylinder.
 
     p: point in the shape's frame. part: 1 for a cap of the cylinder, 0 for any other point. The
-    coordinates are those of `_surface`.
+    first two coordinates are in metres; the last two run from -1 to 1 across the surface.
     """
     x, y, z = p
     radius = float(body.extent[0])
@@ -207,8 +207,8 @@ def _light(room, code, place, normal):
 def _gather(t, code, i, j, own, samples, top, o, rays, points):
     """Write the points where a pixel's rays hit the face `own` to `points`; return their number n.
 
-    Rows 1 to n of `points` are the hits, row 0 is their mean. These rays are marked as TAKEN in
-    `code`.
+    Rows 1 to n of `points` are the hits, row 0 is their mean. In `code`, which has the face of each
+    ray, these rays are marked as TAKEN.
     """
     n = 0
     step = 1.0 / samples
@@ -265,9 +265,9 @@ def _shade(room, code, points, n, footprint):
 def paint_room(image, t, code, top, samples, room, c2w, rays):
     """Colour a band of image rows, `image` (rows, W, 3) uint8. This overwrites `code`.
 
-    t, code, rays: results of `trace` for the band. top: number of the band's first row in the whole
-    image. Rays of a pixel that hit the same face share one computation of light; if the texture has
-    no sharp edges, they share its colour too.
+    t, code, rays: depths, face codes and ray basis of the band from `trace`. top: number of the
+    band's first row in the image. Rays of a pixel that hit the same face share one computation of
+    light; if the texture has no sharp edges, they share its colour too.
     """
     eye = triple(c2w[:, 3])
     points = np.empty((samples * samples + 1, 3))

@@ -52,7 +52,7 @@ def slab(o, inverse, h):
 
 @inner
 def nearest(o, d):
-    """Return the point of a ray that is nearest to the origin, and the t of this point."""
+    """Return the point of a ray that is nearest to the origin, and its t along the ray."""
     t = -dot(o, d) / dot(d, d)
     return along(o, t, d), t
 
@@ -71,7 +71,7 @@ def ellipsoid(o, d):
 
 @inner
 def ball(o, d, radius):
-    """Return the interval of a ray in a sphere around the origin, with inf as exit t."""
+    """Return the interval of a ray in a sphere around the origin; its exit t is always inf."""
     inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
     x, y, z = along(o, middle, d)
@@ -142,7 +142,7 @@ def interior(o, d, h):
 def _shaft(o, d, radius, half):
     """Return the t at which a ray enters and leaves an upright cylinder around the z axis.
 
-    The third and fourth number are the t at which the ray crosses the planes of the two caps.
+    Returns four t: entry, exit, first and second crossing of the planes of the caps.
     """
     low, high = slab(o[2], reciprocal(d[2]), half)
     inverse = reciprocal(d[0] * d[0] + d[1] * d[1])
@@ -221,7 +221,7 @@ def frustum(o, d, top):
 
 @inner
 def torus(o, d, thickness, start):
-    """Return an interval with the first hit of a torus from t = `start` on, as entry and exit.
+    """Return an interval whose entry and exit are both the first hit of a torus at t >= `start`.
 
     The torus lies in the xy plane and has outer radius 1. The search uses sphere tracing, because
     the roots of the quartic equation miss thin rings in float32.
@@ -300,7 +300,7 @@ def _surface_between(heights, o, d, t, above, line, below):
 
 @inner
 def relief(o, d, heights, start):
-    """Return an interval with the first hit of a height map from t = `start` on, as entry and exit.
+    """Return an interval whose entry and exit are the first hit of a height map at t >= `start`.
 
     The map bounds a solid: the part of the cube [-1, 1]^3 below the map. Face 0 is the top of the
     solid, face 1 a side.
@@ -331,8 +331,8 @@ def less(near, far, entry, cut_near, cut_far, cut_leave):
     """Return the t at which a ray enters a body from which a cut is removed, and the face there.
 
     near, far, entry: entry t, exit t and entry face of the body. cut_near, cut_far, cut_leave:
-    entry t, exit t and exit face of the cut. The wall of the cut has the numbers of the cut's faces
-    plus 3. A ray that misses has t = inf.
+    entry t, exit t and exit face of the cut. Each face of the cut's wall has the number of
+    the cut's face plus 3. A ray that misses has t = inf.
     """
     outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
     # a ray that starts in the cut, or enters through it, hits the wall of the cut

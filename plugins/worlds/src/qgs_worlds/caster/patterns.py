@@ -71,9 +71,9 @@ def _planks(x, y, seed, fade):
 
 @inner
 def _picture(p, q, seed):
-    """Return colour weights (m, n), see `mixture`, of a painted landscape at (p, q) in [-1, 1].
+    """Return the weights (m, n) that mix three colours to a painted landscape at (p, q).
 
-    The picture shows hills under a sky with a sun.
+    It shows hills under a sky with a sun. p, q: in [-1, 1]. For m and n, see `mixture`.
     """
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
     # hills farther off are higher and paler
@@ -91,9 +91,9 @@ def _picture(p, q, seed):
 
 @inner
 def _rug(p, q, x, y, seed):
-    """Return colour weights (m, n), see `mixture`, of a rug at (p, q) in [-1, 1].
+    """Return the weights (m, n) that mix three colours to a rug at (p, q) in [-1, 1].
 
-    The rug has two borders, a ring in the centre, and diamonds. x, y: the position in periods.
+    The rug has two borders, a centre ring and diamonds with period 1 in x, y. See `mixture`.
     """
     edge = min(1 - abs(p), 1 - abs(q))
     ring = abs(p) + abs(q)
@@ -111,9 +111,9 @@ def _rug(p, q, x, y, seed):
 
 @inner
 def _window(p, q, seed):
-    """Return colour weights (m, n), see `mixture`, of a window at (p, q) in [-1, 1].
+    """Return the weights (m, n) that mix three colours to a window at (p, q) in [-1, 1].
 
-    The window has a frame and glazing bars, and shows trees and sky.
+    The window has a frame and glazing bars, and shows trees and sky. See `mixture`.
     """
     if abs(p) < 0.03 or abs(q - 0.25) < 0.025 or abs(p) > 0.94 or abs(q) > 0.95:
         return 0.0, 1.0
@@ -125,9 +125,9 @@ def _window(p, q, seed):
 
 @inner
 def _spines(x, seed):
-    """Return colour weights (m, n), see `mixture`, of a row of book spines.
+    """Return the weights (m, n) that mix three colours to a row of book spines.
 
-    Some spines have a band. x: position along the row, in widths of a book.
+    Some spines have a band. x: position in the row, in widths of a book. See `mixture`.
     """
     i = math.floor(x + 0.3 * _noise(x, 0.5, seed))
     return _hash(i, 1, seed), (0.9 * _hash(i, 2, seed) if _hash(i, 3, seed) > 0.5 else 0.0)

@@ -56,7 +56,7 @@ def _corners(body, c2w, corners):
 def _clipped(corners, points):
     """Write the corners of a box, after clipping at the camera plane, to `points`.
 
-    Returns the number of these corners. Only the part of the box in front of the camera is kept.
+    Returns the number of points. Only the part of the box in front of the camera is kept.
     """
     n = 0
     for k in range(8):
@@ -209,9 +209,9 @@ def _keep(t, code, k, own, found):
 
 @inner
 def _cover_row(t, code, own, kind, extent, steps, o, base, step):
-    """Do the work of `_closest` for a shape of a furnished room.
+    """Update the hits of a row of rays where a shape of a furnished room is nearer.
 
-    Such a shape has no cut, so intervals need not be stored. This takes a third of the time.
+    Such a shape has no cut, so no intervals are stored, which saves two thirds of the time.
     """
     if kind == s.BLOCK:
         for k in range(t.shape[0]):
@@ -238,7 +238,7 @@ def _trace_primitive(primitive, heights, o, base, step, steps, spans):
 
 @inner
 def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
-    """Do the work of `_trace_shape` for shapes of furnished rooms, whose frame is in metres."""
+    """Update the hits of rays in `area` where a shape of a furnished room is nearer."""
     above, below, first, last = area
     kind = body.kind
     extent = triple(body.extent)

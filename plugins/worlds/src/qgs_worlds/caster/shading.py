@@ -92,7 +92,7 @@ def _on_primitive(primitive, heights, face, p):
 
 @inner
 def to_world(primitive, n):
-    """Return the normal n of a primitive in the world frame. The length of the result is not 1."""
+    """Turn the normal n from a primitive's frame to the world frame, without unit length."""
     axes = primitive.axes
     # `axes` leads into the frame, so its transpose leads normals out of it
     return dot(axes[:, 0], n), dot(axes[:, 1], n), dot(axes[:, 2], n)
@@ -194,9 +194,9 @@ def _light(light, shadows, own, place, normal, view, open_, shine):
 def _shade(world, around, code, place, view, footprint, distance):
     """Return the RGB, in linear light, of a surface seen from the camera.
 
-    around: see `surroundings`. code: face code of the surface. place: point on the surface. view:
-    direction from the camera. footprint: distance between neighbouring pixels at the point.
-    distance: distance of the point from the camera. All lengths are in metres.
+    around: boxes near earlier points, from `surroundings`. code: face code of the surface. place:
+    point on the surface. view: direction from the camera. footprint: distance between neighbouring
+    pixels at the point. distance: from the camera to the point. All lengths are in metres.
     """
     i = code >> 3
     shape = world.shapes[i]
@@ -251,8 +251,8 @@ def _gather(t, code, i, j, own, samples):
 def paint(image, t, code, top, samples, world, c2w, rays):
     """Colour a band of image rows, `image` (rows, W, 3) float32 linear light. Overwrites `code`.
 
-    t, code, rays: results of `trace` for the band. top: number of the band's first row in the whole
-    image. Rays of a pixel that hit the same face are shaded once, at their mean.
+    t, code, rays: depths, face codes and ray basis of the band from `trace`. top: number of the
+    band's first row in the image. Rays of a pixel that hit one face are shaded once, at their mean.
     """
     # kept over the band, because neighbouring points have the same boxes nearby
     around = surroundings(world.shapes)

@@ -35,8 +35,8 @@ def shadow_maps(
 ) -> tuple[np.ndarray, s.Shadows]:
     """Return a copy of `lights` and the shadow maps of all lights.
 
-    In the copy, the field `shadows` gives the number of the light's first map plus 1. middle,
-    radius: ball in which the sun casts shadows. Lamps cast shadows everywhere.
+    In the copy, the field `shadows` of a light with shadows is the index of its first map plus 1.
+    middle, radius: ball in which the sun casts shadows. Lamps cast shadows everywhere.
     """
     lights = lights.copy()
     maps = []
@@ -130,8 +130,8 @@ def surroundings(shapes):
     """Return the cache that `visible` keeps between points: three arrays.
 
     The first array (19, S) has 19 fields of the boxes around S shapes, field by field, so that
-    loops over shapes are vectorised. The second array (19, S) has the boxes near a point. The third
-    array (5,) has that point, the number of boxes near it, and the squared distance from it up to
+    loops over shapes are vectorised. The second array (19, S) has the boxes near a point p.
+    The third array (5,) has p, the number of boxes near p, and the squared distance from p up to
     which the second array is valid.
     """
     boxes = np.empty((_FIELDS, shapes.shape[0]), np.float32)
@@ -175,10 +175,10 @@ def visible(shapes, around, own, point, normal, strength, reach, footprint):
     """Return the share of ambient light that reaches a point; 1 without occlusion.
 
     Distances from two heights above the point to other shapes are compared with the heights, after
-    Evans 2006, "Fast approximations for global illumination on dynamic scenes". around: see
-    `surroundings`. own: index of the shape on which the point lies. strength: amount of darkening;
-    0 for none. reach: distance at which shapes darken points. footprint: distance between
-    neighbouring pixels at the point. Lengths are in metres.
+    Evans 2006, "Fast approximations for global illumination on dynamic scenes". around: cache
+    from `surroundings`. own: index of the shape on which the point lies. strength: amount of
+    darkening; 0 for none. reach: distance at which shapes darken points. footprint: distance
+    between neighbouring pixels at the point. Lengths are in metres.
     """
     x, y, z = narrow(point)
     nx, ny, nz = narrow(normal)

@@ -56,7 +56,7 @@ class Primitive(NamedTuple):
 class Shape(NamedTuple):
     """Solid shape: the primitive `body`, from which the primitive `cut` is removed if it is given.
 
-    texture: index of the body's first texture. faces: number of its textures, one for each face.
+    texture: index of the body's first texture. faces: number of the body's textures, one per face.
     cut_texture: texture of the cut's wall. scale: metres per unit of a texture.
     """
 

@@ -24,7 +24,7 @@ def chance(i, j, seed):
 def _corner(basis, i, j, seed, x, y):
     """Return the contribution of grid point (i, j) to noise at the offset (x, y) from it.
 
-    For VALUE noise it is a random number; for GRADIENT noise it is a random slope times the offset.
+    VALUE noise contributes a random number, GRADIENT noise a random slope times the offset.
     """
     if basis == s.VALUE:
         return chance(i, j, seed) - 0.5
@@ -35,7 +35,7 @@ def _corner(basis, i, j, seed, x, y):
 def _cells(x, y, i, j, seed):
     """Return noise at (x, y) from random points, one in each cell of a grid.
 
-    It is the distance to the nearest of these points, shifted and scaled to a mean of about 0.
+    The noise is the distance to the nearest of these points, with a mean of about 0 after a shift.
     i, j: cell of (x, y).
     """
     least = 4.0
@@ -178,7 +178,7 @@ def _pattern(kind, x, y, width, seed, blur):
 def _marked(texture, rgb, u, v, warped, footprint):
     """Return the colour `rgb` with the pattern of a texture blended over it, at (u, v).
 
-    warped: u in periods of the texture's noise, after the noise was warped.
+    warped: u in periods of the texture's noise, plus the shift that warps noise and pattern.
     """
     period = texture.pattern_period
     blur = footprint / period * max(texture.aspect, 1.0)
@@ -197,8 +197,8 @@ def _marked(texture, rgb, u, v, warped, footprint):
 def color(texture, u, v, footprint):
     """Return the RGB of a texture at (u, v).
 
-    footprint: distance between neighbouring pixels on the surface. u, v and footprint have one
-    unit.
+    footprint: distance between neighbouring pixels on the surface. u, v and footprint have the
+    same unit.
     """
     x = u / texture.period
     y = v / texture.period

@@ -162,7 +162,7 @@ def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
     """Return x and y of a point, given relative to a wall.
 
     side: number of the wall, 0 to 3. away: distance in metres from the centre of the room towards
-    the wall. along: distance in metres beside this line, along the wall.
+    the wall. along: distance in metres from this line, parallel to the wall.
     """
     angle = math.pi + side * math.pi / 2
     cos = math.cos(angle)

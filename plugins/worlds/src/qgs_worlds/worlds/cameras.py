@@ -82,9 +82,9 @@ def draw_cameras(
 ) -> Rig:
     """Return `count` random cameras in `place` with useful views.
 
-    world: table of SHAPE, and height maps. varied: False gives only level walks. The cameras are
-    the best of a few random sets and keep the distance CLEARANCE from fixed shapes. The caller must
-    remove other shapes that are nearer.
+    world: table of SHAPE, and height maps. varied: False gives only level walks, True all motions.
+    The cameras are the best of a few random sets and keep the distance CLEARANCE from fixed shapes.
+    The caller must remove movable shapes that are nearer.
     """
     best = None
     least = math.inf
@@ -142,7 +142,7 @@ def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: in
 def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
     """Return random cameras that have not been tested for collisions.
 
-    shrink: factor of the path's length, to make it shorter.
+    shrink: factor from 0 to 1 by which the camera path is made shorter.
     """
     target = np.array(place.targets[rng.integers(len(place.targets))])
     base, distance = _stand(rng, place, target, varied)

@@ -97,8 +97,8 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
 def _tinted(rng: Random, by: float) -> np.ndarray:
     """Return random factors for R, G and B whose mean is 1.
 
-    by: standard deviation of the factor of R, in stops (powers of 2); that of B changes the other
-    way.
+    by: standard deviation of the factor of R, in stops (powers of 2). The factor of B falls as that
+    of R rises.
     """
     warm = rng.gauss(0, by)
     green = rng.gauss(0, 0.3 * by)
@@ -109,8 +109,8 @@ def _tinted(rng: Random, by: float) -> np.ndarray:
 def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return random lights: a table of LIGHT, and a table of AIR with one row.
 
-    varied: True gives sun and lamps at random, with shadows; False gives one white lamp without
-    shadows near the top of the place. Lamps may be inside objects.
+    varied: True gives sun and lamps at random, with shadows; False gives one white lamp near the
+    top of `place`, without shadows. Lamps may be inside objects.
     """
     if not varied:
         lamp = (1.0, (0.3, 0.2, place.top - 0.3), np.full(3, 1.2), 0)
@@ -160,7 +160,7 @@ def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) ->
 
 
 def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> Effects:
-    """Return random camera effects; without `varied`, neutral effects with the right exposure.
+    """Return random camera effects; if not `varied`, neutral effects with the right exposure.
 
     light: small images (F, H, W, 3) of all F views in linear light, which determine the exposure.
     """
