@@ -112,7 +112,7 @@ class Problem:
 def without_effect(
     config: ComponentConfig, options: Iterable[str], because: str
 ) -> Iterator[Problem]:
-    """Yield a problem for each of `options` that has no effect but a value other than its default.
+    """Yield a problem for each of `options` that has no effect, but is changed from its default.
 
     because: the setting in `config` that disables the options. Default values are no problem,
     because a checked recipe contains the defaults of all options.

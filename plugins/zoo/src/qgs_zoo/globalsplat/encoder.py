@@ -60,7 +60,7 @@ class PosedPatches(PatchEncoder):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the fields of memory that the encoder writes.
+        """Return the fields of the image memory that the encoder writes.
 
         These are the features, with their width, and the grid of patches if there are no registers.
         """
