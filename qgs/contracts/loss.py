@@ -49,7 +49,7 @@ class Loss(Component, torch.nn.Module):
         target: Views,  # (B, V)
         inputs: Views,
     ) -> Tensor | Mapping[str, Tensor]:
-        """Return the unweighted loss, averaged over scenes: a 0-d tensor, or several by name."""
+        """Return the unweighted loss, averaged over scenes: one 0-d tensor, or several by name."""
 
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views

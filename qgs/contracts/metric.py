@@ -44,7 +44,7 @@ class Column:
     def beats(self, value: float | None, other: float | None) -> bool:
         """Return whether `value` is better than `other` after rounding as in tables.
 
-        False if `other` is None.
+        False if `value` or `other` is None.
         """
         # 14.463 and 14.457 both show as 14.46; ranking them would confuse readers
         if other is None or self.shown(value) == self.shown(other):

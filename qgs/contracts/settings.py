@@ -85,7 +85,7 @@ class TrainingConfig(ComponentConfig):
     """Number of target views rendered at a time. Smaller numbers need less memory; gradients stay
     the same. 0: all views at once."""
     judge_inputs: bool = False
-    """Compute the losses on the input views too, which are then rendered after the target views."""
+    """Compute the losses on input views as well as target views. Input views are rendered last."""
     ema: float | None = Field(default=None, gt=0, lt=1)
     """Decay per step of a moving average of the weights. The average is saved and evaluated in
     addition to the weights. null: no average."""

@@ -106,7 +106,7 @@ def make_sample(
 
 
 def _asked(times: Tensor, inputs: int) -> Tensor | None:
-    """Return the time (1, 1) at which to reconstruct: that of the targets; None if times differ.
+    """Return the time (1, 1) of all targets, at which to reconstruct; None if target times differ.
 
     Without targets, return the median time of the inputs. times: times (1, V) of inputs, then
     targets. inputs: number of inputs.

@@ -191,7 +191,7 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
 
 @kernel
 def _covariance_slopes(row_x, row_y, splat, given, dilation):
-    """Return the gradients of row_x and row_y, two rows of J W R S, from those of the conic.
+    """Return gradients of row_x and row_y, two rows of J W R S, from the gradients of a splat.
 
     splat: the fields of the splat; fields 2 to 4 are the conic (inverse 2D covariance). given:
         gradients of the splat's fields.
@@ -295,7 +295,7 @@ def project_backward_unit(
     means, scales, quats, c2w, lenses, bounds, limits, splats, given, wants_cameras,
     of_means, of_scales, of_quats, of_opacities, of_cameras,
 ):  # fmt: skip
-    """Compute the gradients of the inputs of `project_unit` from those of its splats.
+    """Compute gradients of the inputs of `project_unit` from the gradients of its splats.
 
     given: gradients (V, P, G, 10) of the rasteriser: views, stripes of an image, Gaussians. They
         are first summed over stripes. Writes the gradients of_means (G, 3), of_scales (G, 3),

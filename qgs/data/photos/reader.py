@@ -184,8 +184,8 @@ class PhotoReader(ABC):
 def installed_readers() -> dict[str, type[PhotoReader]]:
     """Return the readers of installed plug-ins by format name.
 
-    If two have the same name, the first counts. A reader that cannot be loaded is left out with a
-    warning.
+    If two readers have the same name, the first counts. A reader that cannot be loaded is left out
+    with a warning.
     """
     found: dict[str, type[PhotoReader]] = {}
     for entry in installed(GROUP):
@@ -272,7 +272,7 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
 
 
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
-    """Yield a problem if fx, fy, cx, cy are not finite, not in pixels, or fx or fy is not positive.
+    """Yield a problem if intrinsics are not finite or not in pixels, or a focal length is <= 0.
 
     size: listed image size (H, W); None if none is listed.
     """
