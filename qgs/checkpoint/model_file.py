@@ -105,7 +105,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def step(self) -> int | None:
-        """Number of training steps before the file was saved; None if unknown (imported weights)."""
+        """Number of training steps when the file was saved; None if unknown (imported weights)."""
         if "step" not in self.extra:
             return None
         with self.entry(_EXTRA + "step") as text:
