@@ -118,8 +118,8 @@ def find_scenes(path: UPath) -> dict[str, UPath]:
     if not scenes:
         inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
         raise FileNotFoundError(
-            f"{path} holds no scenes of DL3DV: expected {{hash}}.zip or {{hash}}/{LISTING}, also "
-            f"in folders such as 1K/, found {inside}"
+            f"{path} holds no scenes of DL3DV: expected {{hash}}.zip or {{hash}}/{LISTING} in "
+            f"it or in folders such as 1K/, found {inside}"
         )
     if len(found) > len(scenes):
         warn_once(
