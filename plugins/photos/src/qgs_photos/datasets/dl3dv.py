@@ -86,7 +86,7 @@ class Dl3dvSource(LazySource):
         """Return whether `path`, or a folder in it such as 1K, holds archives or scenes of DL3DV.
 
         The folder of a scene is named by a hash, or has the layout of DL3DV's benchmark. A folder
-        that lists its own photos is not recognised, since `qgs/photos` reads it.
+        in a format that `qgs/photos` reads is not recognised.
         """
         if path.is_file():
             return path.suffix == ".zip"

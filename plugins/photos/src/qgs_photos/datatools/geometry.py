@@ -155,7 +155,7 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
 
 
 def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
-    """Return at most `most` frames: all in one run, or several evenly spread runs of neighbours."""
+    """Return all `frames` as one run; of more than `most`, return a few evenly spread runs."""
     if len(frames) <= most:
         return [frames]
     length = max(most // _RUNS, 2)

@@ -73,7 +73,7 @@ def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
 
 
 def _paired(reference: Runs, runs: Runs) -> Runs:
-    """Pair `runs` with those of `reference`; return them by the seed of their partner.
+    """Pair `runs` with runs of `reference`; return `runs` by the seeds of their partners.
 
     Runs are paired by equal seeds if enough seeds are equal. Otherwise runs are paired in order.
     """
