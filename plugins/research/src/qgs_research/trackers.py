@@ -13,7 +13,7 @@ from qgs.train.tracking import Tracker
 
 
 class _OfAccelerate(Tracker):
-    """Base class of trackers that pass everything on to a tracker of `accelerate`."""
+    """Base class of trackers that pass values and images on to a tracker of `accelerate`."""
 
     _tracker: Any
     _of_pictures: ClassVar[Mapping[str, str]] = {}
@@ -28,15 +28,12 @@ class _OfAccelerate(Tracker):
         self._tracker.store_init_configuration(plain)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
-        """Log the values of one training step, by name."""
         self._tracker.log(dict(values), step=step)
 
     def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        """Log one image (H, W, 3) of a training step."""
         self._tracker.log_images({name: picture[None]}, step=step, **self._of_pictures)
 
     def close(self) -> None:
-        """Finish the log: write or send the remaining data."""
         self._tracker.finish()
 
 

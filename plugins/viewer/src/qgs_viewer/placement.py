@@ -103,9 +103,9 @@ def _array(tensor: Tensor) -> np.ndarray:
 def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
     """Return the index of the Gaussian with the largest blending weight on a ray.
 
-    Returns None if all weights are below 0.02. The alpha of a Gaussian is its greatest
-    value along the ray; alphas are blended from near to far. origin, direction: start and direction
-    of the ray, both (3,).
+    Returns None if all weights are below 0.02. The alpha of a Gaussian is its greatest value along
+    the ray; alphas are blended from near to far. origin, direction: start and direction of the ray,
+    both (3,).
     """
     offsets = origin - found.centers.astype(np.float64)
     # flat Gaussians have no inverse

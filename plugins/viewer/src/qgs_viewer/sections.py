@@ -209,7 +209,7 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
     kind (Render, Error, Depth), then by column (Truth, names of models); `most`, the error that is
     shown brightest.
 
-    place: index of the scene's sample. targets: indices of the target views to show.
+    place: index of the scene among the samples. targets: indices of the target views to show.
     """
     sample = models[0].samples[place]
     views = sample.targets.select(list(targets))

@@ -171,8 +171,8 @@ def is_free(run: Run) -> bool:
 def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -> None:
     """Train and evaluate one run of the study in `folder`. Existing results are kept.
 
-    If another process trains the run, nothing is done. An error is written to a file beside the run
-    folder.
+    If another process trains the run, this call does nothing. An error is written to a file beside
+    the run folder.
     """
     # a call that is killed cannot end its runs, so each run watches its call
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()

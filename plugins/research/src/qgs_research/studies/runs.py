@@ -97,7 +97,7 @@ class Plan:
         return f"{variants} x {counted(len(self.study.settings.seeds), 'seed')}"
 
     def evaluation_recipe(self, variant: str, evaluation: str) -> Recipe:
-        """Return the recipe by which models of a variant are evaluated."""
+        """Return the recipe of `variant`, changed as the evaluation `evaluation` says."""
         recipe = self.recipes[variant]
         changes = self.study.evaluations.get(evaluation)
         return changed_recipe(recipe, changes) if changes else recipe

@@ -11,7 +11,7 @@ import typer
 
 from qgs.cli.options import Device
 
-app = typer.Typer(help="Write Slurm jobs that save before their time limit and continue later.")
+app = typer.Typer(help="Write Slurm jobs that save a training in time and continue it later.")
 
 
 # Unknown options are passed on to `qgs train`.

@@ -131,7 +131,7 @@ def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, 
 def training_notes(scores: Scores) -> Iterator[str]:
     """Yield a note for each model that was trained unlike the reference model.
 
-    The data and the length of the trainings are compared.
+    The trainings' data, steps, seconds and batch sizes are compared.
     """
 
     def facts(model: str) -> set[tuple[str, str]]:

@@ -129,7 +129,7 @@ def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primit
 
 
 def packed(shapes: Sequence[Shape]) -> np.ndarray:
-    """Return the shapes as a table of SHAPE for the ray caster, one row for each shape."""
+    """Return the shapes as an array of dtype SHAPE for the ray caster, one row for each shape."""
     table = np.zeros(len(shapes), s.SHAPE)
     body = _primitives([shape.body for shape in shapes])
     table["body"] = body
@@ -147,7 +147,7 @@ def packed(shapes: Sequence[Shape]) -> np.ndarray:
 
 
 def _primitives(primitives: Sequence[Primitive]) -> np.ndarray:
-    """Return the primitives as a table of PRIMITIVE, one row for each primitive."""
+    """Return the primitives as an array of dtype PRIMITIVE, one row for each primitive."""
     kind, center, half, turn, extra = map(np.array, zip(*primitives, strict=True))
     metric = (kind >= s.BLOCK)[:, None]
     unit = np.where(metric, 1.0, half)
