@@ -73,7 +73,7 @@ def _planks(x, y, seed, fade):
 def _picture(p, q, seed):
     """Return the weights (m, n) that mix three colours to a painted landscape at (p, q).
 
-    It shows hills under a sky with a sun. p, q: in [-1, 1]. For m and n, see `mixture`.
+    The picture shows hills under a sky with a sun. p, q: in [-1, 1]. See `mixture`.
     """
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
     # hills farther off are higher and paler

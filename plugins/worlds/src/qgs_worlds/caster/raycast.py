@@ -209,7 +209,7 @@ def _keep(t, code, k, own, found):
 
 @inner
 def _cover_row(t, code, own, kind, extent, steps, o, base, step):
-    """Update the hits of a row of rays where a shape of a furnished room is nearer.
+    """Update the hits of a row of rays where a room's shape is nearer than all earlier shapes.
 
     Such a shape has no cut, so no intervals are stored, which saves two thirds of the time.
     """
@@ -238,7 +238,7 @@ def _trace_primitive(primitive, heights, o, base, step, steps, spans):
 
 @inner
 def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
-    """Update the hits of rays in `area` where a shape of a furnished room is nearer."""
+    """Update the hits of rays in `area` where a room's shape is nearer than all earlier shapes."""
     above, below, first, last = area
     kind = body.kind
     extent = triple(body.extent)
