@@ -57,8 +57,8 @@ def heading(model: Any) -> str:
 def slot_rows(model: Any) -> list[tuple[str, str, str]]:
     """Return the rows of a table: a slot, the types of its components, their number of parameters.
 
-    A model built without a recipe has no types. Its rows show class names, and for slots of decoder
-    layers nothing.
+    Types are those of the recipe. For a model without a recipe, rows show class names in place of
+    types, and nothing for slots of decoder layers.
     """
     counts = {name: f"{count:,}" for name, count in parameter_counts(model).items()}
     counts |= {"supervision": "", "renderer": ""}

@@ -70,15 +70,15 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     except _DAMAGED as error:
         raise OSError(f"{path} is damaged: {error}") from error
     if len(content) > most:
-        raise OSError(f"{path} is larger than {decimal(most)}, the limit for such files")
+        raise OSError(f"{path} is larger than {decimal(most)}, the limit for files read as a whole")
     return content
 
 
 def read_json(path: UPath, fix: str) -> Any:
     """Return the content of a JSON file.
 
-    fix: advice at the end of the error message. Raises ValueError if the file is not JSON, and the
-    errors of `read_file`.
+    fix: advice at the end of the error message. Raises ValueError if the file is not JSON, and
+    OSError as `read_file` does.
     """
     content = read_file(path, _LARGEST_JSON)
     try:

@@ -49,7 +49,7 @@ def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1
 
 @full_precision
 def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
-    """Return the mean of `similarity_map`, 0-d; most cases on a CPU use a faster kernel."""
+    """Return the mean of `similarity_map`, 0-d; most calls on a CPU use a faster kernel."""
     # Subclasses that torch uses to count or trace hold no numbers and cannot become arrays.
     plain = type(images) is type(truth) is Tensor and images.is_cpu
     single = images.dtype == truth.dtype == torch.float32

@@ -236,13 +236,13 @@ SH_COUNTS = (3, 8, 15)
 
 
 def _check_gaussians(container: Any, **shapes: str) -> None:
-    """Raise ValueError for wrong shapes of the common fields of Gaussians and those in `shapes`."""
+    """Raise ValueError for a wrong shape of a field in `shapes` or a common field of Gaussians."""
     check_shapes(container, **shapes, **_OF_GAUSSIANS)
     sh = container.sh
     if sh is not None and sh.shape[-2] not in SH_COUNTS:
         raise ValueError(
             f"{type(container).__name__}.sh has {sh.shape[-2]} coefficients per Gaussian; give 3, "
-            "8 or 15, for degrees from 1 to 1, 2 or 3 (degree 0 is `colors`)"
+            "8 or 15, for a highest degree of 1, 2 or 3 (degree 0 is `colors`)"
         )
 
 
@@ -275,9 +275,9 @@ class Gaussians(TensorContainer):
     means: (B, G, 3) world. scales: (B, G, 3) standard deviations, world units.
     quats: (B, G, 4) unit, w x y z. opacities: (B, G). colors: (B, G, 3) RGB.
     sh: (B, G, C, 3) RGB coefficients of real spherical harmonics in the world frame, for degrees 1
-        to 1, 2 or 3 (C = 3, 8 or 15), in the order of `qgs.geometry.harmonics`. Seen along the
-        direction d, the colour is max(colors + sum_i Y_i(d) sh_i, 0) with the harmonics Y_i. None:
-        the colour is `colors` from all directions.
+        to L (C = 3, 8 or 15 for L = 1, 2 or 3), in the order of `qgs.geometry.harmonics`. Seen
+        along the unit direction d, the colour is max(colors + sum_i Y_i(d) sh_i, 0) with the
+        harmonics Y_i. None: the colour is `colors` from all directions.
     features: (B, G, F) further values to render, over a background of 0; None if there are none.
     """
 

@@ -99,7 +99,7 @@ def _assemble(recipe: Recipe) -> QueryGaussianModel:
 class OnMeta(TorchFunctionMode):
     """Mode that speeds up constructors of components on torch's meta device.
 
-    `linspace` returns real numbers, because DINO's constructor reads them. Initialisers of weights
+    `linspace` computes its values, because DINO's constructor reads them. Initialisers of weights
     do nothing. `randn` and arithmetic on float32 tensors compute only shapes; otherwise torch would
     import its compiler, which takes 1 to 3 s.
     """
@@ -133,7 +133,7 @@ class OnMeta(TorchFunctionMode):
 
 
 def build(chosen: Chosen, *arguments: Any) -> Any:
-    """Build a component. arguments: what its constructor takes after the Config.
+    """Build a component. arguments: what the constructor takes after the Config.
 
     If the constructor of a plugin's component fails, raises RecipeError that names the plugin's
     distribution. Errors that a user can mend are not converted: missing packages or data, and

@@ -23,7 +23,7 @@ def at_their_causes(
 ) -> Iterator[RecipeProblem]:
     """Yield the problems `found` in the recipe `written`, moved to the lines that caused them.
 
-    Problems with the same cause become one problem. plugins: plugins that need not be installed.
+    Problems with the same cause become one. plugins: used in place of installed plugins.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     left = found

@@ -54,9 +54,9 @@ def _context(draft: Draft) -> RecipeContext:
 
 
 def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
-    """Report problems of a component's options; return whether the component's methods ran.
+    """Report problems of a component's options; return False if a method of the component fails.
 
-    False means that one of these methods raised an error.
+    Otherwise returns True, even if there are problems.
     """
     component = chosen.component
     config = chosen.config
@@ -87,7 +87,7 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
 
 
 def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
-    """Return the components of a draft without sublayers that their decoder layer does not use.
+    """Return the components of `draft` without sublayers that their decoder layer does not use.
 
     A sublayer that is left out is reported if the recipe sets it for that layer alone, or if the
     recipe sets it for all layers and no layer uses it.
@@ -242,7 +242,7 @@ def keys_are_read(parts: Parts) -> bool:
 
 
 def idle_fields(parts: Parts) -> Iterator[str]:
-    """Yield a warning for each learnable field of the queries that nothing but refinements read."""
+    """Yield a warning for each learnable field of the queries that only refinements read."""
     read = set[str]()
     for path, part in parts.items():
         # A refinement reads the fields that it updates; that alone does not use them.

@@ -146,7 +146,7 @@ def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = Non
 
 
 def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) -> MapNode:
-    """Merge the recipe `node` over the files that it extends, of which later ones win."""
+    """Merge the recipe `node` over the files that it extends; later files win over earlier ones."""
     layers: list[MapNode] = []
     for name, origin in items_of(node.get("extends"), node.origin_of("extends")):
         if not isinstance(name, str):

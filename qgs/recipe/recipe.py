@@ -51,7 +51,7 @@ class Recipe:
 
     @property
     def data_config(self) -> contracts.SceneSourceConfig | None:
-        """Options of the data source; None without a source or if they are no SceneSourceConfig."""
+        """Options of the data source; None without a source or if not a SceneSourceConfig."""
         config = self.parts["data",].config if ("data",) in self.parts else None
         return config if isinstance(config, contracts.SceneSourceConfig) else None
 
@@ -63,7 +63,7 @@ class Recipe:
     def build_model(
         self, device: torch.device | str | None = None, pretrained: bool = True
     ) -> QueryGaussianModel:
-        """Build the model with its initial parameters; on the device "meta" it takes no memory.
+        """Build the model with its initial parameters; the device "meta" needs no memory.
 
         pretrained: read pretrained weights, such as DINO's. Use False before loading a checkpoint.
         Raises TooLargeError, before memory is allocated, if the weights do not fit into memory.
@@ -110,7 +110,7 @@ class Recipe:
         return build(self.parts["objective",])
 
     def build_optimizer(self) -> contracts.Optimizer:
-        """Build the optimiser; raise ValueError if `training` is too short for its schedule."""
+        """Build the optimiser; raise ValueError if `training` is too short for the optimiser."""
         optimizer = build(self.parts["optimizer",], self.training)
         optimizer.check()
         return optimizer
@@ -183,9 +183,9 @@ _Spelled: TypeAlias = Iterator[tuple[KeyPath, Any, Origin | str]]
 
 
 def spell_out(draft: Draft, parts: Parts) -> _Spelled:
-    """Yield path, value and origin of each value of a draft, including defaults.
+    """Yield path, value and origin of each option of the recipe `draft`, including defaults.
 
-    Of the draft's plugins, only those in use are listed.
+    The value of `plugins` lists only plugins whose components the draft uses.
     """
     shown = _shown_parts(parts)
     top, model, decoder, *sections = SETTINGS

@@ -109,8 +109,8 @@ def load_plugins(
 ) -> Registry:
     """Load the plugins `names`; add a problem for each plugin that cannot be used.
 
-    tree: the merged recipe, in which the problems get their lines. given: Plugin objects, which are
-        used in place of installed plugins of their names.
+    tree: the merged recipe, whose lines the problems name. given: Plugin objects, which are used in
+        place of installed plugins of the same names.
     """
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
     plugins = {"qgs": BUILTIN}
@@ -191,7 +191,7 @@ def _plugin_fault(plugin: object, name: str) -> str:
 
 
 def default_config(component: type[Component]) -> ComponentConfig | None:
-    """Return a component's default options; None if one has no default or validation fails."""
+    """Return a component's default options; None if an option has no default or is invalid."""
     try:
         return component.Config()
     except (Exception, SystemExit):

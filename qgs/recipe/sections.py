@@ -131,9 +131,9 @@ Layout: Any = create_model(
 
 
 def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
-    """Return `tree` without invalid values and null sections, and this tree decoded as a Layout.
+    """Return `tree` without invalid values and null sections, and all settings as a `Layout`.
 
-    Adds a problem for each invalid value.
+    A problem is added for each invalid value, which is replaced by its default.
     """
     settings, faults = validated(Layout, tree)
     for fault in faults:

@@ -121,9 +121,9 @@ def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
 
 
 def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Origin, Node]:
-    """Follow `path` into `tree`, skipping keys that `tree` does not have.
+    """Follow `path` into `tree`, skipping keys that are missing on the way.
 
-    Returns the keys that were found, file and line of the last one, and the value that it leads to.
+    Returns the keys that were found, the file and line of the last one, and the value there.
     """
     taken = list[str | int]()
     origin = tree.origin
@@ -242,7 +242,7 @@ def _fault(reason: str, node: yaml.Node) -> yaml.YAMLError:
 
 
 def _scalar(kind: str, text: str) -> Any:
-    """Return the value of a YAML scalar; raise ValueError if `text` is not valid for its `kind`."""
+    """Convert `text` to the type `kind`, such as "int"; raise ValueError if this is impossible."""
     if kind == "null":
         return None
     if kind == "bool":

@@ -44,7 +44,7 @@ def reconstruct(
         world; all of them are inputs unless `inputs` or `frames` is given.
     inputs: number of input photos; None uses the recipe's number.
     frames: input photos, by number or file name; None chooses them, see `qgs.data.inputs`.
-    compare: photos to score, or "none". None scores held-out photos (every eighth) near the inputs.
+    compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
     size: (H, W) of a folder's images, see `chosen_scene`. scene: name of a scene in the folder.
     overrides: changes of the recipe's `views`, such as "views.scale=auto".
     tune: what to fit to the inputs first, such as "queries:50"; None fits nothing.
@@ -112,7 +112,7 @@ def choose_frames(
     frames, compare: input frames and compared frames that the user chose; None chooses them here.
         In scenes with times, inputs are spread over time, and compared frames between them share
         one time. In other scenes, the best window of `ranked_windows` is used.
-    trained_on: ranges of cameras in the model's training; None allows any.
+    trained_on: distances and angles of cameras in the model's training; None allows any.
     Raises ValueError for frames that do not exist or repeat, and for too few frames.
     """
     views = views.model_copy(update={"inputs": inputs or views.inputs})
@@ -160,7 +160,10 @@ def _over_time(
     if frames is None:
         usable = moments(scene)
         if views.inputs > len(usable):
-            raise ValueError(f"photos have {len(usable)} times, too few for {views.inputs} inputs")
+            raise ValueError(
+                f"photos were taken at {len(usable)} times, too few for {views.inputs} inputs: "
+                "choose fewer inputs"
+            )
         first = max(len(usable) - max(views.gap[1] + 1, views.inputs), 0) // 2
         frames = spread(usable[first : len(usable) - first], views.inputs)
     between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]

@@ -27,8 +27,8 @@ KINDS = ("input", "novel", "seen in training")
 class ViewScore:
     """Quality of a rendered view, compared with its photo.
 
-    kind: one of KINDS. psnr: in dB. baselines: PSNR in dB of each baseline method, by its name;
-        empty for an input.
+    kind: "input", "novel" or "seen in training". psnr: in dB. baselines: PSNR in dB of each
+        baseline method, by name; empty for an input.
     """
 
     frame: int

@@ -114,8 +114,8 @@ def find_scale(
 
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
     given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
-    model: must be in evaluation mode; the search runs on its device. compared: frames that will
-        score the result, so the search does not use them.
+    model: must be in evaluation mode; the search runs on its device. compared: frames
+        kept for the scores of the result, which the search does not use.
     """
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
@@ -155,7 +155,7 @@ def find_scale(
 
 
 def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
-    """Return at most FURTHER photos that lie amid the inputs, to score factors with.
+    """Return at most FURTHER photos near the inputs, by which `find_scale` scores factors.
 
     These are the photos whose largest `pose_distance` to an input is smallest. Inputs, compared
     photos and held-out photos are left out. A scene with times gives no photos.
@@ -173,7 +173,7 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
 
     At factors below the third number, depths are smaller than in training. The third number is 0 if
     the depth at which the cameras look is unknown.
-    trained: ranges of cameras in the model's training. frames: the inputs.
+    trained: baselines and depths of cameras in the model's training. frames: the inputs.
     """
     depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
@@ -220,7 +220,7 @@ class _Trial:
         return -math.inf if math.isnan(found) else found
 
     def best(self, places: Iterable[float]) -> float:
-        """Score the factors at `places`; return the place with the best score of all so far."""
+        """Score factor(p) for each p in `places`; return the p with the best score so far."""
         for place in places:
             if place in self.tried:
                 continue
@@ -231,15 +231,16 @@ class _Trial:
         return max(self.tried, key=self.score)
 
     def past(self, place: float) -> Sequence[float]:
-        """Return two places beyond `place` if it is the first or last tried place; else none."""
+        """Return two exponents beyond `place` if it is the least or largest tried, else none."""
         if place == min(self.tried):
             return [place - 6, place - 3]
         return [place + 3, place + 6] if place == max(self.tried) else []
 
     def vertex(self, place: float) -> float:
-        """Return the offset from `place` to the vertex of a parabola through it and its neighbours.
+        """Return the offset from `place` to the maximum of a parabola through three scores.
 
-        Returns 0 if a neighbour was not tried or the parabola has no maximum.
+        The scores are at `place` - 1, `place` and `place` + 1. Returns 0 if one of them is missing
+        or if the parabola has no maximum.
         """
         if not {place - 1, place + 1} <= self.tried.keys():
             return 0.0

@@ -175,7 +175,8 @@ def _of_ply(path: Path) -> Gaussians:
     # plyfile takes the memory that a header promises.
     if not end or max(counts, default=0) > path.stat().st_size:
         raise ValueError(
-            f"its header does not end in {_HEADER:,} bytes, or counts more than the file holds"
+            f"its header does not end within the first {_HEADER:,} bytes, or announces more "
+            "elements than the file can hold"
         )
     elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
     vertices = elements["vertex"]

@@ -103,9 +103,9 @@ def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
 def whole_size(scene: Scene, multiple: int | None) -> Size:
     """Return the image size (H, W) at which photos of a user are resized without cropping.
 
-    Its shorter side is about that of the trained size. Its aspect ratio is about that of the first
-    photo. Both sides are multiples of `multiple`. If `multiple` is None or images are generated,
-    the trained size is returned. scene: must be opened at the trained size.
+    The shorter side is about as long as that of the training images, and the aspect ratio is about
+    that of the first photo. Both sides are multiples of `multiple`. If `multiple` is None or images
+    are generated, the size is that of the training images, at which `scene` must be opened.
     """
     trained = scene.cameras.size
     stored = scene.stored_size(0)
@@ -146,7 +146,7 @@ def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
         (name,) = places
     if name not in places:
         found = f"no scene {name!r}, but" if name is not None else f"{len(places)} scenes:"
-        raise ValueError(f"{path} holds {found} {listed(places)}: name one of them (scene)")
+        raise ValueError(f"{path} holds {found} {listed(places)}: name one of them as `scene`")
     split, place = places[name]
     return source.scenes(split)[place]
 

@@ -173,9 +173,9 @@ def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
 
 
 def _parts(splats: Any, size: Size) -> tuple[list[_Part], list[_Part]]:
-    """Return the units of work: numbered ranges of Gaussians, and of rows of tiles in an image.
+    """Divide the work: return numbered ranges of Gaussians, and of rows of tiles in an image.
 
-    The rows of an image are divided only if there are few images.
+    There is one range of rows, the whole image, unless there are few images.
     """
     batch, views, count, _ = splats.shape
     chunks = pairwise([*range(0, count, _CHUNK), count])

@@ -167,5 +167,5 @@ class CrossAttentionCore(nn.Module):
 
 
 def _by_head(bias: Tensor) -> Tensor:
-    """Add a head axis, (B, N, M) -> (B, 1, N, M); return (B, h, N, M) unchanged."""
+    """Add a head axis to a bias, (B, N, M) -> (B, 1, N, M); return (B, h, N, M) unchanged."""
     return bias if bias.ndim == 4 else bias[:, None]

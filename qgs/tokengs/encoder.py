@@ -51,9 +51,10 @@ class EncoderBlock(nn.Module):
 
 
 class PatchViT(PatchEncoder):
-    """Base class of ViTs over the patches of all views; a token adds RGB and Plücker embeddings.
+    """Base class of ViTs over the patches of all views.
 
-    Subclasses run the blocks and build the image memory.
+    A token is the sum of an RGB and a Plücker embedding. Subclasses run the blocks and build the
+    image memory.
     """
 
     class Config(NormConfig, PatchEncoder.Config):
@@ -79,11 +80,11 @@ class PatchViT(PatchEncoder):
         )
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return `learned` weights of smaller patches, enlarged to the patches of this component.
+        """Return the weights `learned`, enlarged from smaller patches to those of this component.
 
-        If the side of a patch here is f times the learned side, with a whole number f, a patch gets
-        the token that the learned weights give for the patch after averaging f x f pixels.
-        Otherwise the weights are returned unchanged.
+        If the side of a patch grows by a whole factor f, the enlarged weights give the token that
+        `learned` gives for the patch after averaging blocks of f x f pixels. Otherwise the weights
+        are returned unchanged.
         """
         # Its shapes give the size of our patches.
         own = self.state_dict()
@@ -129,7 +130,7 @@ class MultiViewViT(PatchViT):
 def keys_and_values(
     features: Tensor, kv_proj: nn.Linear, k_norm: nn.LayerNorm
 ) -> tuple[Tensor, Tensor]:
-    """Project features (B, M, C) to keys, normalised per head, and values, both (B, h, M, d)."""
+    """Project features of image tokens to keys, normalised per head, and values (B, h, M, d)."""
     heads = kv_proj.out_features // 2 // k_norm.normalized_shape[0]
     k_BMD, v_BMD = kv_proj(features).chunk(2, -1)
     v_BhMd = split_heads(v_BMD, heads)
@@ -141,7 +142,7 @@ _KERNEL = "_embedding.proj.weight"
 
 
 def _larger(kernel: Tensor, side: int) -> Tensor:
-    """Enlarge a kernel (D, C, p, p) to patches of `side` pixels.
+    """Enlarge the kernel (D, C, p, p) of a convolution to a width and height of `side`.
 
     If p does not divide `side`, the kernel is returned unchanged.
     """

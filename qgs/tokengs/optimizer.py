@@ -18,10 +18,10 @@ Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 class OneCycleAdamW(Optimizer):
     """AdamW with a learning rate that rises and falls along cosines (LocusGS release).
 
-    The rise ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that is
-    earlier. `warmup_shape` can make the rise linear. The fall follows the used fraction of the
-    steps or of the seconds, whichever is larger. Without a time budget this is torch's `OneCycleLR`
-    with pct_start = warmup / steps.
+    The rise ends after `warmup` optimiser steps or after the fraction WARMUP_TIME of a time budget,
+    whichever is earlier. `warmup_shape` can make the rise linear. The fall follows the used
+    fraction of the steps or of the seconds, whichever is larger. Without a time budget this is
+    torch's `OneCycleLR` with pct_start = warmup / steps.
 
     A schedule for `learning_rate` replaces rise and fall. Then warmup and divisors have no effect.
     """
@@ -41,8 +41,8 @@ class OneCycleAdamW(Optimizer):
         initial_divisor: float = Field(default=25.0, ge=1)
         """Peak learning rate divided by the first learning rate."""
         final_divisor: float = Field(default=1000.0, gt=0)
-        """First learning rate divided by the last one, as in torch's OneCycleLR. Below 1 the last
-        one is larger."""
+        """First learning rate divided by the last one, as in torch's OneCycleLR. A value below 1
+        makes the last one larger."""
         betas: tuple[Decay, Decay] = (0.9, 0.95)
         """AdamW's decay rates for the averages of gradients and of their squares."""
         weight_decay: float = Field(default=0.05, ge=0)

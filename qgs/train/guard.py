@@ -323,7 +323,7 @@ def first_bad_tensor(
     batch = batches[0]
 
     def see(name: str, value: Any) -> None:
-        """Check `value`, a tensor or a nested container of tensors. name: what messages call it."""
+        """Look for NaN and infinity in the tensors of `value`, which messages call `name`."""
         for path, tensor in named_tensors(value, name):
             bad = tensor[~tensor.isfinite()]
             if bad.numel() and not found:

@@ -76,7 +76,7 @@ def _part(prefix: str, weights: Weights) -> dict[str, Tensor]:
 
 
 def _comparable(tensors: Weights, count: int | None) -> Shapes:
-    """Return shapes by name, with -1 for the number of queries `count`, which may differ."""
+    """Return the shape of each tensor, with -1 in place of the number of queries, `count`."""
     return {
         name: (-1, *shape[1:]) if name.startswith(_QUERIES) and shape[:1] == (count,) else shape
         for name, shape in shapes_of(tensors).items()

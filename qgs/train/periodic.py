@@ -40,7 +40,7 @@ def judge(
 
     Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png. Training or evaluation mode
     of the model is restored. Raises InterruptedError after a scene if a stop is requested, and the
-    errors of `evaluate`. step: optimiser steps so far. average: None without a moving average.
+    errors of `evaluate`. step: optimiser steps so far. average: None if there is none.
     """
 
     def between_scenes(done: int, wanted: int) -> None:

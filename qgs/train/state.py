@@ -1,4 +1,4 @@
-"""State of a run besides its weights: step counts, random states, moments, averaged weights."""
+"""State of a run besides its weights: steps, random states, optimiser, averaged weights."""
 
 import math
 import time
@@ -68,7 +68,7 @@ class Counters:
 
     config: TrainingConfig
     scenes: str
-    """Result of `scenes_fingerprint` for the data."""
+    """Fingerprint of the training scenes, from `scenes_fingerprint`."""
     step: int = 0
     seconds: float = 0.0
     last_tick: float = 0.0

@@ -76,7 +76,7 @@ def test_one_scene_of_chunks(folders, tmp_path):
 
 
 def test_a_scene_that_is_not_named_or_not_there(folders, tmp_path):
-    must_refuse(r"holds 2 scenes: a, b: name one of them \(scene\)", chosen, ROOMS, folders)
+    must_refuse(r"holds 2 scenes: a, b: name one of them as `scene`", chosen, ROOMS, folders)
     must_refuse("holds no scene 'c', but a, b: name one", chosen, ROOMS, folders, name="c")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty/transforms.txt").touch()
