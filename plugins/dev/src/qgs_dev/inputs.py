@@ -198,7 +198,7 @@ class Maker:
         )
 
     def gaussians(self) -> Gaussians:
-        """Return random Gaussians in front of the cameras, with the parts that `gives` tells."""
+        """Return random Gaussians in front of the cameras, with parts for which `gives` is True."""
         return Gaussians(
             means=self.in_front(self.normal("BG3")),
             scales=self.uniform(0.05, 0.3, "BG3"),
@@ -221,7 +221,7 @@ class Maker:
         return LayerPrediction(self.gaussians(), self.state())
 
     def rendering(self) -> Rendering:
-        """Return random numbers as renderings; of no views for a loss that needs no renderings."""
+        """Return random renderings of all views; of no view if a loss needs no renderings."""
         rendering = self.all_views()
         unseen = getattr(self.case.component, "renderings", "") == "none"
         return map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering

@@ -38,8 +38,8 @@ def tensors_of(module: nn.Module) -> dict[str, Tensor]:
 def attributes(module: nn.Module) -> dict[str, Any]:
     """Return a module's attributes, as copies that can be compared with later ones.
 
-    Parameters, buffers and submodules are left out, and values of a `cached_property`, which are
-    computed from the module. Attributes of submodules and of their classes are included.
+    Attributes of submodules and of all classes are included. Parameters, buffers, the submodules
+    themselves and values of a `cached_property`, computed from the module, are left out.
     """
     found = {}
     for name, part in module.named_modules():
@@ -66,7 +66,7 @@ def _is_code(value: Any) -> bool:
 def _comparable(value: Any, inside: tuple[int, ...] = ()) -> Any:
     """Return a copy of `value` that can be compared with a later copy.
 
-    inside: ids of the containers that hold `value`, so that a container in itself is left out.
+    inside: ids of containers that hold `value`; None replaces a container that holds itself.
     """
     # A module may hold an object that holds the module.
     if id(value) in inside:

@@ -192,7 +192,10 @@ def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) ->
     for name, why in expected.items():
         if name not in made.difference(BASICS):
             fix = did_you_mean(str(name), made, "checks made of it")
-            raise ValueError(f"the check `{name}` cannot be expected to fail here; {fix}")
+            raise ValueError(
+                f"the check `{name}` cannot be an expected failure, because it does not run on "
+                f"this component, or because other checks need it; {fix}"
+            )
         if not (isinstance(why, str) and why.strip()):
             raise ValueError(f"the expected failure of `{name}` needs a text that gives the reason")
 
@@ -238,7 +241,7 @@ def cases_of(installed: InstalledPlugin) -> list[Case]:
 
 
 def without_case(installed: InstalledPlugin) -> list[type[Component]]:
-    """Return the components without a case: no example, and no valid default options."""
+    """Return components with no case: they have no example and no valid default options."""
     checked = {case.component for case in cases_of(installed)}
     return [component for component in installed.plugin.components if component not in checked]
 

@@ -89,7 +89,7 @@ def details(name: str, registry: Registry) -> Iterator[Table | str]:
 def _explained(
     heading: str, described: type, config: type[ComponentConfig]
 ) -> Iterator[Table | str]:
-    """Yield the summary of `described` and a table of the options of `config`."""
+    """Yield `heading`, the summary of the class `described`, and a table of `config`'s options."""
     yield f"[bold]{escape(heading)}[/bold]"
     yield escape(summary_of(described))
     rows = [*option_rows(settings_schema(config)["properties"])]

@@ -92,8 +92,8 @@ class AnchoredQueries(LearnedQueries):
         radius: bool = True
         """Give anchors a support radius. With false, they have a centre only."""
         init_radius: float = Field(default=1.0, gt=0)
-        """Initial radius of each anchor, world units. Then `radius_min` bounds it, or is added to
-        it, as `radius_bound` says."""
+        """Initial radius of each anchor, world units. `radius_bound` tells whether `radius_min` is
+        its lower bound or is added to it."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )

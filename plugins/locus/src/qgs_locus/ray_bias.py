@@ -58,9 +58,9 @@ def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
 class RayBias(AttentionBias):
     """Attention bias max(-factor D^2, lower), with D the distance of anchor centre and ray.
 
-    Each query has five numbers: the anchor's centre mu, factor = gamma / (2 sigma^2) and
-    lower = gamma * bias_min. Each token has six numbers: moment m and direction d of its ray. So
-    kernels compute only D for each pair of query and token.
+    Each query has five numbers: its anchor's centre, factor = gamma / (2 sigma^2) and
+    lower = gamma * bias_min, with weight gamma and bandwidth sigma. Each token has six: moment and
+    direction of its ray. So kernels compute only D for each pair of query and token.
     """
 
     in_triton = True
@@ -75,10 +75,10 @@ class RayBias(AttentionBias):
         bias_min: float,
         gamma: Tensor,
     ) -> Self:
-        """Make the bias of a layer.
+        """Make the attention bias of a decoder layer.
 
         center: anchor centres, world frame. sigma_sq: squared bandwidths (B, N, 1), or one number.
-        tokens: result of `ray_tokens`. bias_min: lower bound of b. gamma: positive weight, 0-d.
+        tokens: result of `ray_tokens`. bias_min: lower bound before weighting. gamma: weight > 0.
         """
         # Kernels read one row per query, even if all queries share a number.
         each_BN1 = torch.ones_like(center_BN3[..., :1])

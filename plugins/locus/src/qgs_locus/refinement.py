@@ -40,7 +40,7 @@ class AnchorRefinement(Refinement):
         limit."""
         zero_init: bool = False
         """Initialise the last layer of each MLP with zeros, so that anchors do not move at first.
-        The LocusGS release does not."""
+        With false, as in the LocusGS release, it is random."""
 
     config: Config
 

@@ -31,8 +31,8 @@ class EllipsoidQueries(LearnedQueries):
         std: float = Field(default=0.01, ge=0)
         """Standard deviation of the initial features, which are normally distributed."""
         init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
-        """Initial radii of each anchor along the axes of the world frame, world units. Then
-        `radius_min` bounds them, or is added to them, as `radius_bound` says."""
+        """Initial radii of each anchor along the axes of the world frame, world units.
+        `radius_bound` tells whether `radius_min` is their lower bound or is added to them."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )

@@ -25,7 +25,7 @@ ROTATION_FIELD: Fields = {
 def radii_field(options: RadiusOptions) -> Fields:
     """Return the state field of raw radii (B, N, 3), one for each axis of the anchor.
 
-    As in LocusGS, the `encoding` of the field names the options `radius_bound` and `radius_min`.
+    As in LocusGS, the field's `encoding` tells the values of `radius_bound` and `radius_min`.
     """
     (scalar,) = radius_field(options).values()
     return {RAW_RADII: FieldSpec((3,), encoding=scalar.encoding)}

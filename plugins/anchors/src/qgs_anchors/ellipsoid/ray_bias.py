@@ -52,7 +52,7 @@ class EllipsoidBias(AttentionBias):
         bias_min: float,
         gamma: Tensor,
     ) -> Self:
-        """Make the bias of a layer.
+        """Make the attention bias of a decoder layer.
 
         center: anchor centres, world frame. rotation: rotation matrices, anchor to world. sigma_sq:
         squared bandwidths along the anchor's axes. tokens: result of `ray_tokens`. bias_min: lower

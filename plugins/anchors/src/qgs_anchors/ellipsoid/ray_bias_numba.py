@@ -1,9 +1,9 @@
 """Numba kernels of `EllipsoidBias`, which pass once over all rays for each query.
 
 A query is a row of numbers: the anchor's centre mu, the rows of cof(W), the rows of W,
-factor = gamma / 2 and lower = gamma * bias_min. `qgs_anchors.ellipsoid.ray_bias` defines W. A token
-is a column of nine numbers: moment m, direction d and unit direction d / |d| of its ray. In the
-code, a matrix is a tuple of its nine entries.
+factor = gamma / 2 and lower = gamma * bias_min. `qgs_anchors.ellipsoid.ray_bias` defines W, gamma
+and bias_min. A token is a column of nine numbers: moment m, direction d and unit direction d / |d|
+of its ray. In the code, a matrix is a tuple of its nine entries.
 """
 
 import numpy as np
@@ -47,10 +47,10 @@ def _moment(mu, t, j):
 
 @kernel
 def write(queries, tokens, out):
-    """Write the bias max(-factor s, lower) to `out`, with s = |cof(W) (m - mu x d)|^2 / |W u|^2.
+    """Write the bias max(-factor s, lower) of queries, with numbers factor and lower, to `out`.
 
-    s is the squared distance of anchor and ray in the metric of the ellipsoid. u is the ray's unit
-    direction d / |d|.
+    s = |cof(W) (m - mu x d)|^2 / |W u|^2 is the squared distance of the anchor's centre mu from the
+    ray (moment m, direction d, u = d / |d|). W maps the anchor's ellipsoid to a unit ball.
     """
     for n in range(queries.shape[0]):
         q = queries[n]
@@ -79,7 +79,7 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Compute gradients of the queries' 23 numbers, in `out`, from the `gradient` of the bias."""
+    """Write gradients for the 23 numbers of each query to `out`, from the bias's `gradient`."""
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]

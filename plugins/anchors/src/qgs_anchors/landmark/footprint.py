@@ -1,6 +1,6 @@
-"""`landmark/footprint`, `landmark/colored`: Gaussians that start on rays and in colours of photos.
+"""`landmark/footprint`, `landmark/colored`: Gaussians that start on photo rays, in photo colours.
 
-`landmark/refine`: LocusGS's update of anchors, with steps in radii along the camera's axes.
+`landmark/refine`: LocusGS's update of anchors, with steps along camera axes in anchor radii.
 """
 
 from collections.abc import Mapping
@@ -91,8 +91,8 @@ class ColoredHead(GaussianHead):
         """Adapt the weights `learned` by a head with a different number of Gaussians per query.
 
         Each Gaussian stands for a cell of a footprint. It takes the weights that the other head has
-        for the nearest cell. Cells are compared in a square footprint, which queries have with
-        `count: null`. Other footprints may have other rows of cells.
+        for the nearest cell. Nearest means in a square footprint, which queries have with
+        `count: null`. In other footprints, cells may be in different rows.
         """
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values
@@ -100,10 +100,10 @@ class ColoredHead(GaussianHead):
         }
 
     def _of_cells(self, rows: Tensor) -> Tensor:
-        """Turn rows (K' * 14, ...) of K' cells into rows (K * 14, ...) of this head's K cells.
+        """Turn weights (K' * 14, ...) for K' cells into (K * 14, ...) for the K cells of this head.
 
-        A Gaussian, one for each cell, has 14 output channels. If the number of rows is not a
-        multiple of 14, the rows belong to another kind of head, and are returned unchanged.
+        Each cell has one Gaussian with 14 output channels. If the number of `rows` is not a
+        multiple of 14, the weights are those of another kind of head, and returned unchanged.
         """
         if len(rows) % sum(CHANNELS):
             return rows
@@ -125,9 +125,9 @@ class ColoredHead(GaussianHead):
 class FramedRefinement(AnchorRefinement):
     """Update of anchors as in `locus/refine`, with steps of centres along the camera's axes.
 
-    The unit of a step is the anchor's radius. The error of an anchor that starts on a ray of a
-    photo is some radii, mostly in depth. Along the axes of the photo's camera, depth is the same
-    direction for all anchors.
+    The unit of a step is the anchor's radius. An anchor starts on the ray of a pixel, often
+    several radii from the surface, mostly because its depth is wrong. In the frame of the camera
+    of this pixel, the depth is the z axis for all anchors.
     """
 
     name = "refine"

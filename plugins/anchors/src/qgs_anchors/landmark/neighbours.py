@@ -67,7 +67,7 @@ class NeighbourAttention(SelfAttention):
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
         """Return the attention weights of the queries with indices `queries`.
 
-        The weights are for all queries: 0 for those that are no neighbours.
+        There is a weight for each of the N queries: 0 for a query that is no neighbour.
         """
         index_BNk, _, bias_BhNk = self._near(state)
         q_BhNd, k_BhNd, _ = self.attention.project(self.norm(state.features))
@@ -96,9 +96,9 @@ class NeighbourAttention(SelfAttention):
 def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Return indices (B, N, k) of the k nearest anchors of each anchor, and a mask (B, N, k).
 
-    The mask is True for neighbours that attention may read; without `mask` it is None. k is
-    `count`, or the number of all anchors if that is less. The search is exact. Each anchor is its
-    own first neighbour, which attention may always read.
+    The result's mask is True for neighbours that attention may read, or None without `mask_BN`. k
+    is `count`, or the number of all anchors if that is less. The search is exact. Each anchor is
+    its own first neighbour, which attention may always read.
     """
     scenes, anchors, _ = center_BN3.shape
     # One part if all distances fit: torch.compile makes a graph for each number of parts.
@@ -124,7 +124,7 @@ def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Ten
 def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | None) -> Tensor:
     """Return relative positions (B, N, k, 5) of neighbours, as `NeighbourAttention` defines them.
 
-    Where `seen` is False, the neighbour is masked: it counts as if it were at the anchor itself.
+    A neighbour with `seen_BNk` False is masked: its position counts as that of the query's anchor.
     """
     around_BNk3 = _taken(center_BN3[:, None], index_BNk)[:, 0]
     step_BNk3 = around_BNk3 - center_BN3[:, :, None]

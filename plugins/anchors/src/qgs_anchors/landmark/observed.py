@@ -87,9 +87,9 @@ class ObservedQueries(Queries):
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
         """N, the number of queries, which are spread evenly over the input photos. If N equal tiles
-        with nearly square cells fill the photos, each query has a tile; otherwise queries form
-        rows, and each has a square. Null puts `per_token` queries at the centre of each token's
-        patch."""
+        with nearly square cells fill the photos, they are the footprints of the queries; otherwise
+        queries are in rows, and footprints are squares. Null puts `per_token` queries at the centre
+        of each token's patch."""
         tokens: int = Field(default=1, ge=1)
         """S, the number of points in the footprint of a query at which the query takes tokens and
         depths. It has an effect only if `count` is a number."""
@@ -161,7 +161,7 @@ class ObservedQueries(Queries):
             yield from without_effect(config, ("per_token",), "`count` is a number")
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """Return initial queries: features (B, N, D) and the fields of `fields_written`."""
+        """Return initial queries: features (B, N, D), and the fields in `fields_written`."""
         assert memory.grid is not None
         config = self.config
         device = memory.features.device

@@ -83,8 +83,8 @@ class RenderedFeedback(Feedback):
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return weights for this feedback, made from the weights `learned` of another model.
 
-        `learned` is returned unchanged if it holds any weights. Otherwise errors of the rendering
-        have no effect at first.
+        If `learned` is empty, because that model has no feedback, the returned weights give errors
+        of the rendering no effect. Otherwise `learned` is returned unchanged.
         """
         # Only a checkpoint of a model with rounds has these names.
         if learned:

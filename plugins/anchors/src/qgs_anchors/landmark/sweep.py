@@ -20,7 +20,7 @@ def mismatch(
 ) -> tuple[Tensor, Tensor]:
     """Compare windows around points of photos with the other photos, at D depths.
 
-    A window is a square of `side` pixels around one of N points, with points x points samples.
+    A window is a square of `side` pixels around one of N points, with `points` x `points` samples.
     Returns two tensors (B, N, D): differences and bools. A difference is the mean of |RGB - RGB of
     the other photo| over the samples, and over the photos that see at least half of the window at
     that depth. If no photo does, the difference is 0 and the bool False; otherwise the bool is

@@ -252,7 +252,7 @@ def _given(base: type, provides: Fields, **methods: Any) -> Any:
 
 
 def _head_with(look: Fields) -> Any:
-    """Return a head class whose Gaussians have `sh`, `features` or both, as `look` requires."""
+    """Return a head class whose Gaussians have the parts `sh` and `features` listed in `look`."""
 
     def forward(self: GaussianHead, state: QueryState) -> Any:
         x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)
@@ -277,7 +277,7 @@ def _encoder_with(case: Case) -> Any:
 
 
 def _queries_with(case: Case, given: Fields) -> Any:
-    """Return a queries class that provides the fields `given`, equal in all scenes."""
+    """Return a queries class that provides the fields `given`, with equal values in all scenes."""
 
     def start(self: LatentQueries, batch_size: int) -> QueryState:
         maker = Maker(case, Sizes(batch=1, queries=self.count))

@@ -168,7 +168,7 @@ def check_training_draws_from_torch(case: Case) -> None:
 
 
 def _outputs(module: Any, inputs: Inputs, seed: int) -> tuple[Any, torch.Tensor]:
-    """Return the outputs of a forward pass with torch's `seed`, and the random state after it."""
+    """Return outputs of a forward pass with random `seed`, and torch's random state after it."""
     with seeded(seed), torch.no_grad():
         outputs = cloned(module(*inputs.values()))
         return outputs, torch.get_rng_state()

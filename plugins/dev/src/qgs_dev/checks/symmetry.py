@@ -137,9 +137,9 @@ def _difference_after(
 ) -> str:
     """Compare outputs with the expected ones after a permutation of the inputs `names`.
 
-    Returns a description of the first difference, or "" if there is none. outputs_too: True if the
-    permutation must permute the outputs, too. part: the output of a layer that it must permute, 0
-    for the state and 1 for the memory.
+    Returns a description of the first difference, or "" if there is none. If a component returns
+    state and memory, its output number `part` must be permuted: 0 for state, 1 for memory.
+    Otherwise outputs must be permuted if `outputs_too`, and must stay the same if not.
     """
     trial = Trial(case, many(case))
     moved = {name: permute(x) if name in names else x for name, x in trial.inputs.items()}

@@ -88,9 +88,9 @@ class AttentionBias(ABC):
     ) -> tuple[Tensor | None, Tensor | None]:
         """Return the gradients of the loss with respect to `queries_nF` and `tokens_GM`.
 
-        Instead of a gradient that is not needed, return None. `requires_grad` of `self.queries` and
-        `self.tokens` tells which are needed: at least one. gradient_nM: gradient of the loss with
-        respect to the bias.
+        A gradient is None if it is not needed: if `requires_grad` of `self.queries` or of
+        `self.tokens` is False. At least one of these must be True. gradient_nM: gradient of the
+        loss with respect to the bias.
         """
         of_queries = self.queries.requires_grad
         of_tokens = self.tokens.requires_grad
@@ -150,7 +150,7 @@ def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...],
 
 
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
-    """Call a kernel on several threads, each with all tokens and some rows of `of_rows`."""
+    """Call a kernel on several threads, each with all tokens and a few rows of all `of_rows`."""
     tokens = tokens_GM.numpy()
     queries, *others = (x.numpy() for x in of_rows)
     pairs = len(queries) * tokens.shape[1]

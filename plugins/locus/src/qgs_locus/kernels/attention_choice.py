@@ -54,7 +54,7 @@ def chosen_kernel(
 
 
 def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
-    """Return the bytes that plain attention needs for the bias and its gradients of all heads."""
+    """Return the bytes that plain attention needs for the bias and, for each head, its gradient."""
     scenes, heads, queries, _ = q_BhNd.shape
     read = q_BhNd.element_size()
     each = bias.queries.element_size()

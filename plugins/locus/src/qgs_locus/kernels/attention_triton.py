@@ -5,12 +5,12 @@ block of queries: one for the result, one for the gradients of the queries. The 
 queries for a block of tokens, for the gradients of keys and values. The bias and all sums are in
 float32. Each sum is added in a fixed order, so a repeated run gives the same bits.
 
-`RayBias` is in `qgs_locus.ray_bias`. A query has five numbers: its anchor's centre mu = (x, y, z),
-factor = gamma / (2 sigma^2) and lower = gamma * bias_min. A token has six: moment m and direction d
-of its ray. The functions of the bias get pointers (n, 1) and (1, m) to the first numbers of n
-queries and m tokens. `step` is the distance in memory from one number of a token to its next.
+A query has five numbers: its anchor's centre mu = (x, y, z), factor = gamma / (2 sigma^2) and
+lower = gamma * bias_min. A token has six: moment and direction of its ray. `RayBias` in
+`qgs_locus.ray_bias` explains them. The functions of the bias get pointers (n, 1) and (1, m) to the
+first numbers of n queries and m tokens. `step` is the distance in memory of a token's numbers.
 
-Axes: as in `qgs_locus.kernels.attention_bias`. W is d, rounded up to a power of two.
+Axes: as in `qgs_locus.kernels.attention_bias`. W is the head width d, rounded up to 2^i.
 """
 
 from typing import Any
@@ -47,7 +47,7 @@ def _moment(queries, tokens, step):
 
 @jit
 def _bias(queries, tokens, step):
-    """Return the bias max(-factor D^2, lower), (n, m), with D the distance of anchor and ray."""
+    """Return the bias (n, m) of `RayBias`, from the numbers of n queries and of m tokens."""
     e0, e1, e2 = _moment(queries, tokens, step)
     bias = -tl.load(queries + 3) * (e0 * e0 + e1 * e1 + e2 * e2)
     lower = tl.load(queries + 4)
@@ -56,7 +56,7 @@ def _bias(queries, tokens, step):
 
 @jit
 def _bias_gradients(queries, tokens, step, gradient, sums):
-    """Return `sums`, five tensors (n,), plus the gradients of the queries' five numbers.
+    """Add the gradients of n queries' five numbers to `sums`, five tensors (n,); return the sums.
 
     gradient: gradient of the loss with respect to the bias (n, m). With e = mu x d - m, the result
     of `_moment`, the gradient of |e|^2 with respect to mu is 2 d x e.

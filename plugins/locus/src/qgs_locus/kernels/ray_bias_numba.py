@@ -1,8 +1,8 @@
 """Numba kernels of `RayBias`, which pass once over all rays for each query.
 
 A query is a row of five numbers (x, y, z, factor, lower): the anchor's centre mu = (x, y, z),
-factor = gamma / (2 sigma^2) and lower = gamma * bias_min. A token is a column of six numbers:
-moment m and direction d of its ray.
+factor = gamma / (2 sigma^2) and lower = gamma * bias_min, with the weight gamma and bandwidth sigma
+of the bias. A token is a column of six numbers: moment m and direction d of its ray.
 """
 
 import numpy as np
@@ -15,9 +15,9 @@ _TWO = np.float32(2)
 
 @kernel
 def write(queries, tokens, out):
-    """Write the bias max(-factor D^2, lower) to `out`, with D = |mu x d - m|.
+    """Write the bias max(-factor D^2, lower) of queries, with numbers factor and lower, to `out`.
 
-    D is the distance of the anchor's centre mu from the ray with moment m and direction d.
+    D = |mu x d - m| is the distance of the anchor's centre mu from the ray (moment m, direction d).
     """
     m0 = tokens[0]
     m1 = tokens[1]

@@ -88,7 +88,7 @@ def check(
     images: Annotated[
         str | None,
         typer.Option(
-            help="Folder of photos inside each scene, such as images_4. Default: set by format."
+            help="Folder of photos in each scene, such as images_4. Default: depends on the format."
         ),
     ] = None,
     quick: Quick = False,

@@ -15,8 +15,8 @@ VideoFrames: TypeAlias = Annotated[
     int | None,
     typer.Option(
         min=3,
-        help="Number of frames taken from a video. Default: two a second, more for fast "
-        "motion, between 40 and 240.",
+        help="Number of frames taken from a video. Default: 40 to 240, about two for each "
+        "second of the video and more in fast motion.",
     ),
 ]
 Matching: TypeAlias = Annotated[

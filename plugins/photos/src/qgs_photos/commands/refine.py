@@ -29,7 +29,7 @@ InputsOnly: TypeAlias = Annotated[
     bool,
     typer.Option(
         "--inputs-only",
-        help="Optimise only on the photos from which the reconstruction was made, not on others.",
+        help="Optimise only on the input photos of the reconstruction, not on others of the scene.",
     ),
 ]
 

@@ -35,11 +35,17 @@ PhotoSize: TypeAlias = Annotated[
     str | None,
     typer.Option(
         metavar="HxW",
-        help="Height and width of the photos in the optimisation. Default: chosen for the time.",
+        help="Height and width of the photos in the optimisation. Default: chosen so that the "
+        "optimisation fits into --minutes (or --seconds).",
     ),
 ]
 Count: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Number of Gaussians. Default: chosen for the time.")
+    int | None,
+    typer.Option(
+        min=1,
+        help="Number of Gaussians. Default: chosen so that the optimisation fits into --minutes "
+        "(or --seconds).",
+    ),
 ]
 Seconds: TypeAlias = Annotated[
     float | None,
