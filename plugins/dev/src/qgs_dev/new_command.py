@@ -63,7 +63,7 @@ def check_name(name: str) -> None:
 
 
 def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
-    """Yield path and content of every file of a new plugin `name`, filled into the template."""
+    """Yield path and content of every file of the template, filled in for the plugin `name`."""
     from jinja2 import Environment, StrictUndefined
 
     import qgs

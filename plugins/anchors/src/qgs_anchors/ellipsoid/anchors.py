@@ -55,9 +55,9 @@ class EllipsoidQueries(LearnedQueries):
         return {**CENTER_FIELD, **shape_fields(config)}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return False for rotations: weight decay would only change the lengths of quaternions.
+        """Return False for rotations; for other parameters, return what the base class returns.
 
-        Lengths have no effect on the result.
+        Weight decay would only change lengths of quaternions, which have no effect on results.
         """
         return name != "rotation" and super().decays(name, parameter)
 
@@ -79,7 +79,7 @@ class EllipsoidQueries(LearnedQueries):
 
 
 def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Convert LocusGS's weights to those of the same recipe with ellipsoidal anchors.
+    """Convert weights of a LocusGS recipe to weights of this recipe with ellipsoidal anchors.
 
     The recipe must keep LocusGS's head. Each radius becomes three equal radii, which the refinement
     changes by equal steps. Rotations are the identity. If the refinement has `rotation: false`, the

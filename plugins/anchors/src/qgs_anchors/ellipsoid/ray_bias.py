@@ -38,7 +38,7 @@ class EllipsoidBias(AttentionBias):
 
     The numbers of a query are the anchor's centre mu, the rows of cof(W), the rows of W, gamma / 2
     and gamma * bias_min. The numbers of a token are moment m, direction d and unit direction
-    d / |d| of its ray. The docstring of this module defines b, W and cof(W).
+    d / |d| of its ray. gamma is a weight. The docstring of this module defines b, W and cof(W).
     """
 
     @classmethod
@@ -56,7 +56,7 @@ class EllipsoidBias(AttentionBias):
 
         center: anchor centres, world frame. rotation: rotation matrices, anchor to world. sigma_sq:
         squared bandwidths along the anchor's axes. tokens: result of `ray_tokens`. bias_min: lower
-        bound of b. gamma: positive weight, 0-d.
+        bound of bias / gamma. gamma: weight > 0, 0-d.
         """
         sigma_BN3 = sigma_sq_BN3.sqrt()
         ball_BN9 = (rotation_BN33 / sigma_BN3[..., None, :]).mT.flatten(2)

@@ -65,7 +65,7 @@ SAMPLES = 4
 
 
 class ObservedQueries(Queries):
-    """Queries for points of photos: each starts on the ray of its point with the image token there.
+    """Queries for points of photos: each starts on the ray and with the image token of its point.
 
     The depth of the anchor along the camera's axis is z = near^w far^(1 - w), with w the sigmoid of
     an MLP of the token. With a sweep over D depths, w is the mean of D values from 0 to 1 with

@@ -150,7 +150,7 @@ def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...],
 
 
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
-    """Call a kernel on several threads, each with all tokens and a few rows of all `of_rows`."""
+    """Call a kernel on several threads, each with all tokens and some rows of the other tensors."""
     tokens = tokens_GM.numpy()
     queries, *others = (x.numpy() for x in of_rows)
     pairs = len(queries) * tokens.shape[1]

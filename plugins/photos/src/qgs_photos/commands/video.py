@@ -43,7 +43,7 @@ def video(
         ),
     ] = None,
     seconds: Annotated[
-        float, typer.Option(min=0.1, help="Length of an orbit, a spiral or a walk in seconds.")
+        float, typer.Option(min=0.1, help="Duration in seconds of an orbit, a spiral or a walk.")
     ] = 8.0,
     rate: Annotated[int, typer.Option(min=1, max=120, help="Frames per second.")] = 24,
     fov: Annotated[
