@@ -158,7 +158,7 @@ class Trial:
         )
 
     def state_of(self, outputs: Any) -> Any:
-        """Return the query state in outputs of a layer or feedback, or all outputs of other slots."""
+        """Return the query state in outputs of a layer or feedback; all outputs of other slots."""
         return outputs[0] if self.case.slot in WITH_MEMORY else outputs
 
 

@@ -78,7 +78,7 @@ class RayBias(AttentionBias):
         """Make the attention bias of a decoder layer.
 
         center: anchor centres, world frame. sigma_sq: squared bandwidths (B, N, 1), or one number.
-        tokens: result of `ray_tokens`. bias_min: lower bound of bias / gamma. gamma: weight > 0, 0-d.
+        tokens: result of `ray_tokens`. bias_min: lower bound of bias / gamma. gamma: 0-d, above 0.
         """
         # Kernels read one row per query, even if all queries share a number.
         each_BN1 = torch.ones_like(center_BN3[..., :1])
