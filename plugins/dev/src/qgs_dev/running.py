@@ -194,7 +194,7 @@ def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) ->
             fix = did_you_mean(str(name), made, "checks made of it")
             raise ValueError(
                 f"the check `{name}` cannot be an expected failure, because it does not run on "
-                f"this component, or because other checks need it; {fix}"
+                f"this component with these options, or because other checks need it; {fix}"
             )
         if not (isinstance(why, str) and why.strip()):
             raise ValueError(f"the expected failure of `{name}` needs a text that gives the reason")
