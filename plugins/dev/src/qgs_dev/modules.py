@@ -38,8 +38,8 @@ def tensors_of(module: nn.Module) -> dict[str, Tensor]:
 def attributes(module: nn.Module) -> dict[str, Any]:
     """Return a module's attributes, as copies that can be compared with later ones.
 
-    Attributes of submodules and of all classes are included. Parameters, buffers, the submodules
-    themselves and values of a `cached_property`, computed from the module, are left out.
+    Attributes of submodules, and of the classes of all these modules, are included. Left out are
+    parameters, buffers, submodules, and values of a `cached_property`, computed from the module.
     """
     found = {}
     for name, part in module.named_modules():

@@ -50,7 +50,7 @@ def write(queries, tokens, out):
     """Write the bias max(-factor s, lower) of queries, with numbers factor and lower, to `out`.
 
     s = |cof(W) (m - mu x d)|^2 / |W u|^2 is the squared distance of the anchor's centre mu from the
-    ray (moment m, direction d, u = d / |d|). W maps the anchor's ellipsoid to a unit ball.
+    ray (moment m, direction d, u = d / |d|). W maps an ellipsoid around mu to a unit ball.
     """
     for n in range(queries.shape[0]):
         q = queries[n]

@@ -125,9 +125,9 @@ class ColoredHead(GaussianHead):
 class FramedRefinement(AnchorRefinement):
     """Update of anchors as in `locus/refine`, with steps of centres along the camera's axes.
 
-    The unit of a step is the anchor's radius. An anchor starts on the ray of a pixel, often
-    several radii from the surface, mostly because its depth is wrong. In the frame of the camera
-    of this pixel, the depth is the z axis for all anchors.
+    The unit of a step is the anchor's radius. An anchor starts on the ray of a pixel, some
+    radii from its right position, mostly because its depth is wrong. In the frame of the pixel's
+    camera, depth is the z axis for all anchors.
     """
 
     name = "refine"
