@@ -16,7 +16,7 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 
 @full_precision
 def sine_embedding(
-    position: Tensor, features: int = 128, temperature: float = 10_000.0, divisor_eps: float = 1e-6
+    position: Tensor, features: int, temperature: float, divisor_eps: float
 ) -> Tensor:
     """Embed positions (..., 3) in [-1, 1] as sines and cosines (..., 3 * features).
 

@@ -70,8 +70,7 @@ class EllipsoidQueries(LearnedQueries):
         quats = F.normalize(self.rotation, dim=-1)
         fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
         fields = {name: x.expand(batch_size, -1, -1) for name, x in fields.items()}
-        features = self.features.expand(batch_size, -1, -1)
-        return QueryState(features=features, fields=fields)
+        return QueryState(features=self.features.expand(batch_size, -1, -1), fields=fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Return the ellipsoid of each anchor."""

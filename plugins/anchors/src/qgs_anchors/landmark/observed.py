@@ -192,12 +192,18 @@ class ObservedQueries(Queries):
         """
         if self.config.sweep is None:
             return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
-        match_BND = self._match(views, view_N, place_N2.expand(len(x_BND), -1, -1))
+        nearness_D = torch.linspace(0, 1, self.config.sweep, device=x_BND.device)
+        place_BN2 = place_N2.expand(len(x_BND), -1, -1)
+        side = self.config.window * side_of(len(view_N), views.cameras.shape[1], views.cameras.size)
+        error_BND, seen_BND = mismatch(
+            views, view_N, place_BN2, self._depth(nearness_D), side, SAMPLES
+        )
+        # These logits of depths are high where the photos agree.
+        match_BND = -self.sharpness.exp() * torch.where(seen_BND, error_BND, self.unseen)
         x_BND = x_BND + self.match_proj(match_BND.softmax(-1))
         # Logits add up: the network only has to correct the result of the comparison.
         share_BND = (at_least_float32(self.depth_mlp(x_BND)) + match_BND).softmax(-1)
         # Not a matrix product, which autocast would compute in half precision.
-        nearness_D = _nearness(self.config.sweep, x_BND.device)
         return x_BND, (share_BND * nearness_D).sum(-1, keepdim=True)
 
     def _joined(self, x_BXD: Tensor, nearness_BX1: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,14 +216,6 @@ class ObservedQueries(Queries):
         # The first difference is minus the sum of the others.
         apart_BNSD = x_BNSD[:, :, 1:] - mean_BND[:, :, None]
         return mean_BND + self.apart_proj(apart_BNSD.flatten(2)), nearness_BNS1.mean(2)
-
-    def _match(self, views: Views, view_N: Tensor, place_BN2: Tensor) -> Tensor:
-        """Return logits (B, N, D) of D depths, which are high where the photos agree."""
-        assert self.config.sweep is not None
-        depth_D = self._depth(_nearness(self.config.sweep, place_BN2.device))
-        side = self.config.window * side_of(len(view_N), views.cameras.shape[1], views.cameras.size)
-        error_BND, seen_BND = mismatch(views, view_N, place_BN2, depth_D, side, SAMPLES)
-        return -self.sharpness.exp() * torch.where(seen_BND, error_BND, self.unseen)
 
     def _depth(self, nearness: Tensor) -> Tensor:
         """Return depths, world units, for a nearness from 0 (`far`) to 1 (`near`)."""
@@ -247,7 +245,10 @@ class ObservedQueries(Queries):
         # A footprint of s pixels is s z / f wide at depth z.
         focal_BN1 = cameras.intrinsics[:, view_N, :2].mean(-1, keepdim=True)
         radii_BN1 = config.radius * side * z_BN1 / focal_BN1
-        rows = 0 if config.cells is None else self._rows_of_cells(config.cells)
+        rows = 0
+        if config.cells is not None:
+            fill = rows_in_square if config.count is None else rows_in_tile
+            rows = fill(config.cells)
         shape_3 = F.pad(
             share_2.to(z_BN1) * constant([width, height], z_BN1) / side, (0, 1), value=rows
         )
@@ -260,15 +261,11 @@ class ObservedQueries(Queries):
         }
         if config.cells is None:
             return anchors
-        cell_K2 = share_2 * cells(config.cells, rows, share_2)
-        view_X, place_X2 = _divided(view_N, place_N2, cell_K2)
+        view_X, place_X2 = _divided(view_N, place_N2, share_2 * cells(config.cells, rows, share_2))
         place_BX2 = place_X2.expand(len(z_BN1), -1, -1)
         # The colour of a cell is the mean over its area, which its Gaussian covers.
         colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_BX2)
         return anchors | {COLORS: colors.unflatten(1, (-1, config.cells))}
-
-    def _rows_of_cells(self, count: int) -> int:
-        return rows_in_square(count) if self.config.count is None else rows_in_tile(count)
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Return each anchor as a ball of its support radius."""
@@ -279,8 +276,3 @@ def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor,
     """Add K steps to each of N points; return the points (N * K, 2) and their views (N * K,)."""
     place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
     return view_N.repeat_interleave(len(step_K2)), place_X2
-
-
-def _nearness(count: int, device: torch.device) -> Tensor:
-    """Return `count` evenly spaced values from 0 (depth `far`) to 1 (depth `near`)."""
-    return torch.linspace(0, 1, count, device=device)

@@ -7,7 +7,6 @@ Triton cannot be used. The speeds of these ways have not been compared on a GPU.
 on sizes only, so all layers, steps and processes make the same choice.
 """
 
-import logging
 import os
 from functools import cache
 from importlib import import_module
@@ -16,6 +15,8 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import torch
 from torch import Tensor
+
+from qgs.wording import warn_once
 
 if TYPE_CHECKING:
     from qgs_locus.kernels.attention_bias import AttentionBias
@@ -49,7 +50,7 @@ def chosen_kernel(
     if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
-    _log_once(f"attention uses {found}: a bias for each query and token needs too much memory")
+    warn_once(f"attention uses {found}: a bias for each query and token needs too much memory")
     return found
 
 
@@ -88,8 +89,3 @@ def triton_version() -> tuple[int, ...]:
     if find_spec("triton") is None:
         return ()
     return tuple(map(int, import_module("triton").__version__.split(".")[:2]))
-
-
-@cache
-def _log_once(message: str) -> None:
-    logging.getLogger(__name__).warning(message)

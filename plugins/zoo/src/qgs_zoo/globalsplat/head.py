@@ -223,5 +223,4 @@ def rotation_6d(vectors: Tensor) -> Tensor:
     # Gram-Schmidt: the first column keeps its direction.
     second = second - (first * second).sum(-1, keepdim=True) * first
     second = F.normalize(second, dim=-1, eps=LEAST_LENGTH)
-    third = torch.linalg.cross(first, second, dim=-1)
-    return quaternions(torch.stack([first, second, third], -1))
+    return quaternions(torch.stack([first, second, torch.linalg.cross(first, second, dim=-1)], -1))

@@ -50,8 +50,8 @@ class Frustum(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        options = self.config.softness, self.config.near
-        per_point = beyond_frusta(prediction.gaussians.means, inputs.cameras, *options)
+        means = prediction.gaussians.means
+        per_point = beyond_frusta(means, inputs.cameras, self.config.softness, self.config.near)
         return mean_of_gaussians(per_point, prediction)
 
 
@@ -103,8 +103,7 @@ def beyond_frusta(points: Tensor, cameras: Cameras, softness: float, near: float
     inside = [(focal * side + c * z) / torch.hypot(focal, c) for side, focal, c in borders]
     depths = torch.stack([*inside, z - near])  # positive inside
     beyond_BVP = F.softplus(-depths / softness).sum(0)
-    views = math.log(cameras.shape[1])
-    return softness * (views - torch.logsumexp(-beyond_BVP, 1))
+    return softness * (math.log(cameras.shape[1]) - torch.logsumexp(-beyond_BVP, 1))
 
 
 LEAST_VIEWS = 3

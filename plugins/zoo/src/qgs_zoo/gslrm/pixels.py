@@ -123,8 +123,7 @@ class PixelQueries(Queries):
         """Return queries: features (B, M, D) of the tokens, and rays `gslrm.patch` (B, M, 4, 3)."""
         assert memory.grid is not None
         _, rows, columns = memory.grid
-        fields = {PATCH: pixel_rays(views.cameras, rows, columns)}
-        return QueryState(features=memory.features, fields=fields)
+        return QueryState(memory.features, {PATCH: pixel_rays(views.cameras, rows, columns)})
 
 
 @full_precision

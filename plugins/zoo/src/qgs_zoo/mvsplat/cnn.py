@@ -55,9 +55,7 @@ class CNN(nn.Module):
     the CNN computes the same in training and evaluation.
     """
 
-    def __init__(
-        self, width: int, strides: tuple[int, int], widths: tuple[int, int, int] = WIDTHS
-    ) -> None:
+    def __init__(self, width: int, strides: tuple[int, int], widths: tuple[int, int, int]) -> None:
         super().__init__()
         first, second, third = widths
         self.conv1 = nn.Conv2d(3, first, 7, 2, padding=3, bias=False)

@@ -101,7 +101,7 @@ class DptHead(nn.Module):
         channels: Sequence[int],
         features: int,
         joined: Sequence[int],
-        ends_in_depth: bool = False,
+        ends_in_depth: bool,
     ) -> None:
         super().__init__()
         c2, c4, _, c16 = channels
@@ -136,6 +136,5 @@ class DptHead(nn.Module):
             for x, project, resize in zip(maps, self.projects, self.resize_layers, strict=True)
         ]
         for level, (before, behind) in enumerate(joined):
-            together = torch.cat([*before, own[level], *behind], 1)
-            own[level] = self.concat_projects[level](together)
+            own[level] = self.concat_projects[level](torch.cat([*before, own[level], *behind], 1))
         return self.scratch(own)

@@ -164,8 +164,7 @@ def _alone(layer: LayerPrediction) -> LayerPrediction:
     The dynamic queries must be the same in all scenes of the batch.
     """
     moves_N = layer.state[MOVES][0]
-    each = layer.gaussians.count // len(moves_N)
-    of_gaussians = moves_N.repeat_interleave(each)
+    of_gaussians = moves_N.repeat_interleave(layer.gaussians.count // len(moves_N))
     return LayerPrediction(
         map_tensors(lambda x: x[:, of_gaussians], layer.gaussians),
         map_tensors(lambda x: x[:, moves_N], layer.state),

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 
 from qgs.contracts import (
     MEMORY_FIELDS,
-    ComponentConfig,
     Fields,
     FieldSpec,
     ModelDims,
@@ -104,13 +103,10 @@ class MultiscaleReadout(PatchViT):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.read = frozenset(config.blocks)
         self.norms = nn.ModuleList(nn.LayerNorm(dims.width, config.norm_eps) for _ in config.blocks)
         self.feature_width = len(config.blocks) * dims.width
         if config.time_channels:
-            channels = config.time_channels
-            patch = config.patch_size
-            self.time_embedding = TimeEmbedding(channels, dims.width, patch)
+            self.time_embedding = TimeEmbedding(config.time_channels, dims.width, config.patch_size)
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
@@ -152,7 +148,7 @@ class MultiscaleReadout(PatchViT):
         outputs = []
         for number, block in enumerate(self.blocks, start=1):
             x_BMD = block(x_BMD)
-            if number in self.read:
+            if number in self.config.blocks:
                 # Each block has its own norm, because the sizes of outputs differ.
                 outputs.append(self.norms[len(outputs)](x_BMD))
         return torch.cat(outputs, -1)
@@ -169,8 +165,7 @@ class MultiscaleViT(MultiscaleReadout):
         self.k_norm = nn.LayerNorm(dims.width // dims.heads, config.norm_eps)
 
     @classmethod
-    def fields_written(cls, config: ComponentConfig) -> Fields:
-        assert isinstance(config, MultiscaleReadout.Config)
+    def fields_written(cls, config: MultiscaleReadout.Config) -> Fields:
         scales = len(config.blocks)
         wide = FieldSpec(("D" if scales == 1 else f"{scales}*D",))
         return {**MEMORY_FIELDS, "memory.features": wide}
