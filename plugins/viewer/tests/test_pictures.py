@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from numpy.testing import assert_allclose
 from qgs_viewer import queries
 from qgs_viewer.look import CATEGORICAL
-from qgs_viewer.placement import Placement, hit, on_photo, splats
+from qgs_viewer.placement import IDENTITY, Placement, hit, on_photo, splats
 from scipy.spatial.transform import Rotation
 from small import cloud
 from walk import arc, pinhole
@@ -114,7 +114,7 @@ def test_a_click_hits_what_the_renderer_shows_there():
     scene = cloud(60).to(torch.float64)
     scene.colors.requires_grad_()
     picture = TorchRenderer(TorchRenderer.Config())(scene, view[None], torch.zeros(3).double())
-    found = splats(cloud(60), Placement.identity())
+    found = splats(cloud(60), IDENTITY)
     eye = view.c2w[0, :3, 3].numpy()
     checked = 0
     for v, u in product(range(8, 60, 6), repeat=2):

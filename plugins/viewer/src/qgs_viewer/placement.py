@@ -26,11 +26,6 @@ class Placement:
     scale: float
 
     @staticmethod
-    def identity() -> "Placement":
-        """Return the identity, which maps every point to itself."""
-        return Placement(torch.eye(3).double(), torch.zeros(3).double(), 1.0)
-
-    @staticmethod
     def between(world: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> "Placement":
         """Return the transform from the world of one reconstruction into the world of another.
 
@@ -50,6 +45,10 @@ class Placement:
     def vectors(self, columns: Tensor) -> Tensor:
         """Rotate and scale n vectors, the columns of (..., 3, n), without translation."""
         return self.scale * self.rotation @ columns.detach().cpu().double()
+
+
+IDENTITY = Placement(torch.eye(3).double(), torch.zeros(3).double(), 1.0)
+"""Transform that maps every point to itself."""
 
 
 @dataclass(frozen=True)

@@ -61,8 +61,7 @@ def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
     """
     in_camera = to_camera(points[None], cameras)[0, 0]
     in_camera = torch.cat([in_camera[:, :2], in_camera[:, 2:].clamp_min(1e-3)], -1)
-    pixels = to_pixels(in_camera, cameras.intrinsics[0, 0])
-    return pixels.clamp(-FARTHEST, FARTHEST).cpu()
+    return to_pixels(in_camera, cameras.intrinsics[0, 0]).clamp(-FARTHEST, FARTHEST).cpu()
 
 
 def washed(picture: Picture, strength: float = 0.6) -> Picture:
@@ -71,8 +70,7 @@ def washed(picture: Picture, strength: float = 0.6) -> Picture:
     strength: share of white in each pixel, from 0 to 1.
     """
     grey = Image.fromarray(picture).convert("L").convert("RGB")
-    white = Image.new("RGB", grey.size, "white")
-    return np.asarray(Image.blend(grey, white, strength))
+    return np.asarray(Image.blend(grey, Image.new("RGB", grey.size, "white"), strength))
 
 
 def _oversampled(picture: Picture) -> Image.Image:
@@ -209,7 +207,7 @@ def notable_queries(
     outside_N = ((places_N2 - 0.5).abs() >= 0.5 - MARGIN).any(1)
     wide_N = (_widths(gaussians, cameras).view_as(weights_NK) >= 0.5).any(1)
     faults_N = (2 * outside_N + wide_N).tolist()
-    order = sorted(weights_N.argsort(descending=True).tolist(), key=lambda n: faults_N[n])
+    order = sorted(weights_N.argsort(descending=True).tolist(), key=faults_N.__getitem__)
     chosen = list[int]()
     # those that are apart first, then any
     for least in (0.6 / count**0.5, 0.0):

@@ -11,7 +11,7 @@ from qgs.contracts import AttentionWeights, RendererConfig
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.trace import Trace, trace
 from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
-from qgs_viewer.placement import Placement, Splats, on_photo, patch_centers, splats
+from qgs_viewer.placement import IDENTITY, Placement, Splats, on_photo, patch_centers, splats
 
 Background = tuple[float, float, float]
 NEUTRAL: Background = RendererConfig().background
@@ -57,7 +57,7 @@ class QueryScene:
     gaussians: Gaussians
     views: Views | None = None
     frames: Sequence[int] = ()
-    placement: Placement = field(default_factory=Placement.identity)
+    placement: Placement = IDENTITY
     inside: Inside | None = None
     background: Background = NEUTRAL
     _traces: dict[int, Trace] = field(default_factory=dict, init=False, repr=False)
@@ -173,7 +173,7 @@ def explained(
     model: QueryGaussianModel,
     views: Views,
     frames: Sequence[int],
-    placement: Placement | None = None,
+    placement: Placement = IDENTITY,
 ) -> QueryScene:
     """Reconstruct a scene from V views (1, V) by `model`, with its queries after each layer.
 
@@ -186,10 +186,10 @@ def explained(
     # supports are asked for layer by layer, and the start counts as a layer
     states = [start, *(layer.state for layer in prediction.layers.values())]
     return QueryScene(
-        gaussians=prediction.gaussians,
-        views=views,
-        frames=frames,
-        placement=placement or Placement.identity(),
+        prediction.gaussians,
+        views,
+        frames,
+        placement,
         inside=Inside(model, memory, states),
         background=model.renderer.config.background,
     )

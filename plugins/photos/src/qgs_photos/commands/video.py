@@ -68,6 +68,5 @@ def video(
     console = Console()
     pixels = parse_size(size)
     opened = open_film_scene(source, photos, scene)
-    cameras = cameras_of(opened, path, pixels, round(seconds * rate), fov)
-    film(opened, cameras, out, rate, console)
+    film(opened, cameras_of(opened, path, pixels, round(seconds * rate), fov), out, rate, console)
     say(console, f"wrote {out}")

@@ -203,8 +203,7 @@ def _binary_cameras(model: UPath) -> Iterator[Camera]:
         for _ in range(_unpacked("<Q", file)[0]):
             number, kind, width, height = _unpacked("<IiQQ", file)
             name = model_name(kind)
-            values = _unpacked(f"<{len(parameters(name))}d", file)
-            yield number, (name, width, height, values)
+            yield number, (name, width, height, _unpacked(f"<{len(parameters(name))}d", file))
         if file.read(1):
             raise ValueError(_LONGER)
 

@@ -65,16 +65,16 @@ def _rows(file: UPath) -> np.ndarray:
 def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
     # Columns of a 3 x 5 matrix: axes and centre of the camera, then its size and focal length.
     down, right, back, centre, lens = row[:15].reshape(3, 5).T
-    height, width, focal = lens
+    height, width, focal = lens.tolist()
     c2w = np.eye(4)
     # OpenCV's axes
     c2w[:3] = np.stack([right, down, -back, centre], 1)
-    size, problems = listed_size(float(height), float(width))
+    size, problems = listed_size(height, width)
     return PhotoFrame(
         name=f"{path.parent.name}/{path.name}",
         path=path,
         c2w=c2w,
-        intrinsics=(float(focal), float(focal), float(width / 2), float(height / 2)),
+        intrinsics=(focal, focal, width / 2, height / 2),
         size=size,
         problems=problems,
     )

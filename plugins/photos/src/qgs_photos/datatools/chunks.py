@@ -4,7 +4,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -97,8 +96,7 @@ def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Iterator[Can
         elif isinstance(key, str):
             found[key] = file.name
             scenes += 1
-            photos = partial(_photos, file, place)
-            yield Candidate(key, "chunks", photos, split)
+            yield Candidate(key, "chunks", partial(_photos, file, place), split)
     if scenes < len(entries) or not entries:
         reason = f"{scenes} of its {len(entries)} entries are mappings with a 'key' not used before"
         yield Finding(label, reason, _REPACK)
@@ -108,9 +106,7 @@ def _label(split: str, name: str) -> str:
     return f"{split}/{name}" if split else name
 
 
-@lru_cache(maxsize=1)
-def _entries(file: UPath) -> list[Any]:
-    return load_chunk(file)
+_entries = lru_cache(maxsize=1)(load_chunk)
 
 
 def _photos(file: UPath, place: int) -> list[Photo]:
