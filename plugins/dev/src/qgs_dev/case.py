@@ -145,8 +145,7 @@ class Case:
 
         size: (H, W); None if the size of images is not known.
         """
-        context = contracts.RecipeContext(self.dims, size)
-        return list(self.component.problems(self.config, context))
+        return list(self.component.problems(self.config, contracts.RecipeContext(self.dims, size)))
 
     def build(self, seed: int = 0) -> Any:
         """Return a new instance, with random initial parameters from `seed`.

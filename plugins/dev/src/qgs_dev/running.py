@@ -133,8 +133,7 @@ class CaseRun:
         cause = ""
         for check in checks_for(self.case, tiers, self.variant):
             if cause:
-                message = f"`{cause}` fails: see that check"
-                yield CheckResult(self.case, check, "skipped", message)
+                yield CheckResult(self.case, check, "skipped", f"`{cause}` fails: see that check")
                 continue
             result = run_check(check, self.case, self.expected.get(check.name, ""))
             # One cause is one failure: what cannot run fails every other check.
@@ -276,7 +275,7 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
     return runs
 
 
-def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
+def check_plugin(name: str, tiers: Iterable[Tier]) -> Iterator[CheckResult]:
     """Run all checks on each case of the plugin `name`, and yield the results case by case.
 
     Raises PluginError for a plugin that cannot be loaded, or with invalid examples or exemptions.

@@ -128,12 +128,7 @@ class Trial:
 
         replaced: values that replace inputs of the same names.
         """
-        given = {**(inputs or self.inputs), **replaced}
-        return self.module(*given.values())
-
-    def with_changed(self, change: Callable[[str, Tensor], Tensor]) -> Any:
-        """Return the outputs for inputs in which `change(name, tensor)` replaces each tensor."""
-        return self(mapped(self.inputs, change))
+        return self.module(*{**(inputs or self.inputs), **replaced}.values())
 
     def in_each_mode(self, inputs: Inputs | None = None) -> Iterator[tuple[str, Any]]:
         """Yield the name of each mode and the outputs in this mode, with the same random seed."""

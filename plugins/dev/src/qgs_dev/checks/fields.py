@@ -269,8 +269,7 @@ def _encoder_with(case: Case) -> Any:
 
     def forward(self: MultiViewViT, views: Any) -> Any:
         memory = MultiViewViT.forward(self, views)
-        features = memory.features[..., wide % memory.features.shape[-1]]
-        return replace(memory, features=features)
+        return replace(memory, features=memory.features[..., wide % memory.features.shape[-1]])
 
     provides = {**MEMORY_FIELDS, "memory.features": case.reads["memory.features"]}
     return _given(MultiViewViT, provides, forward=forward)

@@ -201,7 +201,8 @@ def _expect_changes(trial: Trial, name: str, gradient: Tensor) -> None:
     def value(steps: Tensor) -> Tensor:
         move = torch.einsum("s,s...->...", steps.to(x), torch.stack(moves))
         moved = x @ torch.matrix_exp(move) if name == "cameras.c2w" else x + move
-        return _brightness(trial.with_changed(lambda n, x: moved if n == name else x))
+        inputs = mapped(trial.inputs, lambda n, x: moved if n == name else x)
+        return _brightness(trial(inputs))
 
     steps = torch.zeros(len(moves), dtype=torch.float64, requires_grad=True)
     # A GPU adds numbers in no fixed order.

@@ -170,4 +170,4 @@ def check_world_frame_makes_no_difference(case: Case) -> None:
 
     # A renderer sorts by depth and cuts at limits, so rounding has larger effects.
     rtol, atol = (1e-2, 2e-3) if case.slot == "renderer" else (1e-3, 1e-5)
-    expect_same(trial(), trial.with_changed(moved), "in a moved world", rtol, atol)
+    expect_same(trial(), trial(mapped(trial.inputs, moved)), "in a moved world", rtol, atol)

@@ -1,7 +1,7 @@
 """The commands `qgs study`, `qgs compare` and `qgs diff`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
 from rich.console import Console
@@ -13,6 +13,11 @@ from qgs_research import short_names
 app = typer.Typer(help="Train variants of a model with several seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
 diff_app = typer.Typer(help="Compare recipes.")
+
+StudyFile: TypeAlias = Annotated[
+    str,
+    typer.Argument(metavar="STUDY", help="Study file, or name of a study that comes with qgs."),
+]
 
 
 @compare_app.command()
@@ -50,10 +55,7 @@ def compare(
 
 @app.command()
 def study(
-    file: Annotated[
-        str,
-        typer.Argument(metavar="STUDY", help="Study file, or name of a study that comes with qgs."),
-    ],
+    file: StudyFile,
     out: Annotated[Path, typer.Option(help="Folder of the study. Finished runs in it are kept.")],
     workers: Annotated[
         int, typer.Option(min=0, help="Number of parallel runs. 0 trains nothing and only reports.")

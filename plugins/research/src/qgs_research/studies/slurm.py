@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from qgs.cli.options import Device
+from qgs_research.studies.commands import StudyFile
 
 app = typer.Typer(help="Write Slurm jobs that save a training in time and continue it later.")
 
@@ -52,10 +53,7 @@ def train(
 
 @app.command()
 def study(
-    file: Annotated[
-        str,
-        typer.Argument(metavar="STUDY", help="Study file, or name of a study that comes with qgs."),
-    ],
+    file: StudyFile,
     out: Annotated[Path, typer.Option(help="Folder for the runs and results of the study.")],
     threads: Annotated[int, typer.Option(min=1, help="CPU threads per run.")] = 1,
     device: Device = "auto",
