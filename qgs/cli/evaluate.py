@@ -73,8 +73,7 @@ def evaluate(
         # All rounds share weights, so a trained model can run more rounds than in training.
         model.feedback.rounds = recipe.build_model("meta", pretrained=False).feedback.rounds
     # Results are written beside a checkpoint of the user's own, not into a cache.
-    own = Path(run).expanduser().exists()
-    folder = out or evaluation_folder(checkpoint, bool(settings), own)
+    folder = out or evaluation_folder(checkpoint, bool(settings), Path(run).expanduser().exists())
     evaluation = evaluate_into(model, recipe, step, folder, console)
     # Scripts need this: a mean over fewer scenes is not comparable.
     if strict and evaluation.missing:

@@ -91,10 +91,12 @@ def with_absolute_path(recipe: Recipe) -> Recipe:
     from qgs.paths import is_local, opened_path
 
     def absolute(section: dict[str, Any], *keys: str) -> dict[str, Any]:
-        given = {key: section.get(key) for key in keys}
-        opened = {key: opened_path(path) for key, path in given.items() if isinstance(path, str)}
-        local = {key: str(path.resolve()) for key, path in opened.items() if is_local(path)}
-        return {**section, **local}
+        changed = dict(section)
+        for key in keys:
+            given = section.get(key)
+            if isinstance(given, str) and is_local(path := opened_path(given)):
+                changed[key] = str(path.resolve())
+        return changed
 
     tree = {**recipe.tree, "evaluation": absolute(recipe.tree["evaluation"], "index")}
     if tree.get("data"):

@@ -129,8 +129,7 @@ def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
     colors = seen_colors(gaussians, cameras)
     if gaussians.features is None:
         return colors
-    features = gaussians.features[:, None].expand(*colors.shape[:-1], -1)
-    return torch.cat([colors, features], -1)
+    return torch.cat([colors, gaussians.features[:, None].expand(*colors.shape[:-1], -1)], -1)
 
 
 def background_of(

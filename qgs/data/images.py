@@ -141,10 +141,10 @@ def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
 def load_array(file: IO[bytes]) -> np.ndarray:
     """Read a .npy file; raise ValueError for Python objects and for arrays of too many bytes."""
     # NumPy allocates the size in the header, so a tiny damaged file could ask for all memory.
-    if np.lib.format.read_magic(file) == (1, 0):
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    else:
-        shape, _, dtype = np.lib.format.read_array_header_2_0(file)
+    form = np.lib.format
+    first = form.read_magic(file) == (1, 0)
+    header = form.read_array_header_1_0 if first else form.read_array_header_2_0
+    shape, _, dtype = header(file)
     size = math.prod(shape) * dtype.itemsize
     if size > LARGEST:
         raise ValueError(f"the array is too large, {decimal(size)}: scale it down")

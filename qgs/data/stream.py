@@ -148,8 +148,7 @@ class SampleStream(Dataset[Batch | Exception]):
 
     def _scene(self, number: int) -> Scene:
         epoch, place = divmod(number, len(self._scenes))
-        order = self._orders.get(epoch, lambda: self._draw_epoch(epoch))
-        return self._scenes[int(order[place])]
+        return self._scenes[int(self._orders.get(epoch, lambda: self._draw_epoch(epoch))[place])]
 
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self.seed, 0, epoch])

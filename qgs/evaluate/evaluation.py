@@ -54,7 +54,7 @@ def evaluate(
         sampler or recipe.build_view_sampler(),
         views_of,
         # Depth maps cost as much as photos to decode.
-        depths="true_depth" in measures.needed,
+        depths=any("true_depth" in metric.needs for metric in measures.metrics.values()),
     )
     scorer = _Scorer(model, measures, recipe, show)
     scores: list[SceneScore] = []
@@ -117,11 +117,9 @@ class Measures:
     def __init__(self, recipe: Recipe) -> None:
         # eval(): layers of a learned metric may differ in training.
         self.metrics = {name: metric.eval() for name, metric in recipe.build_metrics().items()}
-        self.needed = set[str]()
         self.columns: dict[str, Column] = {}
         self._owners: dict[str, Metric] = {}
         for label, metric in self.metrics.items():
-            self.needed.update(metric.needs)
             for key, column in metric.columns().items():
                 name = _name(label, key)
                 if name in self.columns:
@@ -224,10 +222,10 @@ class _Scorer:
         shown = MetricInput(
             rendering.rgb,
             targets,
-            gaussians=gaussians,
-            gaussians_per_query=self.model.head.gaussians_per_query,
-            depth=rendering.depth,
-            true_depth=targets.depths,
+            gaussians,
+            self.model.head.gaussians_per_query,
+            rendering.depth,
+            targets.depths,
         )
         values = self.measures("model", shown)
         for name, baseline in BASELINES.items():

@@ -71,8 +71,8 @@ class Recipe:
         if device is None or torch.device(device).type != "meta":
             # A width of 65,536 is valid, and would end in the kernel's out-of-memory killer.
             state = build_model(self, "meta").state_dict()
-            sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
-            largest = max(sizes, key=lambda name: sizes[name])
+            sizes = {name: x.nbytes for name, x in state.items()}
+            largest = max(sizes, key=sizes.__getitem__)
             fix = f"Lower the model option that sets the size of {largest}."
             refuse_more_than_memory("the model with its weights", sum(sizes.values()), fix)
         model = build_model(self, device)
@@ -150,8 +150,7 @@ def resolve(
     try:
         parts = check(draft, problems)
     except RecipeError as error:
-        found = at_their_causes(written, error.problems, plugins)
-        raise RecipeError(found) from error.__cause__
+        raise RecipeError(at_their_causes(written, error.problems, plugins)) from error.__cause__
     settings = draft.settings
     tree: dict[str, Any] = {}
     provenance: dict[str, str] = {}

@@ -76,8 +76,7 @@ class Counters:
     @property
     def used(self) -> float:
         """Used fraction of the budget: that of the steps or of the seconds, whichever is larger."""
-        of_seconds = self.seconds / (self.config.seconds or math.inf)
-        return max(self.step / self.config.steps, of_seconds)
+        return max(self.step / self.config.steps, self.seconds / (self.config.seconds or math.inf))
 
     def every(self, steps: int) -> bool:
         """Return whether the present step is a multiple of `steps`; False if `steps` is 0."""
@@ -179,8 +178,7 @@ class OptimizerState:
         Raises KeyError if a parameter has no entry.
         """
         kept = {place: state[name] for place, name in enumerate(self._names) if state[name]}
-        present = self._optimizer.state_dict()
-        self._optimizer.load_state_dict({**present, "state": kept})
+        self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": kept})
 
 
 class MovingAverage(AveragedModel):

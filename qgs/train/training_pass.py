@@ -134,8 +134,7 @@ class TrainingPass(nn.Module):
         """Return the loss terms of the losses `names`; the other arguments are those of `Loss`."""
         terms: dict[str, Tensor] = {}
         for name in names:
-            found = self.losses[name](prediction, rendering, target, inputs)
-            for term, value in found.items():
+            for term, value in self.losses[name](prediction, rendering, target, inputs).items():
                 owner = self._owners.setdefault(term, name)
                 if owner != name:
                     raise ValueError(
