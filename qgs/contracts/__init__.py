@@ -43,7 +43,7 @@ from qgs.contracts.optimizer import Optimizer, OptimizerConfig, ParameterGroup
 from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
 from qgs.contracts.queries import LearnedQueries, Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
-from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
+from qgs.contracts.settings import Ascending, EvaluationConfig, TrainingConfig, ViewsConfig
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -51,6 +51,7 @@ __all__ = [
     "LAYER_SLOTS",
     "MEMORY_FIELDS",
     "SUBLAYER_SLOTS",
+    "Ascending",
     "AttentionWeights",
     "Centers",
     "Column",

@@ -1,11 +1,27 @@
 """Sections of a recipe that are not components: views, training, evaluation."""
 
-from typing import Literal
+from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field
 
 from qgs.contracts.component import ComponentConfig, OptionError
 from qgs.precision import Precision
+
+
+def ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    """Return a range [min, max] unchanged. Raises OptionError unless 0 < min <= max."""
+    low, high = ends
+    # not by limits of the field, so that the fix can give the numbers in order
+    if not 0 < low <= high:
+        raise OptionError(
+            f"must be [min, max] with 0 < min <= max, got [{low:g}, {high:g}]",
+            f"write [{min(ends):g}, {max(ends):g}], both above 0",
+        )
+    return ends
+
+
+Ascending: TypeAlias = Annotated[tuple[float, float], AfterValidator(ascending)]
+"""Range [min, max] of positive numbers."""
 
 
 class ViewsConfig(ComponentConfig):
@@ -19,7 +35,7 @@ class ViewsConfig(ComponentConfig):
     targets: int = Field(default=4, ge=1)
     """Number of target views per sample, chosen at random between the first and the last input
     view."""
-    gap: tuple[int, int] = (10, 40)
+    gap: Annotated[tuple[int, int], AfterValidator(ascending)] = (10, 40)
     """Distance from the first to the last input view, as [min, max] in frames. Neighbouring frames
     have distance 1. In scenes with times, neighbouring times have distance 1. A scene shorter than
     max uses at most its own length; a scene shorter than min logs a warning."""
@@ -42,18 +58,6 @@ class ViewsConfig(ComponentConfig):
     each axis. One random rotation turns each camera; another turns the camera's position about the
     first input camera. The first input camera and the target cameras stay exact. Reconstructions
     ignore this option. 0: no noise."""
-
-    @field_validator("gap")
-    @classmethod
-    def _gap_is_ordered(cls, gap: tuple[int, int]) -> tuple[int, int]:
-        # Not by limits of the field, so that the fix can give the numbers in order.
-        low, high = gap
-        if not 1 <= low <= high:
-            raise OptionError(
-                f"must be [min, max] with 1 <= min <= max, got [{low}, {high}]",
-                f"write [{max(min(gap), 1)}, {max(*gap, 1)}], in frames",
-            )
-        return gap
 
 
 class TrainingConfig(ComponentConfig):

@@ -82,7 +82,7 @@ def test_slices_and_range(source):
 RECIPE = {"recipe": 1, "plugins": ["rooms", "worlds"]}
 REFUSED = """
 data={type: rooms/procedural, image_size: [16, 24], fov: [80, 60]}
-    data: fov must be
+    data.fov: must be
 data={type: rooms/procedural, image_size: [16, 24], scenes: 0}
     data.scenes: 1
 data={type: rooms/procedural, image_size: [16, 24], rooms: 3}
@@ -94,7 +94,7 @@ data={type: worlds/procedural, image_size: [16, 24], complexity: 2}
 data={type: worlds/procedural, image_size: [16, 24], light: dark}
     data.light: 'varied'
 data={type: worlds/procedural, image_size: [16, 24], depth: [2, 1]}
-    data.depth: depth must be
+    data.depth: must be
 data={type: worlds/procedural, image_size: [16, 24], rooms: 2}
     data.rooms: 1
 """

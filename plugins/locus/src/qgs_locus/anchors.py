@@ -4,15 +4,15 @@ from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.contracts import (
+    Ascending,
     ComponentConfig,
     Fields,
     LearnedQueries,
     ModelDims,
-    OptionError,
     Problem,
     RecipeContext,
     without_effect,
@@ -51,22 +51,11 @@ class FrustumCenters(ComponentConfig):
     kind: Literal["frustum"]
     """Draw the initial anchor centres in the frustum of the first camera. They are uniformly
     distributed over the image and over the logarithm of depth."""
-    depth: tuple[float, float] = (0.3, 3.0)
+    depth: Ascending = (0.3, 3.0)
     """[nearest, farthest] depth z of a centre, world units."""
     slope: float = Field(default=0.6, gt=0)
     """Largest |x / z| and |y / z| of a centre. This is half of the frustum's width and height at
     depth 1."""
-
-    @field_validator("depth")
-    @classmethod
-    def _depth_is_ordered(cls, depth: tuple[float, float]) -> tuple[float, float]:
-        near, far = depth
-        if not 0 < near <= far:
-            raise OptionError(
-                f"must be [near, far] with 0 < near <= far, got [{near:g}, {far:g}]",
-                "give the depths at which the scene begins and ends, such as [0.3, 3.0]",
-            )
-        return depth
 
     def sample(self, count: int) -> Tensor:
         """Return `count` random anchor centres (count, 3), world frame."""

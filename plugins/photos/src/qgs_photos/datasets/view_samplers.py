@@ -4,12 +4,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import (
+    Ascending,
     Frames,
-    OptionError,
     Problem,
     RecipeContext,
     Scene,
@@ -217,20 +217,9 @@ class Overlapping(ViewSampler):
     name = "overlapping"
 
     class Config(ComponentConfig):
-        apart: tuple[float, float] = (0.5, 2.0)
+        apart: Ascending = (0.5, 2.0)
         """[least, largest] factor by which training multiplies distances and angles between
         inputs. [1, 1] takes inputs as `qgs demo` does."""
-
-        @field_validator("apart")
-        @classmethod
-        def _apart_is_ordered(cls, apart: tuple[float, float]) -> tuple[float, float]:
-            low, high = apart
-            if not 0 < low <= high:
-                raise OptionError(
-                    f"must be [least, largest] with 0 < least <= largest, got [{low}, {high}]",
-                    "write [0.5, 2.0], half to twice the usual distance",
-                )
-            return apart
 
     config: Config
 

@@ -6,12 +6,13 @@ The compiled kernels are imported when the first room is generated, because load
 import math
 from functools import cached_property
 from random import Random
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import AfterValidator, Field
 
-from qgs.contracts import Split
+from qgs.contracts.data import Split
+from qgs.contracts.settings import ascending
 from qgs_worlds.caster.lens import lens, look_along
 from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
 
@@ -27,20 +28,14 @@ WALL = 0.45
 TRAVEL = (0.65, 1.2)
 
 
+_Degrees = Annotated[float, Field(ge=5, le=150)]
+
+
 class RoomsConfig(DrawnConfig):
     """Options of `rooms/procedural`."""
 
-    fov: tuple[float, float] = (60.0, 75.0)
+    fov: Annotated[tuple[_Degrees, _Degrees], AfterValidator(ascending)] = (60.0, 75.0)
     """Smallest and largest horizontal field of view, in degrees."""
-
-    @model_validator(mode="after")
-    def _fov_is_a_range(self) -> "RoomsConfig":
-        low, high = self.fov
-        if not 5 <= low <= high <= 150:
-            raise ValueError(
-                f"fov must be [min, max] degrees with 5 <= min <= max <= 150, got [{low}, {high}]"
-            )
-        return self
 
 
 class RoomScene(DrawnScene):

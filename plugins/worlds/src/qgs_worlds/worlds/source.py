@@ -3,16 +3,15 @@
 The compiled kernels are imported when the first scene is generated, because loading numba is slow.
 """
 
-import math
 from collections.abc import Sequence
 from functools import cached_property
 from random import Random
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from qgs.contracts import Split
+from qgs.contracts import Ascending, Split
 from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
 from qgs_worlds.rooms.source import RoomScene, RoomsConfig
 
@@ -46,7 +45,7 @@ class WorldsConfig(DrawnConfig):
     light: Variety = "varied"
     """Light. `plain`: one lamp with soft shading and no cast shadows. `varied`: sun and lamps with
     shadows and highlights."""
-    depth: tuple[float, float] | None = (1.2, 4.0)
+    depth: Ascending | None = (1.2, 4.0)
     """Range [min, max] of the median depth of a scene, in metres. Each scene is scaled to a random
     median depth from this range, log-uniform. Null means that scenes are not scaled."""
     rooms: float = Field(default=0.0, ge=0, le=1)
@@ -54,15 +53,6 @@ class WorldsConfig(DrawnConfig):
     effects: bool = True
     """Vary exposure, white balance, tone curve, vignette, noise and JPEG quality from scene to
     scene. False means the same neutral camera for all scenes."""
-
-    @field_validator("depth")
-    @classmethod
-    def _depth_is_a_range(cls, depth: tuple[float, float] | None) -> tuple[float, float] | None:
-        if depth is not None and not 0 < depth[0] <= depth[1] < math.inf:
-            raise ValueError(
-                f"depth must be [min, max] metres with 0 < min <= max, got {list(depth)}"
-            )
-        return depth
 
     @cached_property
     def of_rooms(self) -> RoomsConfig:
