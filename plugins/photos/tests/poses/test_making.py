@@ -14,6 +14,7 @@ from PIL import Image
 from qgs_photos.poses import door, making
 from qgs_photos.poses.making import Options, make_poses
 from qgs_photos.poses.photos import PosesError
+from qgs_photos.poses.worker import likely
 from tables import must_refuse
 from upath import UPath
 from walked import PHOTOS, QUIET, SCALE, write_photos, write_video
@@ -79,12 +80,27 @@ def test_other_folders_are_left_alone(walk, made, tmp_path):
     assert notes.read_text() == "keep"
 
 
+def test_photos_are_matched_with_the_next_and_with_those_that_look_alike():
+    """Two walks past the same 40 places, one after the other: photos n and n + 40 look alike."""
+    features = np.random.default_rng(0).normal(size=(40, 20, 128)).astype(np.float32)
+    features /= np.linalg.norm(features, axis=2, keepdims=True)
+    features[0, 9:] = 0
+    wanted = likely(np.concatenate([features, features]))
+    assert np.diag(wanted, 40).all()
+    assert np.diag(wanted, 1).all()
+    assert (wanted == wanted.T).all()
+    assert 10 <= wanted.sum(1).min() <= wanted.mean() * 80 < 30
+
+
 @pytest.mark.slow
-def test_one_thread_and_a_seed_give_the_same_file(walk, tmp_path):
+def test_one_thread_and_a_seed_give_the_same_file(walk, shots, tmp_path, monkeypatch):
+    """And pairs are chosen by a quick matching."""
+    monkeypatch.setattr(making, "FEW", 2)
     for name in "ab":
         make_poses(walk, tmp_path / name, Options(threads=1), QUIET)
     one, other = ((tmp_path / name / "sparse/0/images.bin").read_bytes() for name in "ab")
     assert one == other
+    assert_close(tmp_path / "a", shots)
 
 
 @pytest.mark.slow

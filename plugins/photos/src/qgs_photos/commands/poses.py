@@ -23,7 +23,8 @@ Matching: TypeAlias = Annotated[
     Literal["auto", "exhaustive", "sequential"],
     typer.Option(
         help="exhaustive: match all pairs of photos. sequential: match neighbours in the order "
-        "of names. auto: sequential for videos and for more than 80 photos, else exhaustive."
+        "of names. auto: sequential for videos and for more than 80 photos, exhaustive for up to "
+        "20, else pairs of photos that look alike."
     ),
 ]
 Side: TypeAlias = Annotated[
@@ -50,9 +51,9 @@ def poses(
         ),
     ] = None,
     frames: VideoFrames = None,
-    side: Side = 1600,
+    side: Side = 1024,
     matching: Matching = "auto",
-    features: Features = 4096,
+    features: Features = 2048,
     seed: Annotated[
         int,
         typer.Option(

@@ -11,9 +11,11 @@ from upath import UPath
 from qgs_photos.datasets.colmap import Colmap
 from qgs_photos.image_files import image_files
 from qgs_photos.poses.making import RECORD, Options, fingerprint, make_poses
-from qgs_photos.poses.photos import PosesError
+from qgs_photos.poses.photos import PosesError, photo_files
 from qgs_photos.printing import say
 
+SECONDS_OF_PHOTO = 1.8
+"""CPU time for the pose of a photo of many pixels."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
@@ -49,7 +51,7 @@ def posed_folder(source: Path) -> Path:
             with FileLock(lock):
                 if not is_made(source, out):
                     text = "has no camera poses: computing them once, into"
-                    say(console, f"{source} {text} {out}")
+                    say(console, f"{source} {text} {out}{_duration(source)}")
                     for line in make_poses(source, out, Options(), console).summary:
                         say(console, line)
                 # Windows keeps it
@@ -61,6 +63,14 @@ def posed_folder(source: Path) -> Path:
             "and use FOLDER in place of the photos"
         ) from error
     return out
+
+
+def _duration(source: Path) -> str:
+    """Return about how long the poses of photos take; nothing for a video."""
+    if source.is_file():
+        return ""
+    seconds = SECONDS_OF_PHOTO * len(photo_files(source)) / Options().threads
+    return f", in about {max(seconds, 5):.0f} s"
 
 
 def is_made(source: Path, out: Path) -> bool:

@@ -37,9 +37,10 @@ from qgs_photos.poses.photos import (
 )
 
 RECORD = "poses.json"
-EXHAUSTIVE = 80
-"""Largest number of photos of which all pairs are matched. With more photos, and in videos, only
-neighbours in time are matched."""
+FEW = 20
+"""Largest number of photos of which all pairs are matched; of more, pairs that look alike."""
+MANY = 80
+"""Largest number of photos for that; of more, and of videos, neighbours in time are matched."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ class Options:
     """
 
     frames: int | None = None
-    side: int = 1600
+    side: int = 1024
     matching: str = "auto"
-    features: int = 4096
+    features: int = 2048
     threads: int = os.cpu_count() or 1
     seed: int = 0
 
@@ -169,8 +170,8 @@ def _made(source: Path, out: Path, working: Path, options: Options, show: Show) 
             f"{source} has {counted(len(photos), 'photo')} that can be read, but poses need at "
             f"least {LEAST}: replace the damaged photos ({why})"
         )
-    # neighbours in a video share most; all pairs of 80 photos take a minute
-    ordered = source.is_file() or len(photos) > EXHAUSTIVE
+    # neighbours in a video share most
+    ordered = source.is_file() or len(photos) > MANY
     job = Job(
         images=str(small),
         database=str(working / "database.db"),
@@ -178,6 +179,7 @@ def _made(source: Path, out: Path, working: Path, options: Options, show: Show) 
         groups=camera_groups(photos),
         sizes={photo.name: photo.size for photo in photos},
         sequential=ordered if options.matching == "auto" else options.matching == "sequential",
+        likely=options.matching == "auto" and len(photos) > FEW,
         features=options.features,
         threads=options.threads,
         seed=options.seed,

@@ -6,6 +6,7 @@ import re
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -108,15 +109,20 @@ def prepare(
     if names != sorted(names):
         digits = len(str(len(names)))
         names = [f"{n:0{digits}}_{name.replace('/', '_')}" for n, name in enumerate(names)]
-    for number, (file, name) in enumerate(zip(files, names, strict=True)):
-        try:
-            ready.append(_prepared(file, name, kept, working, side))
-        except (OSError, ValueError) as error:
-            # a number of the system's: it is the disk that is at fault, not the photo
-            if isinstance(error, OSError) and error.errno is not None:
-                raise
-            faulty[name] = str(error)
-        progress("photos", number + 1, len(files))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        jobs = [
+            pool.submit(_prepared, *pair, kept, working, side)
+            for pair in zip(files, names, strict=True)
+        ]
+        for name, job in zip(names, jobs, strict=True):
+            try:
+                ready.append(job.result())
+            except (OSError, ValueError) as error:
+                # a number of the system's: it is the disk that is at fault, not the photo
+                if isinstance(error, OSError) and error.errno is not None:
+                    raise
+                faulty[name] = str(error)
+            progress("photos", len(ready) + len(faulty), len(files))
     return ready, faulty
 
 
@@ -144,7 +150,7 @@ def _prepared(file: Path, name: str, kept: Path, working: Path, side: int) -> Ph
     scale = min(side / max(rgb.size), 1.0)
     if scale < 1 or not plain:
         width, height = (max(round(extent * scale), 3) for extent in rgb.size)
-        scaled = rgb.resize((width, height), Image.Resampling.LANCZOS)
+        scaled = rgb.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=2)
         _save(scaled, working / name, exif)
     else:
         _link(kept / name, working / name)
