@@ -13,8 +13,8 @@ from tape_source import Tape
 
 
 @pytest.fixture
-def tapes(tmp_path, monkeypatch):
-    tape_source.install(tmp_path / "site", monkeypatch)
+def tapes(tmp_path, install):
+    install(*tape_source.INSTALLED)
     sources._imported.cache_clear()
     for name in "ab":
         tape_source.write_tape(tmp_path / f"tapes/{name}.tape")

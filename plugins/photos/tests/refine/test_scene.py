@@ -17,6 +17,7 @@ from commands import run_qgs
 from photo_formats import PhotoSet, synthetic, write_colmap, write_nerfstudio
 from PIL import Image
 from plyfile import PlyData
+from qgs_photos.refine import scene
 from qgs_photos.refine.initial import from_points, photos_start, photos_world, sparse_points
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.result import page_writer
@@ -119,6 +120,13 @@ def test_a_model_makes_the_start(photos, tmp_path):
     assert record["held_out"] == []
     assert len(record["refined_on"]) == 9
     assert "--frames images/0.png,images/2.png --scale 0.5 " in record["command"]
+
+
+def test_an_interrupt_before_the_optimisation_says_what_is_kept(photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(scene, "chosen_initialisation", MagicMock(side_effect=KeyboardInterrupt))
+    result = run_qgs("scene", photos, "--out", tmp_path / "out")
+    assert "out is not written" in result.output
+    assert result.exit_code == 130
 
 
 def test_without_the_viewer_there_is_no_page(monkeypatch):

@@ -116,7 +116,7 @@ def check(
 
         result = check(opened_path(path), options, indices, progress)
     if result.scenes:
-        console.print(_table(result.scenes))
+        console.print(_table(result.scenes), markup=False)
     for line in (*result.findings, *(f"note: {note}" for note in result.notes)):
         say(console, str(line))
     errors = len(errors_of(result.findings))

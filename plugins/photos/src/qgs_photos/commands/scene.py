@@ -22,7 +22,10 @@ class Adjustment(StrEnum):
 
 Minutes: TypeAlias = Annotated[
     float,
-    typer.Option(help="Time in minutes, from the start of the command to the last file."),
+    typer.Option(
+        help="Time in minutes, from the start of the command to the last file. The first run takes "
+        "up to a minute more, in which it compiles."
+    ),
 ]
 Model: TypeAlias = Annotated[
     str | None,
@@ -105,7 +108,6 @@ def scene(
     that were chosen are printed as a command that makes the scene again. Ctrl-C ends the
     optimisation early and writes its result.
     """
-    # imports took time already
     began = perf_counter() - process_time()
     # what can be refused is refused before anything heavy is imported
     refuse_filled(out)
@@ -121,11 +123,8 @@ def scene(
     from qgs_photos.refine.scene import make_scene
 
     adjusted = adjust or []
-    extras = Extras(
-        degree=degree,
-        exposure=Adjustment.EXPOSURE in adjusted,
-        poses=Adjustment.POSES in adjusted,
-    )
+    exposure = Adjustment.EXPOSURE in adjusted
+    poses = Adjustment.POSES in adjusted
     options = Options(
         model=model,
         frames=frames,
@@ -136,7 +135,12 @@ def scene(
         holdout=holdout,
         scene=scene_name,
         device=choose_device(device),
-        extras=extras,
+        extras=Extras(degree=degree, exposure=exposure, poses=poses),
         masks=masks,
     )
-    make_scene(photos, out, options, began, 60 * minutes, Console())
+    try:
+        make_scene(photos, out, options, began, 60 * minutes, Console())
+    except KeyboardInterrupt:
+        # the optimisation itself ends early and writes its result
+        typer.echo(f"{out} is not written; computed camera poses are kept for the next run")
+        raise

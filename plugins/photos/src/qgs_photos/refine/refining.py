@@ -136,11 +136,11 @@ def refine(
 
 def seconds_of_step(
     gaussians: Gaussians, views: Views, renderer: nn.Module, extras: Extras = NO_EXTRAS
-) -> float:
-    """Measure the time in seconds of a step of `refine` on these Gaussians and photos (1, V).
+) -> tuple[float, float]:
+    """Measure the seconds of a step of `refine` on these Gaussians and photos (1, V).
 
-    The result is the least time of three steps with all spherical harmonics, after a step in which
-    kernels compile.
+    Returns the least time of three steps with all spherical harmonics, and the additional time of
+    the step before them, in which kernels compile.
     """
     run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras)
     run.levels = run.levels[-1:]
@@ -151,7 +151,8 @@ def seconds_of_step(
             began = perf_counter()
             run.optimise()
             times.append(perf_counter() - began)
-    return min(times[1:])
+    least = min(times[1:])
+    return least, times[0] - least
 
 
 class _Run:

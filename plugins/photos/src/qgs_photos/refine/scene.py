@@ -7,11 +7,13 @@ from time import perf_counter
 
 import torch
 from rich.console import Console
+from torch import Tensor
 
 from qgs.data.photos.finding import is_inside
 from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import views_in
 from qgs.paths import opened_path
+from qgs.reconstruction.scenes import Size
 from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians, Views
 from qgs_photos.datatools.check import faults_of_poses
@@ -46,35 +48,39 @@ def make_scene(
     """
     # its remark comes first, before minutes of bars
     page = page_writer(console)
-    ends = began + seconds - END - PART_OF_END * seconds
+    end = END + PART_OF_END * seconds
 
     def left() -> float:
-        return options.seconds or max(ends - perf_counter(), _LEAST_PART * seconds)
+        return options.seconds or max(began + seconds - end - perf_counter(), _LEAST_PART * seconds)
 
     photos = ScenePhotos(path, options)
-    for finding in faults_of_given_poses(photos)[:1]:
-        say(console, str(finding))
-    start = chosen_initialisation(photos, options)
-    small = views_in(start.world, photos.small, photos.frames).to(options.device)
-    # What masks leave out is empty, and black in viewers.
-    color = (0.0, 0.0, 0.0) if options.masks else edge_color(small)
-    renderer = AutoRenderer(AutoRenderer.Config(background=color))
-    few, seconds_of_pixel = timed_sweep(small)
-    # on this machine, with these options: exposure and harmonics cost time too
-    step = seconds_of_step(few, small, renderer, options.extras)
-    size, count = affordable(step, small.cameras.size, photos, left(), options)
-    frames = (*photos.frames, *photos.held_out)
-    every = views_in(start.world, photos.at(size), frames).to(options.device)
-    every = masked(every) if options.masks else every
+    with console.status("choosing a size for the time"):
+        for finding in faults_of_given_poses(photos)[:1]:
+            say(console, str(finding))
+        start = chosen_initialisation(photos, options)
+        small = views_in(start.world, photos.small, photos.frames).to(options.device)
+        # What masks leave out is empty, and black in viewers.
+        color = (0.0, 0.0, 0.0) if options.masks else edge_color(small)
+        renderer = AutoRenderer(AutoRenderer.Config(background=color))
+        few, seconds_of_pixel = timed_sweep(small)
+        # on this machine, with these options: exposure and harmonics cost time too
+        step, compiling = seconds_of_step(few, small, renderer, options.extras)
+        # once for each version of qgs: that time would be missing in the scene
+        began += compiling
+        size, count = affordable(step, small.cameras.size, photos, left(), options)
+        every = views_of(photos, start.world, size, options)
     budget = left()
     chosen = replace(options, size=size, gaussians=count, seconds=budget)
     command = with_start(chosen, start).command(path, str(out))
     # before the optimisation: an interrupted one can be repeated
     say(console, command)
+    plan = f"{budget:.0f} s of optimisation, on photos of {size[0]} x {size[1]} pixels"
+    say(console, f"{perf_counter() - began:.0f} s so far; {plan}; about {end:.0f} s for files")
     gaussians = start.gaussians
     if gaussians is None:
         most = int(SWEEP * budget / seconds_of_pixel)
-        gaussians = photos_start(photos.small, start.world, small, count, most)
+        with console.status("placing Gaussians at pixels"):
+            gaussians = photos_start(photos.small, start.world, small, count, most)
     views = every.select(slice(len(photos.frames)))
     refined = refine(
         gaussians,
@@ -91,7 +97,17 @@ def make_scene(
         refined = replace(refined, gaussians=surrounded(refined.gaussians, every, color))
     judged = every.select(slice(len(photos.frames), None))
     result = Result(command, start.world, refined, photos, views, judged)
-    write_scene(result, out, page, began, console)
+    with console.status("scoring held-out photos and writing files"):
+        write_scene(result, out, page, began, console)
+
+
+def views_of(
+    photos: ScenePhotos, world: tuple[Tensor, Tensor], size: Size, options: Options
+) -> Views:
+    """Return the photos of size (H, W) for the optimisation, then the held-out photos: (1, V)."""
+    frames = (*photos.frames, *photos.held_out)
+    views = views_in(world, photos.at(size), frames).to(options.device)
+    return masked(views) if options.masks else views
 
 
 def faults_of_given_poses(photos: ScenePhotos) -> Sequence[Finding]:
