@@ -12,6 +12,7 @@ import pytest
 import yaml
 from commands import done
 from photo_formats import PhotoSet, noisy_photos, write_nerfstudio
+from qgs_viewer import report
 from qgs_viewer.commands import new_folder
 from qgs_viewer.compare import RECIPES
 from qgs_viewer.comparison import open_models, resolve_fairly
@@ -88,6 +89,16 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
     done(*reconstruct[1:])
     record = json.loads(Path("report/scene/cameras.json").read_text())["to_photos"]
     assert (record["scale"], record["search"]) == (0.5, None)
+
+
+def test_no_model_is_marked_by_few_samples_or_below_a_baseline(models, tmp_path, monkeypatch):
+    results = opened(models, noisy_photos(tmp_path, 12))
+    assert report.sample_count(results) < report.RANKED
+    assert not any(best for row in report.score_rows(results).values() for _, best in row)
+    monkeypatch.setattr(report, "RANKED", 1)
+    rows = [row[0] for row in report.score_rows(results).values()]
+    highest = max(float(psnr) for psnr, _ in rows)
+    assert [best for _, best in rows[:2]] == [float(psnr) == highest for psnr, _ in rows[:2]]
 
 
 def test_small_scenes_keep_their_photos_and_others_every_eighth(models, tmp_path):

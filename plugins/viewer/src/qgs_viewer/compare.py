@@ -19,14 +19,8 @@ from qgs_viewer.report import Comparison, write_report
 
 # The shipped models that are compared on unseen rooms.
 MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
-ON_PHOTOS = {
-    64: ("worlds/landmark-64", "worlds/locus-64", "worlds/tokengs-64"),
-    128: ("worlds/landmark-128", "rooms/landmark-128", "rooms/locus-128"),
-}
-"""Default models for a user's photos, by the size that they take, in pixels.
-
-Which photos are inputs follows from the training data of the first model.
-"""
+ON_PHOTOS = {64: ["worlds/landmark-64"], 128: ["worlds/landmark-128"]}
+"""Default models for a user's photos, by the size that they take, in pixels."""
 # The recipes that `qgs demo --train` trains.
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
@@ -51,10 +45,13 @@ def compare_models(
     names = models or (MODELS if photos is None else ON_PHOTOS[side])
     console = Console()
     scenes = "Unseen scenes" if photos is None else "Your photos"
-    console.print(f"Reconstructing: {scenes.lower()}", style="dim")
     # warnings about photos concern whoever reads the page, not only the terminal
     with kept_warnings() as warnings:
         opened = open_models(names, photos, choose_device(device), pixels, scale_settings(scale))
+        for model in opened:
+            console.print(f"reconstructing with {model.name}", style="dim")
+            # Ctrl-C during the next model, or the page, leaves these scores
+            model.evaluation.write(target / model.name)
         options = ["--size", size] if size else []
         options += ["--scale", f"{scale:g}"] if scale else []
         commands = next_commands(names, opened, target, photos, options)

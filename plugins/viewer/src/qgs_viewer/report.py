@@ -7,13 +7,13 @@ from pathlib import Path
 import torch
 from rich import box
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.recipe.slots import summary_of
 from qgs.terminal import print_lines, print_table
-from qgs.wording import listed
+from qgs.wording import counted, listed
 from qgs_viewer import sections
 from qgs_viewer.comparison import Model
 from qgs_viewer.look import data_uri, hex_color, page_environment
@@ -24,6 +24,8 @@ from qgs_viewer.sections import Detail
 PICTURED_SCENES = 6
 # Target views of each scene that are shown.
 TARGETS = 2
+RANKED = 5
+"""Least number of samples by which models are ranked."""
 
 
 @dataclass(frozen=True)
@@ -42,25 +44,32 @@ class Comparison:
     notes: Sequence[str] = ()
 
 
+def sample_count(models: Sequence[Model]) -> int:
+    """Return the number of samples on which every model was scored."""
+    return sum(len(score.views) for score in models[0].evaluation.scores)
+
+
 def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
     """Return the table of scores as rows by name: first the models, then the baselines.
 
-    A cell is a pair: its text, and True if its value is the best of all models.
+    A cell is a pair: its text, and True if its value is the best of all rows. With fewer than
+    RANKED samples no value is marked.
     """
     columns = models[0].evaluation.columns
     means = [model.evaluation.means() for model in models]
+    baselines = {name: models[0].evaluation.means(name) for name in BASELINES}
+    rivals = [*means, *baselines.values()] if sample_count(models) >= RANKED else []
     rows = {}
     for model, own in zip(models, means, strict=True):
         cells = rows[model.name] = list[tuple[str, bool]]()
         for name, column in columns.items():
             cell = column.shown(own[name])
-            best = column.best(other[name] for other in means)
+            best = column.best(other[name] for other in rivals)
             # cells that read alike are both best
             cells.append((cell, best is not None and cell == column.shown(best)))
         for size in (model.evaluation.gaussians, model.parameters):
             cells.append((f"{size:,}", False))
-    for baseline in BASELINES:
-        own = models[0].evaluation.means(baseline)
+    for baseline, own in baselines.items():
         shown = [column.shown(own[name]) for name, column in columns.items()]
         # they have neither Gaussians nor parameters
         cells = [(cell, False) for cell in (*shown, "–", "–")]
@@ -71,12 +80,15 @@ def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
 def show_scores(comparison: Comparison, console: Console) -> None:
     """Print the table of scores in the terminal, with the best values in green."""
     columns = comparison.models[0].evaluation.columns.values()
-    lines = [["", *(column.title for column in columns), "Gaussians", "parameters"]]
+    lines = list[Sequence[str | Text]]()
+    lines.append(["", *(column.title for column in columns), "Gaussians", "parameters"])
     for name, row in score_rows(comparison.models).items():
-        cells = [f"[green]{cell}[/green]" if best else cell for cell, best in row]
-        lines.append([escape(name), *cells])
+        lines.append([name, *(Text(cell, "green" if best else "") for cell, best in row)])
     look = {"box": box.SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True}
-    print_table(console, f"{comparison.scenes}, best in green", lines, **look)
+    samples = sample_count(comparison.models)
+    marks = "best in green" if samples >= RANKED else "too few to rank models"
+    title = f"{comparison.scenes}, {counted(samples, 'sample')}, {marks}"
+    print_table(console, title, lines, **look)
 
 
 @torch.no_grad()
@@ -98,7 +110,8 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     height, width = first.recipe.tree["data"]["image_size"]
     data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
     judged = "beside" if first.windows else "between"
-    views = f"{first.recipe.views.inputs} inputs, scored on views {judged} the inputs"
+    samples = counted(sample_count(models), "sample")
+    views = f"{samples}, {first.recipe.views.inputs} inputs, scored on views {judged} the inputs"
     names = listed((model.name for model in models), most=3)
     metrics = [part for place, part in first.recipe.parts.items() if place[0] == "metrics"]
     environment = page_environment(uri=data_uri, hex=hex_color)
@@ -124,6 +137,7 @@ def write_report(comparison: Comparison, folder: Path, console: Console) -> None
     comparison = replace(comparison, notes=[*comparison.notes, *notes])
     show_scores(comparison, console)
     # the table first: the page takes longer
+    console.print("writing the page", style="dim")
     page = folder / "report.html"
     write_text(page, report_html(comparison, model_scenes(comparison.models, PICTURED_SCENES)))
     console.print(f"\n[bold]Report:[/bold] {page.resolve()}", soft_wrap=True)
