@@ -8,6 +8,7 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 _RAW = "[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 # A password may hold / ? #.
@@ -62,18 +63,19 @@ def show_safely() -> None:
 
 
 def print_table(
-    console: Console, title: str, rows: Sequence[Sequence[str]], **options: Any
+    console: Console, title: str, rows: Sequence[Sequence[str | Text]], **options: Any
 ) -> None:
     """Print a table whose first column aligns left and whose other columns align right.
 
-    rows: the headers, then the cells of each row. options: arguments of Rich's `Table`.
+    rows: the headers, then the cells of each row; brackets in a `str` are printed as they are.
+    options: arguments of Rich's `Table`.
     """
     table = Table(title=escape(title) or None, title_justify="left", **options)
     for place, header in enumerate(rows[0]):
         table.add_column(header, justify="right" if place else "left", overflow="fold")
     for row in rows[1:]:
         table.add_row(*row)
-    console.print(table)
+    console.print(table, markup=False)
 
 
 def print_lines(console: Console, lines: Iterable[str]) -> None:

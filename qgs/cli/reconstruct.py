@@ -112,7 +112,9 @@ def show(result: Reconstruction, console: Console) -> None:
     from qgs.reconstruction.result import KINDS
     from qgs.terminal import print_lines, print_table
 
-    title = f"{result.sample.scene}: {result.gaussians.count:,} Gaussians"
+    # A PLY shows the viewer's background through the rest.
+    alpha = result.rendering.alpha.mean()
+    title = f"{result.sample.scene}: {result.gaussians.count:,} Gaussians, mean alpha {alpha:.3f}"
     shown = Psnr.column.shown
     baselines = [name.replace("_", " ") for name in BASELINES]
     table = [["view", "photo", Psnr.column.heading, *baselines]]
@@ -134,4 +136,5 @@ def show(result: Reconstruction, console: Console) -> None:
         print_lines(console, [text.format(**tuning)])
     if result.scale:
         print_lines(console, [f"{result.scale.text}; --scale FACTOR sets another"])
-    print_lines(console, result.remarks)
+    # cameras.json has all of them
+    print_lines(console, result.remarks[:3])

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
 from qgs.terminal import print_table
 from qgs_research import short_names
@@ -25,7 +24,7 @@ def show(report: Mapping[str, Any], console: Console) -> None:
     rounds = "{rounds} rounds after {warmup} of warm-up".format(**report)
     settings = f"{base['precision']}, {of}; {rounds}"
     console.print(f"{settings}; ratios are relative to the first recipe", markup=False)
-    names = [escape(name) for name in short_names([entry["recipe"] for entry in entries])]
+    names = short_names([entry["recipe"] for entry in entries])
 
     def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
         lines = [[name, *row] for name, row in zip(names, rows, strict=True)]

@@ -109,8 +109,6 @@ def diff(
 
     "-" marks an option that does not exist in one of the recipes.
     """
-    from rich.markup import escape
-
     from qgs.model_text import parameter_counts
     from qgs.recipe import resolve
     from qgs.recipe.recipe import differing_options
@@ -124,7 +122,7 @@ def diff(
     for path, values in differing_options(ours.tree, theirs.tree).items():
         # Another component has other options, so name the components first.
         rows = slots if path.endswith(".type") else options
-        rows.append([path.removesuffix(".type"), *(escape(value or "-") for value in values)])
+        rows.append([path.removesuffix(".type"), *(value or "-" for value in values)])
     # sizes need no memory for weights
     before = parameter_counts(ours.build_model("meta"))
     after = parameter_counts(theirs.build_model("meta"))
