@@ -55,15 +55,6 @@ INSTALLED = ("qgs-tapes", "tapes", "from tape_source import plugin")
 """For the fixture `install`."""
 
 
-def install(folder, monkeypatch):
-    """Install the plugin for a test; `folder` gets the metadata of its distribution."""
-    info = folder / "qgs_tapes-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: qgs-tapes\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[qgs.plugins]\ntapes = tape_source:plugin\n")
-    monkeypatch.syspath_prepend(folder)
-
-
 def write_tape(file):
     """Noise, seen by cameras a step apart."""
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -21,8 +21,9 @@ from qgs.recipe import resolve
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"
-SCHEMA = json.loads((RECIPES / "recipe.schema.json").read_text())
-IS_VALID = jsonschema.Draft202012Validator(SCHEMA).is_valid
+IS_VALID = jsonschema.Draft202012Validator(
+    json.loads((RECIPES / "recipe.schema.json").read_text())
+).is_valid
 EVERY = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
 STUDIES = [file for file in EVERY if file.startswith("studies/")]
 FILES = [file for file in EVERY if file not in STUDIES]
@@ -135,8 +136,7 @@ def structure(node):
     sizes = ("width", "heads", "count", "depth", "gaussians_per_query", "layers")
     if not isinstance(node, dict):
         return node
-    kept = node.keys() - {*sizes, "init_std", "layer_scale"}
-    return {key: structure(node[key]) for key in kept}
+    return {key: structure(node[key]) for key in node.keys() - {*sizes, "init_std", "layer_scale"}}
 
 
 def beside_its_twin(file, twin):

@@ -36,10 +36,7 @@ def tiny(name, *overrides):
     return resolve(f"tiny/{name}.yaml", [*SMALL.split(), *overrides])
 
 
-def run(recipe, folder, resume=False, device="cpu"):
-    return train(recipe, folder, console=QUIET, device=device, resume=resume)
-
-
+run = partial(train, console=QUIET, device="cpu")
 resume = partial(run, resume=True)
 
 
@@ -62,10 +59,6 @@ def run_calling(after_step, recipe, folder, resume=False):
 
     with closing(Trainer(recipe, folder, resume=resume)) as trainer:
         return trainer.run(Calling(QUIET), stop)
-
-
-def weights(result):
-    return result.model.state_dict()
 
 
 def same(first, second):

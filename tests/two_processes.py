@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 import torch
 from accelerate.state import AcceleratorState
-from training_runs import change_samples, run
+from training_runs import change_samples, resume
 
 from qgs.data.stream import SampleError
 from qgs.recipe import resolve
@@ -39,7 +39,7 @@ def train_as(rank, port, tree, folder, *spoiled):
     if spoiled:
         spoil(*spoiled)
     try:
-        result = run(resolve(tree), folder, resume=True)
+        result = resume(resolve(tree), folder)
     except SampleError as error:
         return f"{error}; {getattr(error, '__notes__', '')}"
     except BaseException:

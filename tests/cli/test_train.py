@@ -5,14 +5,14 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 from commands import MODEL, done, sets
+from tables import contents, must_refuse
 
 from qgs.cli.train import with_absolute_path
 from qgs.recipe import resolve
 from qgs.train import training as engine
 
-FINETUNE = Path(__file__).parents[2] / "recipes/locus/dl3dv_4096_2views.yaml"
+FINETUNE = "locus/dl3dv_4096_2views.yaml"
 ROOMS = "data={type: rooms/procedural, image_size: [16, 16]}"
 
 
@@ -26,14 +26,13 @@ def test_training_names_its_budgets_and_ends_with_an_evaluation(trained):
 def test_a_finished_run_is_left_as_it_is(training, trained):
     """By the same command, another recipe, a new run in its folder and `qgs eval`."""
     _, run = trained
-    files = [path for path in run.rglob("*") if path.is_file()]
-    before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in files]
+    before = contents(run)
     assert training(run, "--resume").exit_code == 0
     assert "seed: 3" in str(training(run, "--resume", "--set", "seed=3").exception)
     assert isinstance(training(run).exception, FileExistsError)
-    assert [(path.read_bytes(), path.stat().st_mtime_ns) for path in files] == before
+    assert contents(run) == before
     done("eval", run)
-    assert [path.read_bytes() for path in files] == [text for text, _ in before]
+    assert all(path.read_bytes() == text for path, (text, _) in before.items())
 
 
 def test_a_signal_ends_with_its_number(training, tmp_path, monkeypatch):
@@ -63,8 +62,8 @@ def test_what_is_missing_is_told_before_training(tmp_path, monkeypatch):
         (("evaluation.index=null", "plugins=[rooms]", ROOMS), "runs/locus/dl3dv"),
     )
     for overrides, message in cases:
-        with pytest.raises(FileNotFoundError, match=message):
-            done("train", FINETUNE, "--out", "run", "--device", "cpu", *sets(*overrides))
+        words = ("train", FINETUNE, "--out", "run", "--device", "cpu", *sets(*overrides))
+        must_refuse(message, done, *words, kind=FileNotFoundError)
         assert not list(tmp_path.iterdir())
 
 

@@ -12,7 +12,6 @@ from qgs.data.recognition import open_for, recognised
 from qgs.recipe.registry import BUILTIN, InstalledPlugin, Registry
 
 HASH = "0a" * 32
-BLACK = (0.0, 0.0, 0.0)
 HOLDINGS = """
 train/index.json: datasets/chunks
 test/000000.torch: datasets/chunks
@@ -32,8 +31,9 @@ garden.tape: tapes/tape
 readme.txt: qgs/photos
 """
 """A file in a folder, and the source that opens the folder."""
-PLUGINS = {"datasets": InstalledPlugin(datasets), "tapes": InstalledPlugin(plugin)}
-SOURCES = Registry({"qgs": BUILTIN, **PLUGINS}).components("data")
+SOURCES = Registry(
+    {"qgs": BUILTIN, "datasets": InstalledPlugin(datasets), "tapes": InstalledPlugin(plugin)}
+).components("data")
 
 
 def test_by_content(tmp_path):
@@ -71,7 +71,7 @@ def test_a_plugin_that_fails_hinders_no_other(tmp_path, caplog, monkeypatch):
 
 def test_options_for_other_data_and_for_that_of_the_training(tmp_path):
     write_tape(tmp_path / "a.tape")
-    black = PhotosSource.Config(path="elsewhere", background=BLACK, holdout=3)
+    black = PhotosSource.Config(path="elsewhere", background=(0.0, 0.0, 0.0), holdout=3)
     trained = TapeSource.Config(path=str(tmp_path / ".." / tmp_path.name), image_size=(16, 16))
     for size, of, opened_at in (((8, 8), black, (8, 8)), (None, trained, (16, 16))):
         source, known = open_for(str(tmp_path), size, of, SOURCES)

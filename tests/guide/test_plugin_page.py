@@ -15,11 +15,13 @@ from tables import must_refuse
 from qgs.recipe import RecipeError, resolve
 from qgs.recipe.registry import InstalledPlugin
 
+WRITTEN = {str(path): text for path, text in rendered("sightline")}
+
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
     """That of the distribution as it is at the end of the page; we are in its folder."""
-    files = {str(path): text for path, text in rendered("sightline")}
+    files = {**WRITTEN}
     for title, text in (blocks("plugin.md", "python") | blocks("plugin.md", "yaml")).items():
         verb, _, path = title.partition(": ")
         if path:
@@ -35,12 +37,11 @@ def package(tmp_path_factory):
 
 
 def test_the_page_shows_what_new_plugin_writes():
-    written = {str(path): text for path, text in rendered("sightline")}
     code = blocks("plugin.md", "python")
     shown = {title: text for title, text in code.items() if ":" not in title}
     assert len(shown) == 3  # the component, the plugin and the test
-    assert shown.items() <= written.items()
-    assert blocks("plugin.md", "toml").popitem()[1] in written["pyproject.toml"]
+    assert shown.items() <= WRITTEN.items()
+    assert blocks("plugin.md", "toml").popitem()[1] in WRITTEN["pyproject.toml"]
 
 
 def test_components_keep_their_contracts(package):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from accelerate import PartialState
 from tables import must_refuse
-from training_runs import run, run_calling, same, tiny
+from training_runs import resume, run, run_calling, same, tiny
 
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
@@ -84,9 +84,7 @@ def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights(tm
 
     checkpoint = run_calling(die, recipe, tmp_path).folder.checkpoint
     assert CheckpointFile(checkpoint).step == 8  # in doubt: saved as it is
-    must_refuse(
-        "at step 15: for the last 10 steps", run, recipe, tmp_path, resume=True, kind=CollapseError
-    )
+    must_refuse("at step 15: for the last 10 steps", resume, recipe, tmp_path, kind=CollapseError)
     assert CheckpointFile(checkpoint).step == 2
     assert same(qgs.load(checkpoint).state_dict(), after[2])
 

@@ -65,8 +65,7 @@ def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
     train_in_two_processes(recipe, tmp_path, 3, True)
     records = read_jsonl(tmp_path / "history.jsonl")
     assert ["loss" in record for record in records] == [True, False, True]
-    judged = read_jsonl(tmp_path / "evaluations.jsonl")
-    assert [record["step"] for record in judged] == [2, 2, 3, 3]
+    assert [record["step"] for record in read_jsonl(tmp_path / "evaluations.jsonl")] == [2, 2, 3, 3]
 
 
 @pytest.mark.parametrize(("bad", "steps"), [(1, 0), (3, 1)], ids=["first", "later"])

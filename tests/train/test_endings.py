@@ -7,13 +7,14 @@ from unittest.mock import DEFAULT, Mock
 import pytest
 import torch
 from safetensors import SafetensorError, safe_open
-from tables import must_refuse
+from tables import contents, must_refuse
 from training_runs import (
     TRAINED,
     assert_equal_runs,
     change_samples,
     losses,
     read_jsonl,
+    resume,
     run,
     run_calling,
     saved_step,
@@ -52,10 +53,10 @@ def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, tmp_path, monkey
 
     with monkeypatch.context() as patch:
         change_samples(patch, broken)
-        with pytest.raises(OSError, match="the disk is gone") as caught:
-            run(tiny("locus", *TRAINED, "training.evaluate_every=0"), tmp_path)
-    assert caught.value.__notes__ == ["The run is saved at step 2; continue with --resume"]
-    assert run(tiny("locus", *TRAINED), tmp_path, resume=True).resumed_at == 2
+        recipe = tiny("locus", *TRAINED, "training.evaluate_every=0")
+        error = must_refuse("the disk is gone", run, recipe, tmp_path, kind=OSError)
+    assert error.__notes__ == ["The run is saved at step 2; continue with --resume"]
+    assert resume(tiny("locus", *TRAINED), tmp_path).resumed_at == 2
     whole = trained_run.folder.path
     assert_equal_runs(tmp_path, whole)
     first, second = (read_jsonl(folder / "evaluations.jsonl") for folder in (tmp_path, whole))
@@ -138,9 +139,9 @@ def test_a_full_disk_is_told_with_what_to_do(copied, monkeypatch):
     whole = state.read_bytes()
     with monkeypatch.context() as patch:
         patch.setattr("qgs.checkpoint.tensors.save_file", full)
-        must_refuse("--resume", run, recipe, copied, resume=True, kind=OSError)
+        must_refuse("--resume", resume, recipe, copied, kind=OSError)
     assert state.read_bytes() == whole
-    assert run(recipe, copied, resume=True).steps == 4
+    assert resume(recipe, copied).steps == 4
 
 
 def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
@@ -149,26 +150,24 @@ def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
     with safe_open(state, "pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         metadata = file.metadata()
-    contents = [state.read_bytes()[:-100], RunFolder(copied).checkpoint.read_bytes()]
-    weight = "queries.features"
-    one = torch.ones(1)
+    damaged = [state.read_bytes()[:-100], RunFolder(copied).checkpoint.read_bytes()]
     for name, changed in (
-        (f"weights.{weight}", one),
-        (f"ema.{weight}", None),
-        (f"moments.model.{weight}.exp_avg", None),
+        ("weights.queries.features", torch.ones(1)),
+        ("ema.queries.features", None),
+        ("moments.model.queries.features.exp_avg", None),
         ("random.", None),
     ):
         kept = {n: tensor for n, tensor in tensors.items() if not n.startswith(name)}
         write_tensors(state, kept if changed is None else kept | {name: changed}, metadata)
-        contents.append(state.read_bytes())
+        damaged.append(state.read_bytes())
     for text in ("null", '{"counters": ', '{"a":' * 5000, '{"weights": {}}'):
         write_tensors(state, tensors, metadata | {"qgs.state": text})
-        contents.append(state.read_bytes())
-    for content in contents:
+        damaged.append(state.read_bytes())
+    for content in damaged:
         state.write_bytes(content)
-        before = {path: path.read_bytes() for path in copied.glob("*.*")}
-        must_refuse(str(state), run, recipe, copied, resume=True, kind=CheckpointError)
-        assert before == {path: path.read_bytes() for path in copied.glob("*.*")}
+        before = contents(copied)
+        must_refuse(str(state), resume, recipe, copied, kind=CheckpointError)
+        assert before == contents(copied)
 
 
 def test_a_folder_in_use_is_refused_untouched(tmp_path):

@@ -7,7 +7,7 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file
 from torch.testing import assert_close
-from training_runs import tiny, weights
+from training_runs import tiny
 
 from qgs.checkpoint.model_file import save
 from qgs.checkpoint.tensors import CheckpointError
@@ -83,10 +83,8 @@ def test_larger_patches_give_the_tokens_of_coarser_images(learned):
         resolve(recipe.tree, ["model.encoder.patch_size=8", "data.image_size=[32, 32]"])
     )
     images = torch.rand(2, 3, 32, 32)
-    fine = images.repeat_interleave(2, -1).repeat_interleave(2, -2)
-    found = model.encoder.rgb_embedding(fine)
-    tokens = coarse.encoder.rgb_embedding(images)
-    assert_close(found, tokens)
+    found = model.encoder.rgb_embedding(images.repeat_interleave(2, -1).repeat_interleave(2, -2))
+    assert_close(found, coarse.encoder.rgb_embedding(images))
     assert "encoder.ray_embedding.proj.weight: (32, 6, 8, 8) -> (32, 6, 16, 16)" in told
 
 
@@ -96,6 +94,6 @@ def test_training_starts_from_a_run(trained_run, tmp_path):
     console = Console(file=StringIO(), width=300)
     grown = tiny("locus", "model.queries.count=32", start, *still)
     result = train(grown, tmp_path, device="cpu", console=console)
-    before, after = (weights(r)["queries.center"] for r in (trained_run, result))
+    before, after = (r.model.queries.center for r in (trained_run, result))
     assert_close(after[:COUNT], before, rtol=0, atol=1e-6)
     assert "queries.center: (24, 3) -> (32, 3)" in console.file.getvalue()

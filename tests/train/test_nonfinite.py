@@ -6,9 +6,8 @@ from itertools import count
 
 import pytest
 import torch
-from training_runs import tiny
+from training_runs import batches, tiny
 
-from qgs.data.stream import training_batches
 from qgs.train.distributed import make_accelerator
 from qgs.train.guard import first_bad_tensor, not_finite
 from qgs.train.training_pass import TrainingPass, compute_gradients
@@ -20,23 +19,25 @@ INF = float("inf")
 class Step:
     """One step of a small model, of two batches, that can be broken in many places."""
 
-    def __init__(self):
-        recipe = tiny("tokengs", "training.render_views=1")
+    def __init__(self, recipe):
         self.model = recipe.build_model().train()
         self.objective = TrainingPass(recipe, self.model)
-        accelerator = make_accelerator("cpu", unread=False)
-        self.gradients = partial(compute_gradients, accelerator, self.objective, recipe.training)
-        stream = training_batches(recipe.build_data(), recipe.views, 2, seed=0)
-        self.batches = [next(stream), next(stream)]
-        stream.close()
+        self.batches = batches(recipe, 2, 2)
+        self.gradients = partial(
+            compute_gradients,
+            make_accelerator("cpu", unread=False),
+            self.objective,
+            recipe.training,
+            self.batches,
+        )
 
     def first(self):
-        return first_bad_tensor(self.objective, self.batches, lambda: self.gradients(self.batches))
+        return first_bad_tensor(self.objective, self.batches, self.gradients)
 
 
 @pytest.fixture
 def step():
-    return Step()
+    return Step(tiny("tokengs", "training.render_views=1"))
 
 
 def told(step, tensor, batch):
@@ -52,7 +53,7 @@ def test_a_good_step_shows_nothing_and_keeps_no_hook(step):
         modules = step.objective.modules()
         return [dict(kept) for m in modules for kept in (m._forward_hooks, m._forward_pre_hooks)]
 
-    step.gradients(step.batches)  # after which the checks of a first forward pass are gone
+    step.gradients()  # after which the checks of a first forward pass are gone
     before = hooks()
     assert step.first() == ""
     assert hooks() == before

@@ -5,8 +5,9 @@ import re
 import pytest
 import torch
 from refusals import refused
+from tables import rows
 from torch import nn
-from training_runs import assert_equal_runs, parts_of, run, tiny
+from training_runs import assert_equal_runs, parts_of, resume, run, tiny
 
 from qgs.contracts import TrainingConfig
 from qgs.recipe import resolve
@@ -97,8 +98,7 @@ decoder.*.*_scale.gamma = decoder\.\d\.\w+_scale\.gamma
 def test_a_pattern_names_a_part_and_all_below_it():
     plain = tiny("locus", "model.decoder.depth=4")
     model = plain.build_model("meta")
-    for line in PATTERNS.strip().splitlines():
-        pattern, expected = line.split(" = ")
+    for pattern, expected in rows(PATTERNS, " = "):
         recipe = resolve(plain.tree, [f'optimizer.parts={{"{pattern}": 0.5}}'])
         wanted = {name for name, _ in model.named_parameters() if re.fullmatch(expected, name)}
         for module in (model, nn.ModuleDict({"model": model})):
@@ -167,32 +167,25 @@ def test_a_plugin_adds_an_optimiser_by_one_class(tmp_path, install):
     history = run(recipe, through).folder.history()
     assert [record["lr"] for record in history] == [0.02] * 3
     run(resolve(recipe.tree, ["training.steps=2"]), halves)
-    assert run(recipe, halves, resume=True).resumed_at == 2
+    assert resume(recipe, halves).resumed_at == 2
     assert_equal_runs(through, halves)
     moments = parts_of(through)["moments"]
     assert set().union(*moments.values()) == {"step", "row_var", "col_var", "variance"}
     assert not [name for name, values in moments.items() if "raw_radius" in name and values]
 
 
-class Small(nn.Module):
-    """A weight, one that is shared, and a counter."""
-
-    def __init__(self):
-        super().__init__()
-        self.first = nn.Linear(3, 2, bias=False)
-        self.second = self.first
-        self.register_buffer("seen", torch.zeros((), dtype=torch.long))
-
-
 def test_the_average_is_the_weighted_mean_of_all_weights_so_far():
-    model = Small()
+    """Of a weight that is shared, and a counter."""
+    linear = nn.Linear(3, 2, bias=False)
+    model = nn.Sequential(linear, linear)
+    model.register_buffer("seen", torch.tensor(0))
     average = MovingAverage(model, 0.9)
-    expected = weight = model.first.weight.detach().clone()
+    expected = linear.weight.detach().clone()
     for _ in range(5):
         weight = torch.randn(2, 3)
-        model.first.weight.data.copy_(weight)
+        linear.weight.data.copy_(weight)
         model.seen.add_(1)
         expected = 0.9 * expected + 0.1 * weight
         average.update_parameters(model)
-    expected = {"first.weight": expected, "seen": torch.tensor(5)}
+    expected = {"0.weight": expected, "seen": torch.tensor(5)}
     torch.testing.assert_close(average.state(), expected)  # shared weights once

@@ -10,17 +10,17 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from tables import must_refuse
+from tables import contents, must_refuse
 from training_runs import (
     TRAINED,
     TWO,
     assert_equal_runs,
     read_jsonl,
+    resume,
     run,
     run_calling,
     same,
     tiny,
-    weights,
 )
 
 import qgs
@@ -42,20 +42,20 @@ class Killed(BaseException):
 
 def resumed(folder, *options):
     """Continue a copy of `trained_run`."""
-    return run(tiny("locus", *TRAINED, *options), folder, resume=True)
+    return resume(tiny("locus", *TRAINED, *options), folder)
 
 
 def change_counters(folder, **values):
     recipe, states = read_state(folder / "state.safetensors")
-    parts = {**states, "counters": {**states["counters"], **values}}
-    write_state(folder / "state.safetensors", recipe.tree, parts)
+    states["counters"] |= values
+    write_state(folder / "state.safetensors", recipe.tree, states)
 
 
 def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     options = (*TWO, *SCHEDULED.strip().splitlines())
     recipe = tiny("locus", *options, "training.steps=4")
     whole, parts, again = (tmp_path / name for name in ("whole", "parts", "again.safetensors"))
-    run(recipe, whole, resume=True)
+    resume(recipe, whole)
     seen = []
 
     def note(trainer, stop):
@@ -70,14 +70,8 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     assert CheckpointFile(again).step == 2
     assert qgs.load(again).renderer.config.dilation == 2
     for other in ("objective.depth_weight=0.5", "losses.photometric.ssim_weight.values=[0.4, 0.1]"):
-        must_refuse(
-            other.split("=")[0],
-            run,
-            tiny("locus", *options, other),
-            parts,
-            resume=True,
-            kind=OtherRunError,
-        )
+        changed = tiny("locus", *options, other)
+        must_refuse(other.split("=")[0], resume, changed, parts, kind=OtherRunError)
     assert run_calling(note, recipe, parts, resume=True).resumed_at == 2
     assert_equal_runs(whole, parts)
     # After a step there stand the numbers of the next one.
@@ -87,17 +81,10 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     assert [record["lr"] for record in history] == pytest.approx(rates)
     assert history[3]["ssim"] == pytest.approx(history[0]["ssim"] / 4, rel=0.2)  # 0.1 is left
     assert [record["alpha_consistency"] > 0 for record in history] == [False, False, True, True]
-    terms = [
-        "mse",
-        "ssim",
-        "visibility",
-        "anchor_visibility",
-        "alpha_consistency",
-        "depth_consistency",
-    ]
+    terms = "mse ssim visibility anchor_visibility alpha_consistency depth_consistency"
     for record in history:
         assert record["depth_consistency"] > 0
-        assert sum(record[term] for term in terms) == pytest.approx(record["loss"])
+        assert sum(record[term] for term in terms.split()) == pytest.approx(record["loss"])
 
 
 def test_a_kill_between_the_first_two_files_loses_nothing(tmp_path, monkeypatch):
@@ -106,7 +93,7 @@ def test_a_kill_between_the_first_two_files_loses_nothing(tmp_path, monkeypatch)
         patch.setattr("qgs.train.folder.save", Mock(side_effect=Killed))
         with pytest.raises(Killed):
             run(recipe, tmp_path)
-    assert run(recipe, tmp_path, resume=True).resumed_at == 1
+    assert resume(recipe, tmp_path).resumed_at == 1
     assert CheckpointFile(tmp_path / "checkpoint.safetensors").step == 1
 
 
@@ -151,30 +138,23 @@ def test_a_run_killed_before_its_first_save_starts_again(trained_run, copied):
 
 
 def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, copied):
-    def files():
-        return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in copied.glob("*.*")}
-
-    before = files()
+    before = contents(copied)
     again = resumed(copied)
     assert (again.resumed_at, again.steps, again.stopped_by) == (3, 3, None)
-    assert same(weights(trained_run), weights(again))
-    with pytest.raises(OtherRunError, match=r"rate: 0\.001 here, 0\.0015 in") as caught:
-        resumed(copied, "optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
-    assert "seed: 4 here, 0 in the run" in str(caught.value)
-    assert "training.save_every:" not in str(caught.value)
-    must_refuse(
-        r"uses 2 samples.*asks for 3.*batch_size=2",
-        resumed,
-        copied,
-        "training.batch_size=3",
-        kind=OtherRunError,
-    )
+    assert same(trained_run.model.state_dict(), again.model.state_dict())
+    changes = ("optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
+    reason = r"rate: 0\.001 here, 0\.0015 in"
+    told = str(must_refuse(reason, resumed, copied, *changes, kind=OtherRunError))
+    assert "seed: 4 here, 0 in the run" in told
+    assert "training.save_every:" not in told
+    batches = r"uses 2 samples.*asks for 3.*batch_size=2"
+    must_refuse(batches, resumed, copied, "training.batch_size=3", kind=OtherRunError)
     folder = RunFolder(copied)
     folder.take()
     must_refuse("another process is training", resumed, copied, kind=FileExistsError)
     folder.close()
     resumed(copied)
-    assert files() == before
+    assert contents(copied) == before
     change_counters(copied, scenes="others")
     must_refuse("training scenes have changed", resumed, copied, kind=OtherRunError)
 

@@ -11,7 +11,7 @@ import pytest
 from accelerate import PartialState
 from rich.console import Console
 from tables import must_refuse
-from training_runs import TRAINED, run, tiny
+from training_runs import TRAINED, resume, run, tiny
 
 from qgs.contracts import MissingExtraError
 from qgs.recipe.recipe import flat
@@ -89,7 +89,7 @@ def test_tensorboard_gets_what_the_history_gets_and_drops_what_was_lost(copied):
         lost.tell(lambda tracker, step=step: tracker.log({"loss": float(step)}, step))
     lost.close()
     time.sleep(1.1)  # files of one second are read in the order of a number in their names
-    last = run(recipe, copied, resume=True).folder.history()[-1]
+    last = resume(recipe, copied).folder.history()[-1]
     events = module.EventAccumulator(str(copied / "tensorboard")).Reload()
     told = [(event.step, event.value) for event in events.Scalars("loss")]
     assert told == [(1, 1.0), (2, 2.0), (3, 3.0), (4, pytest.approx(last["loss"]))]
@@ -108,8 +108,7 @@ def test_a_resumed_run_goes_on_in_its_run_of_wandb(tmp_path, monkeypatch):
         trackers.tell(lambda tracker, step=step: tracker.log({"loss": 0.5}, step + 1))
     first, second = (call.kwargs["id"] for call in wandb.init.call_args_list)
     assert first == second != ""
-    logged = [call.kwargs["step"] for call in wandb.init.return_value.log.call_args_list]
-    assert logged == [1, 5]
+    assert [call.kwargs["step"] for call in wandb.init.return_value.log.call_args_list] == [1, 5]
 
 
 def test_a_line_tells_how_much_of_the_budget_is_used():

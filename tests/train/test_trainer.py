@@ -13,10 +13,10 @@ from training_runs import (
     losses,
     parts_of,
     read_jsonl,
+    resume,
     run,
     same,
     tiny,
-    weights,
 )
 
 import qgs
@@ -29,9 +29,16 @@ from qgs.train.guard import NonFiniteError
 
 
 def test_training_lowers_the_loss(tmp_path):
-    options = ("training.steps=20", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0")
-    more = ("optimizer.learning_rate=4e-3", "training.collapse_window=10")
-    run(tiny("locus", *options, *more), tmp_path, device="auto")
+    recipe = tiny(
+        "locus",
+        "training.steps=20",
+        "optimizer.warmup=4",
+        "data.scenes=1",
+        "views.mirror=0.0",
+        "optimizer.learning_rate=4e-3",
+        "training.collapse_window=10",
+    )
+    run(recipe, tmp_path, device="auto")
     falling = losses(tmp_path)
     assert sum(falling[-5:]) < 0.95 * sum(falling[:5])
 
@@ -44,7 +51,7 @@ def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
     assert {"psnr", "lr", "seconds", "gradient"} <= history[0].keys()
     assert CheckpointFile(folder.checkpoint).step == 3
     assert not trained_run.model.training
-    assert same(qgs.load(folder.checkpoint).state_dict(), weights(trained_run))
+    assert same(qgs.load(folder.checkpoint).state_dict(), trained_run.model.state_dict())
 
 
 def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path):
@@ -58,7 +65,7 @@ def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path
     files = {"recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"}
     assert {path.name for path in tmp_path.iterdir()} == files
     start, average, last = (
-        model.state_dict()["queries.features"]
+        model.queries.features
         for model in (tiny("locus").build_model(), qgs.load(folder.checkpoint_ema), plain.model)
     )
     assert 0 < (average - last).norm() < (start - last).norm()  # it follows the weights
@@ -87,7 +94,7 @@ def test_scenes_that_do_not_split_evenly_are_refused():
 
 
 def test_bf16_trains_with_finite_numbers(tmp_path):
-    model = run(tiny("locus", "training.precision=bf16"), tmp_path / "run").model
+    model = run(tiny("locus", "training.precision=bf16"), tmp_path).model
     assert all(p.dtype == torch.float32 and p.isfinite().all() for p in model.parameters())
 
 
@@ -127,16 +134,16 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     records = read_jsonl(through / "history.jsonl")
     assert ["loss" in r for r in records] == [True, False, True, False]
     assert ["skipped" in r for r in records] == [False, True, False, True]
-    curves = curves_of(through / "checkpoint.safetensors")
-    assert [record["step"] for record in curves] == [1, 3]
+    assert [record["step"] for record in curves_of(through / "checkpoint.safetensors")] == [1, 3]
     assert parts_of(through)["guard"]["skipped"] == 1  # a good step lies between the two
-    for resume in (False, True):
-        with pytest.raises(NonFiniteError, match=r"targets\.images \(1 of") as error:
-            run(tiny("locus", *options), stopped, resume)
-    for part in ("step 2 is not finite", "mse is nan"):
-        assert part in str(error.value)
+    recipe = tiny("locus", *options)
+    for begin in (run, resume):
+        place = r"targets\.images \(1 of"
+        told = str(must_refuse(place, begin, recipe, stopped, kind=NonFiniteError))
+        assert "step 2 is not finite" in told
+        assert "mse is nan" in told
     assert len(losses(stopped)) == 1
-    assert run(skipping, stopped, resume=True).resumed_at == 1
+    assert resume(skipping, stopped).resumed_at == 1
     ours = parts_of(stopped)
     theirs = parts_of(through)
     for name in ("weights", "ema"):
@@ -157,11 +164,6 @@ def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
 def test_skipping_comes_to_an_end(tmp_path, monkeypatch):
     spoil(monkeypatch, *range(2, 100))
     monkeypatch.setattr(guard, "MAX_SKIPPED", 2)
-    must_refuse(
-        "most 2 steps in a row",
-        run,
-        tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50"),
-        tmp_path,
-        kind=NonFiniteError,
-    )
+    recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
+    must_refuse("most 2 steps in a row", run, recipe, tmp_path, kind=NonFiniteError)
     assert len(read_jsonl(tmp_path / "history.jsonl")) == 3
