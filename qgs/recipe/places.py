@@ -1,4 +1,4 @@
-"""Where a recipe sets each component, after defaults, decoder layers and swaps are applied."""
+"""Places where a recipe sets components, after defaults, decoder layers and swaps are applied."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -59,10 +59,7 @@ def nearest(o, d):
 
 @inner
 def ellipsoid(o, d):
-    """Return the interval of a ray in the unit sphere: entry t, exit t, and two faces, both 0.
-
-    o: point of the ray nearest to the origin.
-    """
+    """Return the interval of a ray in the unit sphere; o is the ray's point nearest to 0."""
     inside = ONE - dot(o, o)
     root = math.sqrt(max(inside, ZERO) / dot(d, d))
     met = inside > ZERO
@@ -98,10 +95,7 @@ def _last_and_first(x, y, z):
 
 @inner
 def box(o, d):
-    """Return the interval of a ray in the cube [-1, 1]^3: entry t, exit t, two faces.
-
-    A face is the number of its axis, 0 to 2.
-    """
+    """Return the interval of a ray in the cube [-1, 1]^3. Faces are numbers of axes, 0 to 2."""
     x = slab(o[0], reciprocal(d[0]), ONE)
     y = slab(o[1], reciprocal(d[1]), ONE)
     z = slab(o[2], reciprocal(d[2]), ONE)
@@ -110,10 +104,7 @@ def box(o, d):
 
 @inner
 def block(o, d, h):
-    """Return the interval of a ray in a box with half sizes h: entry t, exit t, two faces.
-
-    A face is the number of its axis, 0 to 2.
-    """
+    """Return the interval of a ray in a box of half sizes h. Faces are numbers of axes, 0 to 2."""
     x = slab(o[0], reciprocal(d[0]), h[0])
     y = slab(o[1], reciprocal(d[1]), h[1])
     z = slab(o[2], reciprocal(d[2]), h[2])
@@ -159,10 +150,7 @@ def _shaft(o, d, radius, half):
 
 @inner
 def cylinder(o, d, h):
-    """Return the interval of a ray in a cylinder of radius h[0] and half height h[2].
-
-    Face 1 is a cap, face 0 the side.
-    """
+    """Return the interval in a cylinder of radius h[0], half height h[2]; face 1 is a cap."""
     near, far, low, high = _shaft(o, d, h[0], h[2])
     return near, far, (ONE if near == low else ZERO), (ONE if far == high else ZERO)
 
