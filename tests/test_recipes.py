@@ -74,7 +74,8 @@ def document(name):
 
 
 PAGE = document("docs/experiments.md")
-NAMED = set(re.findall(r"[\w-]+/[\w-]+\.yaml", PAGE + document("docs/api/mvsplat.md")))
+ZOO = [document(f"docs/api/{name}.md") for name in ("mvsplat", "tokengs2026")]
+NAMED = set(re.findall(r"[\w-]+/[\w-]+\.yaml", "".join([PAGE, *ZOO])))
 SHOWN = dict(re.findall(r"`(ablations/\w+\.yaml)`.* \| ([\d,]+) \|$", PAGE, re.MULTILINE))
 
 

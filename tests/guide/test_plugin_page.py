@@ -6,9 +6,11 @@ The slow tests in tests/outside type every command of the page in a fresh enviro
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 from guide_pages import blocks, contract_failures
-from qgs_dev import cases_of
+from PIL import Image
+from qgs_dev import Case, cases_of
 from qgs_dev.new_command import rendered
 from tables import must_refuse
 
@@ -48,6 +50,17 @@ def test_components_keep_their_contracts(package):
     cases = cases_of(InstalledPlugin(package.plugin))
     assert len(cases) == 9  # one of each component, and one more of its examples
     assert not contract_failures(*cases)
+
+
+def test_the_source_keeps_its_contract(package, tmp_path):
+    for name in ("first", "second"):
+        folder = tmp_path / name
+        folder.mkdir()
+        for frame in range(9):
+            Image.effect_noise((40, 24), 9 * frame).save(folder / f"{frame}.png")
+        np.save(folder / "poses.npy", np.tile(np.eye(4), (9, 1, 1)))
+        np.save(folder / "lens.npy", np.array([30.0, 30.0, 20.0, 12.0]))
+    assert not contract_failures(Case(package.ScanSource.Config(path=str(tmp_path))))
 
 
 def test_the_recipes_work_and_what_the_page_says_is_refused(package):
