@@ -112,10 +112,10 @@ class Problem:
 def without_effect(
     config: ComponentConfig, options: Iterable[str], because: str
 ) -> Iterator[Problem]:
-    """Yield a problem for each of `options` that has no effect, but is changed from its default.
+    """Yield a problem for each name in `options` whose value in `config` is not its default.
 
-    because: the setting in `config` that disables the options. Default values are no problem,
-    because a checked recipe contains the defaults of all options.
+    None of these options has an effect, because of the setting `because`. Options that keep their
+    defaults are no problem.
     """
     for option in options:
         default = type(config).model_fields[option].get_default()

@@ -1,4 +1,4 @@
-"""The metrics PSNR and SSIM, as papers report them (LocusGS evaluation)."""
+"""The metrics PSNR and SSIM, computed as in the evaluation of the LocusGS release."""
 
 from collections.abc import Mapping
 from typing import Literal, TypeAlias

@@ -91,8 +91,8 @@ class ObservedQueries(Queries):
         queries are in rows, and footprints are squares. Null puts `per_token` queries at the centre
         of each token's patch."""
         tokens: int = Field(default=1, ge=1)
-        """S, the number of points in the footprint of a query at which the query takes tokens and
-        depths. It has an effect only if `count` is a number."""
+        """S, the number of points in the footprint of a query at which the query samples tokens
+        and depths. It has an effect only if `count` is a number."""
         per_token: int = Field(default=1, ge=1)
         """Number of queries for each token if `count` is null. Each query adds a learned vector of
         its own to the token."""
