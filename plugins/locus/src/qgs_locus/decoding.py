@@ -27,9 +27,9 @@ class OffsetOptions(ComponentConfig):
     """Displacement for a raw offset t: posact(t) = sign(t) (exp|t| - 1) (LocusGS release), or t
     itself ("linear", LocusGS paper)."""
     input_limit: float | None = Field(default=100.0, gt=0)
-    """Largest size of a raw offset: larger ones are clamped before posact. Null means no limit."""
+    """Clamp raw offsets to [-input_limit, input_limit] before posact. Null means no limit."""
     output_limit: float | None = Field(default=1000.0, gt=0)
-    """Largest size of a displacement: larger ones are clamped after posact. Null means no limit."""
+    """Clamp displacements to [-output_limit, output_limit] after posact. Null means no limit."""
 
     def displacement(self, raw: Tensor) -> Tensor:
         """Return displacements for raw offsets of any shape, in float32 or float64."""
@@ -55,7 +55,7 @@ class AnchorOffsetCenters(Centers):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report `input_limit` and `output_limit` without effect because `offset` is linear."""
+        """Report `input_limit` and `output_limit`, which have no effect if `offset` is linear."""
         if config.offset == "linear":
             yield from without_effect(config, ("input_limit", "output_limit"), "`offset` is linear")
 

@@ -33,11 +33,11 @@ class AnchorRefinement(Refinement):
         """Step of a centre for an output t of its MLP: posact(t) = sign(t) (exp|t| - 1) (LocusGS
         release), or t itself ("linear", LocusGS paper)."""
         input_limit: float | None = Field(default=100.0, gt=0)
-        """Largest size of an MLP output: larger ones are clamped before posact. Null means no
-        limit."""
+        """Clamp outputs of the MLP of centres to [-input_limit, input_limit] before posact. Null
+        means no limit."""
         output_limit: float | None = Field(default=1000.0, gt=0)
-        """Largest size of a step, world units: larger ones are clamped after posact. Null means no
-        limit."""
+        """Clamp steps along each axis to [-output_limit, output_limit], world units, after posact.
+        Null means no limit."""
         zero_init: bool = False
         """Initialise the last layer of each MLP with zeros, so that anchors do not move at first.
         With false, as in the LocusGS release, it is random."""

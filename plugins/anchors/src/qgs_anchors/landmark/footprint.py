@@ -38,11 +38,11 @@ _OF_CHANNELS = ("linear.weight", "linear.bias")
 class FootprintCenters(RadiusScaledCenters):
     """Gaussian means at mu + r (u, v, 0) + r posact(offset), along the axes of the photo's camera.
 
-    mu and r are centre and radius of the anchor. The anchor starts on a ray of a photo. The part of
-    the photo that its query stands for is the footprint, which has a cell for each Gaussian. (u, v)
-    is the centre of the cell relative to the centre of the footprint; the unit is the root of the
-    footprint's area. If r is this root, measured at the anchor's depth, an offset of 0 puts the
-    Gaussian on the ray of its cell. posact(t) is sign(t) (exp|t| - 1).
+    mu and r are centre and radius of the anchor, which starts on a ray of a photo. The part of the
+    photo that the anchor's query stands for is the footprint, with a cell for each Gaussian. (u, v)
+    is the centre of the cell relative to that of the footprint, in units of the square root of the
+    footprint's area. If r is this square root, measured at the anchor's depth, an offset of 0 puts
+    the Gaussian on the ray of its cell. posact(t) is sign(t) (exp|t| - 1).
     """
 
     name = "footprint"
@@ -88,11 +88,11 @@ class ColoredHead(GaussianHead):
         return {**color_field(config.gaussians_per_query), **radius_field(config)}
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Adapt the weights `learned` by a head with a different number of Gaussians per query.
+        """Adapt the weights `learned` of a head with a different number of Gaussians per query.
 
         Each Gaussian stands for a cell of a footprint. It takes the weights that the other head has
-        for the nearest cell. Nearest means in a square footprint, which queries have with
-        `count: null`. In other footprints, cells may be in different rows.
+        for the nearest cell. Distances between cells are those in a square footprint, which
+        queries have with `count: null`. In other footprints, cells may be in different rows.
         """
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values
@@ -125,9 +125,9 @@ class ColoredHead(GaussianHead):
 class FramedRefinement(AnchorRefinement):
     """Update of anchors as in `locus/refine`, with steps of centres along the camera's axes.
 
-    The unit of a step is the anchor's radius. An anchor starts on the ray of a pixel, some
-    radii from its right position, mostly because its depth is wrong. In the frame of the pixel's
-    camera, depth is the z axis for all anchors.
+    The unit of a step is the anchor's radius. An anchor starts on the ray of a pixel, at a distance
+    of some radii from the right position, mostly because the anchor's depth is wrong. In the frame
+    of the pixel's camera, depth is the z axis for all anchors.
     """
 
     name = "refine"

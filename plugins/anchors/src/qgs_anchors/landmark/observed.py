@@ -73,8 +73,8 @@ class ObservedQueries(Queries):
     this photo and the other photos at that depth; t is learned.
 
     A query's footprint is the part of its photo that it stands for, a tile or a square. The side of
-    a footprint is the root of its area. The initial radius of the anchor is `radius` times this
-    side, measured at the anchor's depth.
+    a footprint is the square root of its area. The initial radius of the anchor is `radius` times
+    this side, measured at the anchor's depth.
 
     A query may take S tokens from its footprint. It starts with their mean, plus a learned matrix
     times the differences of all tokens but the first from the mean. Its w is the mean of the w of
@@ -114,7 +114,7 @@ class ObservedQueries(Queries):
         cells: int | None = Field(default=None, ge=1)
         """K, the number of cells into which a footprint is divided. Queries store the mean colour
         of each cell for the head `landmark/colored`. Null stores no colours. For example, 8 cells
-        form rows of 2, 3 and 3 if `count` is null, and 2 rows of 4 if it is a number."""
+        form rows of 2, 3 and 3 if `count` is null, and 2 rows of 4 if `count` is a number."""
 
         @field_validator("far")
         @classmethod
@@ -273,6 +273,6 @@ class ObservedQueries(Queries):
 
 
 def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
-    """Add K steps to each of N points; return the points (N * K, 2) and their views (N * K,)."""
+    """Return K points around each of N points, (N * K, 2), and the indices of their photos."""
     place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
     return view_N.repeat_interleave(len(step_K2)), place_X2

@@ -140,10 +140,10 @@ def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
 def sampled(
     maps_BMC: Tensor, grid: tuple[int, int, int], view_N: Tensor, place_BN2: Tensor
 ) -> Tensor:
-    """Sample maps at points, bilinearly between the centres of patches, as (B, N, C).
+    """Sample values of patches at N points of photos, bilinearly between centres, as (B, N, C).
 
-    Points beyond the outermost centres get the values at the nearest edge. maps: values of the
-    patches of a grid (V, rows, columns), by view, row and column.
+    Points beyond the outermost centres get the values at the nearest edge. maps: values (B, M, C)
+    of the patches of `grid` (V, rows, columns). view: index (N,) of the photo of each point.
     """
     maps_BVChw = maps_BMC.unflatten(1, grid).movedim(-1, 2)
     return bilinear(maps_BVChw, view_N, place_BN2[:, :, None])[..., 0].mT

@@ -229,7 +229,7 @@ def check_project_makes_the_memory_again(case: Case) -> None:
 
 
 def _wide_and_tall(case: Case, size: tuple[int, int]) -> Iterator[tuple[str, Views]]:
-    """Yield views of `size` (H, W), then of (W, H) if that is accepted, each with a description."""
+    """Yield views of `size` (H, W), and of (W, H) if the component takes it, with descriptions."""
     for image in dict.fromkeys([size, (size[1], size[0])]):
         if image == size or not case.problems(image):
             where = f"with images of {image[0]} x {image[1]}"

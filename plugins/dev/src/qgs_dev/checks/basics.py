@@ -265,8 +265,8 @@ def _configs_in(annotation: Any) -> set[type[BaseModel]]:
 def _decoded(case: Case, options: dict[str, Any]) -> tuple[ComponentConfig | None, str]:
     """Write options as YAML and read them again as a recipe does.
 
-    Returns the options that were read and "". If they are refused, returns None or some options,
-    and the message of the error.
+    Returns the options that were read, and the error's message if they are refused, otherwise "".
+    Refused options may be None.
     """
     problems = Problems()
     node = load_mapping(dump(options), "case", problems)

@@ -63,7 +63,7 @@ class AttentionBias(ABC):
         """Return the bias (n, M) of n queries and all tokens of a scene, differentiable."""
 
     def compiled(self) -> tuple[Kernel, Kernel] | None:
-        """Return two kernels (`qgs.kernels.kernel`) for float32 on a CPU, or None without kernels.
+        """Return two kernels (`qgs.kernels.kernel`) for float32 on a CPU; None if there are none.
 
         The first takes arrays (queries, tokens, out) and writes `value` to `out`. The second takes
         (queries, tokens, gradient, out). From the gradient of the bias (n, M) it computes the
@@ -144,7 +144,7 @@ class AttentionBias(ABC):
 
 
 def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...], ...]:
-    """Split both tensors by queries into parts of about `_PART` pairs of query and token."""
+    """Split queries (n, F) and values (n, M) by queries, into parts of about `_PART` values."""
     rows = max(_PART // max(of_pairs_nM.shape[1], 1), 1)
     return queries_nF.split(rows), of_pairs_nM.split(rows)
 

@@ -41,7 +41,8 @@ def chosen_kernel(
     if kernel == "triton" and not fits_triton(q_BhNd, bias):
         raise ValueError(
             "Triton kernels cannot compute this attention: they need triton 3.5, a GPU, LocusGS's "
-            "bias, tokens without gradient, heads of at most 256 channels, and no float64"
+            "bias, tokens without gradient, heads of at most 256 channels, and no float64; use "
+            'kernel="auto"'
         )
     if kernel != "auto":
         return kernel

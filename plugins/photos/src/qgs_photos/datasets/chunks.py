@@ -50,7 +50,7 @@ class ChunksConfig(SceneSource.Config):
     on. 0 holds out the frames that the chunk lists as held out. Only chunks of `qgs data pack`
     can have such a list; without it, 0 holds out none."""
     max_scenes: int = Field(default=0, ge=0)
-    """Use only this number of scenes from each split, the first of its list. 0 uses all."""
+    """Use only the first scenes of each split, at most this number. 0 uses all."""
     min_frames: int = Field(default=0, ge=0)
     """Leave out scenes with fewer frames than this number. To count frames, every chunk is opened
     at the start. 0 keeps all scenes and opens none."""

@@ -43,7 +43,7 @@ _PLACES = (
     "dense/sparse",
     "dense/*/sparse",
 )
-_LONGER = "a file has more data than the number of records that it announces"
+_LONGER = "a file goes on after the number of records that it announces at its start"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 

@@ -42,7 +42,7 @@ class Dl3dvConfig(SceneSource.Config):
     """A number N above 0 holds out every Nth frame of a scene for evaluation, from frame N // 2
     on. 0 holds out none."""
     max_scenes: int = Field(default=0, ge=0)
-    """Use only this number of scenes from each split, the first of its list. 0 uses all."""
+    """Use only the first scenes of each split, at most this number. 0 uses all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1] behind transparent pixels."""
 

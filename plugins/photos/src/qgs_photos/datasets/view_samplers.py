@@ -276,7 +276,7 @@ class Overlapping(ViewSampler):
 
 
 def apart(domain: Domain, factor: float) -> Domain:
-    """Return the trained `domain` with distances and angles between inputs times `factor`."""
+    """Return `domain` with the ranges of distances and angles between inputs times `factor`."""
     low, high, turn = trained_ratios(domain)
     ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
     return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)

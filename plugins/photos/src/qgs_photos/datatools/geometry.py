@@ -154,7 +154,7 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
 
 
 def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
-    """Return all `frames` as one run; of more than `most`, return a few evenly spread runs."""
+    """Return `frames` as one run, or a few evenly spread runs if there are more than `most`."""
     if len(frames) <= most:
         return [frames]
     length = max(most // _RUNS, 2)

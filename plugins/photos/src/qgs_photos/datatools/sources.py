@@ -50,7 +50,7 @@ def left_out(format: str = "auto") -> list[str]:
 
 
 def kind_of(path: UPath) -> str:
-    """Return PLUGIN/NAME of the data source that reads `path`; if PLUGIN is in OF_FILES, NAME."""
+    """Return PLUGIN/NAME of the data source that reads `path`, or NAME if OF_FILES lists PLUGIN."""
     kind = recognised(path, sources())
     plugin, _, name = kind.partition("/")
     return name if plugin in OF_FILES else kind

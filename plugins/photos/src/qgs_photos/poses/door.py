@@ -66,7 +66,7 @@ def posed_folder(source: Path) -> Path:
 
 
 def _duration(source: Path) -> str:
-    """Return about how long the poses of photos take; nothing for a video."""
+    """Return text with the estimated time to compute poses of photos; "" for a video."""
     if source.is_file():
         return ""
     seconds = SECONDS_OF_PHOTO * len(photo_files(source)) / Options().threads

@@ -109,8 +109,8 @@ def cameras_of(
 ) -> Cameras:
     """Return the cameras (1, T) of a camera path of T frames.
 
-    path: one of KINDS, or the name of a file. size: (H, W) of the video in pixels; None takes that
-    of the photos. frames: number of frames of a path in KINDS. fov: vertical angle of view in
+    path: orbit, spiral, walk, or the name of a file. size: (H, W) of the video in pixels; None
+    takes that of the photos. frames: T, unless `path` is a file. fov: vertical angle of view in
     degrees; None takes that of the photos or the file. Raises ValueError for a file that is not a
     camera path.
     """
@@ -132,7 +132,7 @@ def _film_size(photos: tuple[int, int]) -> tuple[int, int]:
 def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
     """Return intrinsics (1, T, 4) for pictures of `size` (H, W), with centred principal points.
 
-    fov: vertical angle of view in degrees; None keeps the view of `path` along the shorter side.
+    fov: vertical angle of view in degrees; None keeps the angle of `path` along the shorter side.
     """
     height, width = size
     fx, fy, _, _ = path.intrinsics.unbind(-1)

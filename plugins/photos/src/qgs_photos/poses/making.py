@@ -106,9 +106,9 @@ def fingerprint(source: Path) -> dict[str, Any]:
 def make_poses(source: Path, out: Path, options: Options, console: Console) -> Poses:
     """Compute the poses of `source`, photos or a video, and write them to the new folder `out`.
 
-    `out` gets sparse/0 (a COLMAP model), images/ and poses.json. COLMAP's readers open `out`.
-    Raises PosesError if no poses are found, FileExistsError if `out` is not empty, and OSError if
-    files cannot be read or written.
+    `out` gets sparse/0 (a COLMAP model), images/ and poses.json. Readers of COLMAP's models can
+    open `out`. Raises PosesError if no poses are found, FileExistsError if `out` is not empty, and
+    OSError if files cannot be read or written.
     """
     # too few photos raise before anything is written
     record = {"made_by": "qgs poses", "source": fingerprint(source), "options": asdict(options)}

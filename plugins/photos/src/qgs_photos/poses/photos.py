@@ -96,8 +96,8 @@ def prepare(
 ) -> tuple[list[Photo], dict[str, str]]:
     """Write upright photos into `kept`, and copies of at most `side` pixels into `working`.
 
-    A file that needs no change is linked, or copied to another file system. If the order of `files`
-    is not the alphabetical order of names, which COLMAP uses, names get a number in front.
+    A file that needs no change is linked, or copied if links are impossible. If the order of
+    `files` is not the alphabetical order of names, which COLMAP uses, names get a number in front.
 
     Returns the prepared photos in the order of `files`, and by name the reason why a photo cannot
     be read. progress: called with the stage, the number of photos done, and the number of all.

@@ -155,10 +155,10 @@ def _largest(opened: Any, image: int) -> Array:
 
 
 def likely(features: Array) -> Array:
-    """Return which pairs of N photos are matched, (N, N) of bool; True for a photo with itself.
+    """Return which pairs of N photos to match, (N, N) of bool; True for a photo with itself.
 
-    These are the NEXT photos in the order of names, and for each photo the ALIKE photos with the
-    most features in common. features: (N, L, 128), of length 1; 0 where a photo has fewer.
+    A photo is matched with the NEXT photos before and after it by name, and with the ALIKE photos
+    that share most features. features: (N, L, 128), of length 1; 0 where a photo has fewer than L.
     """
     shared = np.zeros((len(features), len(features)))
     for place, own in enumerate(features):

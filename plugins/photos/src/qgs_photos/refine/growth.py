@@ -85,7 +85,7 @@ class FreeGaussians:
         Parents are sampled with probabilities proportional to opacity. Parent and copies become
         smaller and more transparent, so that together they render like the parent before. The Adam
         moments of parent and copies restart at 0. A Gaussian is dead if its
-        opacity is below DEAD; if all opacities are, none is dead.
+        opacity is below DEAD, unless the opacities of all Gaussians are.
         """
         opacities = self.values["opacity_logits"].sigmoid()
         faint = (opacities < DEAD) & (opacities >= DEAD).any()
@@ -137,8 +137,8 @@ def shared(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
     """Return the opacity a and the scale factor of N equal Gaussians that replace one Gaussian.
 
     opacities: (n,), of the replaced Gaussians. shares: (n,) integers N, clamped to _MOST_COPIES.
-    By equation 9 of the paper, the factor is the old opacity divided by the sum over k from 0 of
-    C(N, k+1) (-1)^k / sqrt(k+1) a^(k+1). In float64, because terms of alternating sign cancel.
+    The factor is the old opacity over the sum of C(N, k+1) (-1)^k / sqrt(k+1) a^(k+1) for k from 0
+    to N - 1 (Kheradmand et al. 2024, equation 9). The sum is in float64: its terms cancel.
     """
     shares = shares.clamp_max(_MOST_COPIES).double()
     old = opacities.double()

@@ -62,8 +62,8 @@ class ScenePhotos:
 def judged_frames(scene: Scene, holdout: str) -> Frames:
     """Return the indices of the held-out photos, which are scored and never optimised on.
 
-    holdout: NONE holds out no photo. A number N of at least 2 holds out every Nth photo, or the
-    photos that the data set itself lists as held out. Raises ValueError for another text.
+    holdout: NONE holds out no photo. A number N of at least 2 holds out the photos that the data
+    set lists as held out, or every Nth if it lists none. Raises ValueError for another text.
     """
     if holdout == NONE:
         return ()

@@ -128,7 +128,7 @@ def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
     two = encoder["scales"] == 2
     if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
         raise LayoutError(
-            f"{_HEAD} has {raw} channels, expected 10 + 3 (degree + 1)^2 for a degree of harmonics"
+            f"{_HEAD} has {raw} channels, expected 10 + 3 (degree + 1)^2 for a degree from 1 to 4"
         )
     # One layer for each depth, so that both depths can be supervised.
     decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
