@@ -18,7 +18,8 @@ from qgs.recipe.yaml_text import load_text
 PAGES = all_pages()
 EQUATIONS, _, REST = PAGES["equations.md"].partition("## Where paper and release differ")
 EQUATIONS += "".join(
-    PAGES[f"api/{name}.md"] for name in ("c3g", "ellipsoid", "globalsplat", "gslrm", "tokengs2026")
+    PAGES[f"api/{name}.md"].partition("## Equations")[2]
+    for name in ("c3g", "ellipsoid", "globalsplat", "gslrm", "tokengs2026")
 )
 CONSTANTS = r"""
 support radius | radius_min | softplus(ρ), {:g})

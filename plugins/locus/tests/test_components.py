@@ -69,11 +69,11 @@ model.decoder.cross_attention={type: locus/ray_biased, bandwidth: fixed, sigma_s
 model.queries={type: locus/anchored, radius: false, init_radius: 2}
     model.queries.init_radius: no effect
 model.queries.center_init={kind: frustum, depth: [0, 1]}
-    model.queries.center_init.depth: near
+    model.queries.center_init.depth: 0 < min
 model.queries.center_init={kind: frustum, depth: [2, 1]}
-    model.queries.center_init.depth: near
+    model.queries.center_init.depth: 0 < min
 model.queries.center_init={kind: frustum, depth: [-1, 1]}
-    model.queries.center_init.depth: near
+    model.queries.center_init.depth: 0 < min
 """
 
 

@@ -255,7 +255,7 @@ def test_too_few_photos_are_refused():
 def test_bounds_are_ordered():
     for apart in ("[2, 1]", "[0, 1]"):
         must_refuse(
-            "least",
+            "0 < min",
             resolve,
             "finetune/photos.yaml",
             [f"view_sampler.apart={apart}"],
