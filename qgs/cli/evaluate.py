@@ -73,7 +73,8 @@ def evaluate(
         # All rounds share weights, so a trained model can run more rounds than in training.
         model.feedback.rounds = recipe.build_model("meta", pretrained=False).feedback.rounds
     # Results are written beside a checkpoint of the user's own, not into a cache.
-    folder = out or evaluation_folder(checkpoint, bool(settings), Path(run).expanduser().exists())
+    own = Path(run).expanduser().exists()
+    folder = out or evaluation_folder(checkpoint, bool(settings), own)
     evaluation = evaluate_into(model, recipe, step, folder, console)
     # Scripts need this: a mean over fewer scenes is not comparable.
     if strict and evaluation.missing:

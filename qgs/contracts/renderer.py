@@ -129,7 +129,8 @@ def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
     colors = seen_colors(gaussians, cameras)
     if gaussians.features is None:
         return colors
-    return torch.cat([colors, gaussians.features[:, None].expand(*colors.shape[:-1], -1)], -1)
+    features = gaussians.features[:, None].expand(*colors.shape[:-1], -1)
+    return torch.cat([colors, features], -1)
 
 
 def background_of(

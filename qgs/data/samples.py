@@ -175,7 +175,8 @@ def in_world(world: tuple[Tensor, Tensor], cameras: Cameras) -> Cameras:
     """
     reference, scale = world
     # float32 only now, because map coordinates have seven digits before the point.
-    return cameras.replace(c2w=scaled(relative_to(reference, cameras.c2w), scale)).to(torch.float32)
+    c2w = scaled(relative_to(reference, cameras.c2w), scale)
+    return cameras.replace(c2w=c2w).to(torch.float32)
 
 
 def from_0_to_1(times: Tensor) -> Tensor:

@@ -148,7 +148,8 @@ class SampleStream(Dataset[Batch | Exception]):
 
     def _scene(self, number: int) -> Scene:
         epoch, place = divmod(number, len(self._scenes))
-        return self._scenes[int(self._orders.get(epoch, lambda: self._draw_epoch(epoch))[place])]
+        order = self._orders.get(epoch, lambda: self._draw_epoch(epoch))
+        return self._scenes[int(order[place])]
 
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self.seed, 0, epoch])

@@ -48,7 +48,8 @@ def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
     forward = F.normalize(forward, dim=-1)
     down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
     # Down is made orthogonal first, so that the view direction stays exact.
-    top = torch.stack([torch.linalg.cross(down, forward), down, forward, eye], -1)
+    right = torch.linalg.cross(down, forward)
+    top = torch.stack([right, down, forward, eye], -1)
     bottom = constant([0.0, 0.0, 0.0, 1.0], top).expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], -2)
 

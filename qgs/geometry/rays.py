@@ -42,7 +42,8 @@ def plucker_rays(cameras: Cameras) -> Tensor:
     o is the camera's centre. The order of o x d and d is that of the TokenGS release.
     """
     origins, directions = camera_rays(cameras)
-    return torch.cat([torch.linalg.cross(origins, directions), directions], -1).movedim(-1, -3)
+    moments = torch.linalg.cross(origins, directions)
+    return torch.cat([moments, directions], -1).movedim(-1, -3)
 
 
 @full_precision
@@ -66,5 +67,6 @@ def camera_centers(rays: Tensor, grid: tuple[int, int, int]) -> Tensor:
     """
     moments, directions = rays.unflatten(1, (grid[0], -1)).chunk(2, -1)
     # A moment o x d is the sum over axes of o_i (e_i x d).
-    parts = torch.linalg.cross(torch.eye(3).to(rays)[None, None, None], directions[..., None, :]).mT
+    axes = torch.eye(3).to(rays)[None, None, None]
+    parts = torch.linalg.cross(axes, directions[..., None, :]).mT
     return torch.linalg.lstsq(parts.flatten(2, 3), moments.flatten(2)[..., None]).solution[..., 0]

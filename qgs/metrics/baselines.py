@@ -14,7 +14,8 @@ def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
     targets: T cameras per scene, (B, T). `pose_distance` defines the distance.
     """
     index = pose_distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
-    return inputs.images[torch.arange(index.shape[0], device=index.device)[:, None], index]
+    scene = torch.arange(index.shape[0], device=index.device)[:, None]
+    return inputs.images[scene, index]
 
 
 def mean_colour(inputs: Views, targets: Cameras) -> Tensor:

@@ -38,7 +38,8 @@ def check(draft: Draft, problems: Problems) -> Parts:
     if all(sound):
         check_flow(parts, draft.dims.depth, draft.registry, problems)
     for path, reason, fix in _contradictions(draft, parts):
-        problems.add(draft.tree.child(*path[:-1]).origin_of(path[-1]), path, reason, fix)
+        section = draft.tree.child(*path[:-1])
+        problems.add(section.origin_of(path[-1]), path, reason, fix)
     problems.raise_any()
     return parts
 

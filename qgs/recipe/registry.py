@@ -119,7 +119,8 @@ def load_plugins(
         try:
             plugins[name] = at_hand.get(name) or load_plugin(name)
         except PluginError as error:
-            problems.add(written[index][1], f"plugins.{index}", error.reason, error.fix, error)
+            origin = written[index][1]
+            problems.add(origin, f"plugins.{index}", error.reason, error.fix, error)
     return Registry(plugins, complete=plugins.keys() >= {*names})
 
 

@@ -167,7 +167,8 @@ def _over_time(
         first = max(len(usable) - max(views.gap[1] + 1, views.inputs), 0) // 2
         frames = spread(usable[first : len(usable) - first], views.inputs)
     between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
-    novel = evenly([f for f in between if f in scene.held_out] or between, NOVEL)
+    held_out = [frame for frame in between if frame in scene.held_out]
+    novel = evenly(held_out or between, NOVEL)
     # A model renders one time in one pass.
     moment = times[novel[len(novel) // 2]] if novel else None
     return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)

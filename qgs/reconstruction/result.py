@@ -122,14 +122,21 @@ def reconstruct_sample(
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     gaussians = model(sample.inputs).gaussians if changed is None else changed
     rendering = model.render(gaussians, sample_cameras(sample))
-    return Reconstruction(model, sample, gaussians, rendering, _scores(sample, rendering, seen))
+    return Reconstruction(
+        model=model,
+        sample=sample,
+        gaussians=gaussians,
+        rendering=rendering,
+        scores=_scores(sample, rendering, seen),
+    )
 
 
 def _scores(sample: Sample, rendering: Rendering, seen: Collection[int]) -> list[ViewScore]:
     """Return the PSNR of each rendered view, and at target views also that of the baselines."""
     inputs = sample.inputs
     targets = sample.targets
-    quality = psnr(rendering.rgb, torch.cat([inputs.images, targets.images], 1))[0].tolist()
+    photos = torch.cat([inputs.images, targets.images], 1)
+    quality = psnr(rendering.rgb, photos)[0].tolist()
     # What needs no model, on the same views.
     baselines = {
         name: psnr(baseline(inputs, targets.cameras), targets.images)[0].tolist()

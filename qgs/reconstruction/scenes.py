@@ -38,7 +38,8 @@ def read_photos(
     """
     found = photo_scene(fspath(folder), size, scene)
     wanted = range(len(found)) if frames is None else frame_list(frames, "frames", found)
-    return views_in((torch.eye(4).double(), torch.ones(()).double()), found, tuple(wanted))
+    own = (torch.eye(4).double(), torch.ones(()).double())
+    return views_in(own, found, tuple(wanted))
 
 
 def photo_scene(path: str, size: Size | None, name: str | None) -> Scene:

@@ -155,7 +155,8 @@ class _Splat(torch.autograd.Function):
         of_inputs = [torch.from_numpy(of_colors), *of_inputs]
         if not wants_cameras:
             return *of_inputs, None, None, None, None
-        rotation, position, lens = torch.tensor(of_cameras.sum(1)).float().split([9, 3, 4], -1)
+        summed = torch.from_numpy(of_cameras.sum(1)).float()
+        rotation, position, lens = summed.split([9, 3, 4], -1)
         pose = torch.cat([rotation.unflatten(-1, (3, 3)), position[..., None]], -1)
         return *of_inputs, F.pad(pose, (0, 0, 0, 1)), lens, None, None
 

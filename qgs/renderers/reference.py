@@ -42,7 +42,8 @@ def project(
     # Before anything can overflow: where() after it would pass on gradients 0 * inf.
     drawn = torch.where(usable[..., None, None], in_camera, 0.0)
     conics, _ = _conics(_image_factors(drawn, centres, cameras), dilation)
-    return to_pixels(centres, cameras.intrinsics), conics, centres[..., 2], in_range & usable
+    means = to_pixels(centres, cameras.intrinsics)
+    return means, conics, centres[..., 2], in_range & usable
 
 
 def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor:

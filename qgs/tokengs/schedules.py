@@ -70,7 +70,8 @@ class Steps(_Listed):
     @property
     def corners(self) -> tuple[int, ...]:
         """Steps in `at`, and the last step before each of them."""
-        return (*(max(at - 1, 0) for at in self.at), *self.at)
+        before = [max(at - 1, 0) for at in self.at]
+        return (*before, *self.at)
 
 
 class Linear(_Listed):

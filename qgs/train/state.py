@@ -76,7 +76,8 @@ class Counters:
     @property
     def used(self) -> float:
         """Used fraction of the budget: that of the steps or of the seconds, whichever is larger."""
-        return max(self.step / self.config.steps, self.seconds / (self.config.seconds or math.inf))
+        of_seconds = self.seconds / (self.config.seconds or math.inf)
+        return max(self.step / self.config.steps, of_seconds)
 
     def every(self, steps: int) -> bool:
         """Return whether the present step is a multiple of `steps`; False if `steps` is 0."""
@@ -178,7 +179,8 @@ class OptimizerState:
         Raises KeyError if a parameter has no entry.
         """
         kept = {place: state[name] for place, name in enumerate(self._names) if state[name]}
-        self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": kept})
+        present = self._optimizer.state_dict()
+        self._optimizer.load_state_dict({**present, "state": kept})
 
 
 class MovingAverage(AveragedModel):

@@ -134,7 +134,8 @@ class TrainingPass(nn.Module):
         """Return the loss terms of the losses `names`; the other arguments are those of `Loss`."""
         terms: dict[str, Tensor] = {}
         for name in names:
-            for term, value in self.losses[name](prediction, rendering, target, inputs).items():
+            found = self.losses[name](prediction, rendering, target, inputs)
+            for term, value in found.items():
                 owner = self._owners.setdefault(term, name)
                 if owner != name:
                     raise ValueError(

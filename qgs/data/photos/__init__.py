@@ -47,7 +47,8 @@ def with_cameras(path: UPath) -> UPath:
     # A folder of scenes may hold other pictures too.
     if any(formats_of(item) for item in listing(path) if item.is_dir()):
         return path
-    return next(filter(None, (reader.posed(path) for reader in readers().values())), path)
+    made = (reader.posed(path) for reader in readers().values())
+    return next(filter(None, made), path)
 
 
 def read_listing(

@@ -201,7 +201,8 @@ def _focal(values: _Values, axis: str, side: int | None) -> float | None:
 
 
 def _lens(values: _Values) -> Lens | None:
-    model = "OPENCV_FISHEYE" if values.get("is_fisheye") else values.get("camera_model", "PINHOLE")
+    fisheye = values.get("is_fisheye")
+    model = "OPENCV_FISHEYE" if fisheye else values.get("camera_model", "PINHOLE")
     # An ignored coefficient would shift pixels against the poses without an error.
     found = {key: number for key in _COEFFICIENTS if (number := values.number(key))}
     if model in PINHOLE and not found:

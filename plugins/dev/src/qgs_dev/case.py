@@ -145,7 +145,8 @@ class Case:
 
         size: (H, W); None if the size of images is not known.
         """
-        return list(self.component.problems(self.config, contracts.RecipeContext(self.dims, size)))
+        context = contracts.RecipeContext(self.dims, size)
+        return list(self.component.problems(self.config, context))
 
     def build(self, seed: int = 0) -> Any:
         """Return a new instance, with random initial parameters from `seed`.

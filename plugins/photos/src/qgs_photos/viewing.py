@@ -18,4 +18,5 @@ def in_own_world(world: tuple[Tensor, Tensor], gaussians: Gaussians) -> Gaussian
     world: reference pose (4, 4) and scale, see `own_world`. `in_world` does the same for cameras.
     """
     reference, scale = world
-    return moved(gaussians, scaled(torch.linalg.inv(reference.double()), scale), float(scale))
+    pose = scaled(torch.linalg.inv(reference.double()), scale)
+    return moved(gaussians, pose, float(scale))

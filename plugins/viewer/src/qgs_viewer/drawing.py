@@ -61,7 +61,8 @@ def query_color(query: int) -> Color:
 
 def query_colors(scene: QueryScene) -> np.ndarray:
     """Return the colours of all N queries of `scene`, uint8 RGB (N, 3)."""
-    return np.array([query_color(query) for query in range(scene.queries)], np.uint8).reshape(-1, 3)
+    colors = [query_color(query) for query in range(scene.queries)]
+    return np.array(colors, np.uint8).reshape(-1, 3)
 
 
 def anchor_colors(scene: QueryScene, choice: Choice) -> np.ndarray:

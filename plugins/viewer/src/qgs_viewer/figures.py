@@ -108,7 +108,8 @@ def write_figure(figure: Figure, folder: Path, name: str) -> None:
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     # a date would change the file at every run; type 42 keeps fonts that journals ask for
-    for kind, entries in {"pdf": {"CreationDate": None}, "png": {}}.items():
+    metadata = {"pdf": {"CreationDate": None}, "png": {}}
+    for kind, entries in metadata.items():
         with (
             replacing(folder / f"{name}.{kind}") as temporary,
             figure_style(),

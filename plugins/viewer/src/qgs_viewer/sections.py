@@ -177,7 +177,8 @@ def training_curves(models: Shown, detail: Detail) -> Section:
     if not curves:
         return Section("training")
     figure = curves_figure(curves)
-    return Section("training", {"": [Tile(figure_picture(figure, dpi=168))]}, figure, width=600)
+    tile = Tile(figure_picture(figure, dpi=168))
+    return Section("training", {"": [tile]}, figure, width=600)
 
 
 def novel_views(models: Shown, detail: Detail) -> Section:

@@ -111,7 +111,8 @@ def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
     signs["deviation"] = torch.stack([o.signs["deviation"] for o in outcomes]).amax()
     total = share * _sum(o.total for o in outcomes) + _sum(terms.values())
     # Detached for the log: a graph would keep the memory of the step.
-    return Outcome(total, judged | {n: term.detach() for n, term in terms.items()}, signs)
+    detached = {n: term.detach() for n, term in terms.items()}
+    return Outcome(total, judged | detached, signs)
 
 
 def _sum(terms: Iterable[Tensor]) -> Tensor:

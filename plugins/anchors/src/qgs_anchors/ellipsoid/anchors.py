@@ -70,7 +70,8 @@ class EllipsoidQueries(LearnedQueries):
         quats = F.normalize(self.rotation, dim=-1)
         fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
         fields = {name: x.expand(batch_size, -1, -1) for name, x in fields.items()}
-        return QueryState(features=self.features.expand(batch_size, -1, -1), fields=fields)
+        features = self.features.expand(batch_size, -1, -1)
+        return QueryState(features=features, fields=fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Return the ellipsoid of each anchor."""

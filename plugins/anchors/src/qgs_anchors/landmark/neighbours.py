@@ -84,7 +84,8 @@ class NeighbourAttention(SelfAttention):
         """
         index_BNk, seen_BNk = nearest(state[CENTER], self.config.count, state.mask)
         place_BNkP = relative_places(state[CENTER], index_BNk, seen_BNk)
-        bias_BhNk = at_least_float32(self.place_mlp(place_BNkP)).permute(0, 3, 1, 2)
+        bias_BNkh = at_least_float32(self.place_mlp(place_BNkP))
+        bias_BhNk = bias_BNkh.permute(0, 3, 1, 2)
         if seen_BNk is not None:
             bias_BhNk = bias_BhNk.masked_fill(~seen_BNk[:, None], -torch.inf)
         return index_BNk, place_BNkP, bias_BhNk

@@ -78,7 +78,8 @@ def spread(
     in_rows_N = torch.minimum((held_N * of_photo).sqrt().round().clamp_min(1).long(), held_N)
     place_N2 = parts(index_N // views, held_N, torch.where(tiled, rows, in_rows_N))
     tile_2 = torch.stack([rows / each, 1 / rows])
-    return view_N, place_N2, torch.where(tiled, tile_2, _square(count, views, size, place_N2))
+    square_2 = _square(count, views, size, place_N2)
+    return view_N, place_N2, torch.where(tiled, tile_2, square_2)
 
 
 def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tensor:

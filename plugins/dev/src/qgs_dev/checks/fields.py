@@ -269,7 +269,8 @@ def _encoder_with(case: Case) -> Any:
 
     def forward(self: MultiViewViT, views: Any) -> Any:
         memory = MultiViewViT.forward(self, views)
-        return replace(memory, features=memory.features[..., wide % memory.features.shape[-1]])
+        features = memory.features[..., wide % memory.features.shape[-1]]
+        return replace(memory, features=features)
 
     provides = {**MEMORY_FIELDS, "memory.features": case.reads["memory.features"]}
     return _given(MultiViewViT, provides, forward=forward)

@@ -174,7 +174,8 @@ def check_objective_gives_an_outcome(case: Case) -> None:
         expect_none(odd, f"not a 0-d tensor {where}")
         expect_finite(numbers, where)
         expect_none(outcome.terms.keys() & RECORDED, TAKEN)
-        expect_none([name for name, x in parts.items() if x.requires_grad], f"not detached {where}")
+        kept = [name for name, x in parts.items() if x.requires_grad]
+        expect_none(kept, f"not detached {where}")
         expect_none(outcome.signs.keys() ^ SIGNS, f"missing or unknown sign {where}")
         total = outcome.total
         of_terms = sum(outcome.terms.values())

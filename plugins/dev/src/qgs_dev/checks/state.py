@@ -204,7 +204,8 @@ def _with_another(config: ComponentConfig, option: str) -> ComponentConfig:
     value = getattr(config, option)
     for other in (value / 2, 2 * value) if value else (0.5, 1):
         try:
-            return type(config).model_validate({**dict(config), option: type(value)(other)})
+            changed = {**dict(config), option: type(value)(other)}
+            return type(config).model_validate(changed)
         except (ValidationError, TypeError):
             continue
     return config

@@ -68,5 +68,6 @@ def video(
     console = Console()
     pixels = parse_size(size)
     opened = open_film_scene(source, photos, scene)
-    film(opened, cameras_of(opened, path, pixels, round(seconds * rate), fov), out, rate, console)
+    cameras = cameras_of(opened, path, pixels, round(seconds * rate), fov)
+    film(opened, cameras, out, rate, console)
     say(console, f"wrote {out}")

@@ -97,7 +97,7 @@ def check(
         notes.append(f"`views.scale: auto` scales by {median} (median of scenes; range {ends})")
     else:
         notes.append("`views.scale: auto` finds no common point that the cameras look at")
-    return CheckReport(scenes, general, notes)
+    return CheckReport(scenes=scenes, general=general, notes=notes)
 
 
 def faults_of_poses(path: UPath, scene: str | None, most_photos: int) -> list[Finding]:

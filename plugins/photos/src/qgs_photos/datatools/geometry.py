@@ -99,7 +99,8 @@ def match(first: Features, second: Features) -> np.ndarray | None:
         return None
     rows = found.numpy().T
     points = np.stack([first[0][rows[0]], second[0][rows[1]]])
-    _, inliers = RANSAC("fundamental", inl_th=_INLIER_PIXELS, seed=0)(*torch.from_numpy(points))
+    ransac = RANSAC("fundamental", inl_th=_INLIER_PIXELS, seed=0)
+    _, inliers = ransac(*torch.from_numpy(points))
     return points[:, inliers.numpy()] if inliers.sum() >= MIN_MATCHES else None
 
 

@@ -74,7 +74,8 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
         for place, name in enumerate(opened.names(split)):
             if name not in known:
                 photos = partial(_photos, opened, split, place)
-                yield Candidate(name, kind, photos, split, partial(_missing, opened, split, place))
+                missing = partial(_missing, opened, split, place)
+                yield Candidate(name, kind, photos, split, missing)
             known.add(name)
 
 

@@ -173,7 +173,7 @@ def measure(tree: dict[str, Any], operation: Operation, workload: Workload, thre
             restart.write_text("5")
     task()
     peak = torch.cuda.max_memory_allocated() if on_gpu else resident_bytes("VmHWM")
-    return Peak(peak, idle)
+    return Peak(peak_bytes=peak, idle_bytes=idle)
 
 
 def resident_bytes(field: str) -> int:

@@ -99,7 +99,8 @@ def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
 
 
 def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
-    shapes = shapes_of(unique_tensors(recipe.build_model("meta")))
+    model = recipe.build_model("meta")
+    shapes = shapes_of(unique_tensors(model))
     named = {name: layout.published_name(name) for name in shapes}
     published = {ours: theirs for ours, theirs in named.items() if theirs is not None}
     unnamed = tuple(name for name in shapes if name not in published)

@@ -14,7 +14,8 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     anchor_aware = DECODER + "0.anchor_head_self_attn.fc1.weight" in shapes
     model = backbone(shapes, "locus/anchored")
     model["queries"]["radius"] = radius
-    biased = {"type": "locus/ray_biased", "bandwidth": "radius" if radius else "fixed"}
+    bandwidth = {"bandwidth": "radius" if radius else "fixed"}
+    biased = {"type": "locus/ray_biased", **bandwidth}
     model["decoder"] |= {
         "cross_attention": biased if ray_biased else {"type": "qgs/content"},
         "self_attention": {"type": "locus/anchor_aware" if anchor_aware else "qgs/content"},

@@ -64,8 +64,9 @@ class Results(Scores):
         for run, evaluation in product(plan.runs, plan.evaluations):
             # Only complete evaluations count: one that is being written would change the means.
             if run.evaluated(evaluation):
-                stored[run.variant, evaluation][run.seed] = read_results(run.evaluation(evaluation))
-        super().__init__(stored, settings.reference, settings.metric)
+                found = read_results(run.evaluation(evaluation))
+                stored[run.variant, evaluation][run.seed] = found
+        super().__init__(stored=stored, reference=settings.reference, metric=settings.metric)
         self.plan = plan
         self.settings = settings
         self.missing = [run for run in plan.runs if not plan.done(run)]
@@ -98,7 +99,13 @@ class Results(Scores):
                     reasons = []
             if self.unlike(contrast.terms):
                 reasons.append("evaluated by different protocols")
-        return Judgement(hypothesis, metric, found, verdict, ", ".join(reasons))
+        return Judgement(
+            hypothesis=hypothesis,
+            metric=metric,
+            estimate=found,
+            verdict=verdict,
+            reason=", ".join(reasons),
+        )
 
     def rank_correlation(self) -> float | None:
         """Return Spearman's rank correlation of measured means and published values, by variant.
@@ -211,7 +218,8 @@ def study_summary(results: Results) -> Summary:
     for name in results.plan.evaluations:
         if results.models(name):
             published = results.settings.published
-            tables.append((name, table_rows(results, name, results.metric, others, published)))
+            rows = table_rows(results, name, results.metric, others, published)
+            tables.append((name, rows))
     return Summary(answer=answer(results), tables=tables, notes=notes(results))
 
 

@@ -103,7 +103,7 @@ class Scores:
         for runs, weight in parts:
             # Pairing precedes the means, so that common effects of a seed or scene cancel.
             values += weight * np.array([runs[seed].scores(metric, scenes) for seed in seeds])
-        return Estimate(seeds, values, interval(values, confidence))
+        return Estimate(seeds=seeds, values=values, interval=interval(values, confidence))
 
     def baselines(self, evaluation: str) -> dict[str, dict[str, float]]:
         """Return the mean scores of the baselines, by name of the baseline, then by metric.

@@ -34,7 +34,8 @@ def _variant_name(name: str, info: ValidationInfo) -> str:
     # If the variants were refused, no name is known.
     variants = info.data.get("variants", {name: None})
     if name not in variants:
-        raise OptionError(f"there is no variant `{name}`", did_you_mean(name, variants, "variants"))
+        fix = did_you_mean(name, variants, "variants")
+        raise OptionError(f"there is no variant `{name}`", fix)
     return name
 
 
@@ -192,7 +193,7 @@ def read_study(file: str | Path) -> Study:
     evaluations: Any = dict(tree.child("evaluations"))
     for node in evaluations.values():
         _locate_index(node)
-    return Study(found, settings, variants, evaluations)
+    return Study(file=found, settings=settings, variants=variants, evaluations=evaluations)
 
 
 def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:

@@ -41,7 +41,8 @@ def cast(
         t, code, rays = trace(*area, scene.shapes, scene.heights, c2w[frame], intrinsics)
         depths[frame, samples * top : samples * (top + rows)] = t
         if paint and images is not None:
-            paint(images[frame, top : top + rows], t, code, top, samples, scene, c2w[frame], rays)
+            painted = images[frame, top : top + rows]
+            paint(painted, t, code, top, samples, scene, c2w[frame], rays)
 
     bands = [*product(range(len(c2w)), range(0, height, _BAND))]
     if torch.get_num_threads() == 1:

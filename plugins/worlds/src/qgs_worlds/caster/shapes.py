@@ -70,7 +70,8 @@ class Shape(NamedTuple):
     def moved(self, to: Point, turn: Turn, size: float = 1.0) -> "Shape":
         """Return the shape scaled by `size` about the origin, turned, then moved by `to`."""
         cut = self.cut and self.cut.moved(to, turn, size)
-        return self._replace(body=self.body.moved(to, turn, size), cut=cut, scale=self.scale * size)
+        body = self.body.moved(to, turn, size)
+        return self._replace(body=body, cut=cut, scale=self.scale * size)
 
 
 def rotated(turn: Turn, p: Point) -> Point:

@@ -190,7 +190,8 @@ class Things:
             points = [(math.cos(t), math.sin(t), lift * t) for t in angles]
         else:
             points = [tuple(rng.uniform(-1, 1) for _ in range(3)) for _ in range(count)]
-        return self._rods(points, [(k, k + 1) for k in range(count - 1)], spread(rng, 0.008, 0.05))
+        pairs = [(k, k + 1) for k in range(count - 1)]
+        return self._rods(points, pairs, spread(rng, 0.008, 0.05))
 
     def _bars(self) -> Thing:
         """Return parallel bars between two rails, like a fence or a ladder."""

@@ -57,7 +57,8 @@ class VggtFeatures(PatchEncoder):
         super().__init__(config, dims)
         self.aggregator = _aggregator_class()()
         # With the width of VGGT there is no layer, so that tokens stay unchanged.
-        self.proj = nn.Identity() if dims.width == WIDTH else nn.Linear(WIDTH, dims.width)
+        own = dims.width == WIDTH
+        self.proj = nn.Identity() if own else nn.Linear(WIDTH, dims.width)
 
     def forward(self, views: Views) -> ImageMemory:
         """Return the features (B, M, D) of all patches, and the grid that the patches form."""

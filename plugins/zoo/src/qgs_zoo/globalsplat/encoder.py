@@ -86,7 +86,8 @@ class PosedPatches(PatchEncoder):
 
 def _tokens(embedding: nn.Conv2d, images: Tensor) -> Tensor:
     """Embed images (B, V, C, H, W) as tokens (B, V, patches, width)."""
-    return rearrange(embedding(images.flatten(0, 1)), "(b v) d h w -> b v (h w) d", b=len(images))
+    x_XDHW = embedding(images.flatten(0, 1))
+    return rearrange(x_XDHW, "(b v) d h w -> b v (h w) d", b=len(images))
 
 
 @full_precision

@@ -123,7 +123,8 @@ class PixelQueries(Queries):
         """Return queries: features (B, M, D) of the tokens, and rays `gslrm.patch` (B, M, 4, 3)."""
         assert memory.grid is not None
         _, rows, columns = memory.grid
-        return QueryState(memory.features, {PATCH: pixel_rays(views.cameras, rows, columns)})
+        fields = {PATCH: pixel_rays(views.cameras, rows, columns)}
+        return QueryState(features=memory.features, fields=fields)
 
 
 @full_precision

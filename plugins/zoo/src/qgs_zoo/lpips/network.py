@@ -148,7 +148,9 @@ class LpipsLoss(Loss):
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
         """Return the mean LPIPS of the views. Raises ValueError for image sides below 16 pixels."""
-        return self.network(rendering.rgb.flatten(0, 1), target.images.flatten(0, 1)).mean()
+        images = rendering.rgb.flatten(0, 1)
+        truth = target.images.flatten(0, 1)
+        return self.network(images, truth).mean()
 
 
 class Lpips(Metric):

@@ -184,7 +184,8 @@ class DepthPredictor(nn.Module):
         self.sizes = sizes
         width = sizes.features
         vit = sizes.vit
-        self.backbone = CNN(width, (1, 2) if sizes.stride == 4 else (2, 2), sizes.cnn)
+        strides = (1, 2) if sizes.stride == 4 else (2, 2)
+        self.backbone = CNN(width, strides, sizes.cnn)
         self.transformer = WindowTransformer(width)
         self.pretrained = DinoV2(vit.width, vit.depth, vit.heads)
         if sizes.scales > 1:

@@ -73,7 +73,8 @@ class ResidualBlock(nn.Module):
             self.in_layers = nn.Sequential(first, group_norm(outputs), nn.SiLU())
             last = (second, zeroed(group_norm(outputs)), nn.SiLU())
         self.out_layers = nn.Sequential(*last)
-        self.skip_connection = nn.Identity() if inputs == outputs else nn.Conv2d(inputs, outputs, 1)
+        same = inputs == outputs
+        self.skip_connection = nn.Identity() if same else nn.Conv2d(inputs, outputs, 1)
 
     def forward(self, x_NCHW: Tensor) -> Tensor:
         return self.skip_connection(x_NCHW) + self.out_layers(self.in_layers(x_NCHW))

@@ -164,7 +164,8 @@ def _alone(layer: LayerPrediction) -> LayerPrediction:
     The dynamic queries must be the same in all scenes of the batch.
     """
     moves_N = layer.state[MOVES][0]
-    of_gaussians = moves_N.repeat_interleave(layer.gaussians.count // len(moves_N))
+    each = layer.gaussians.count // len(moves_N)
+    of_gaussians = moves_N.repeat_interleave(each)
     return LayerPrediction(
         map_tensors(lambda x: x[:, of_gaussians], layer.gaussians),
         map_tensors(lambda x: x[:, moves_N], layer.state),
