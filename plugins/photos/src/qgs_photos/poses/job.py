@@ -9,10 +9,10 @@ class Job:
 
     images: folder of upright RGB photos. database: COLMAP's file for features and matches. models:
     folder for the results. groups: names of photos, in lists of photos that share a camera. sizes:
-    (H, W) in pixels of the original photos, to which intrinsics are scaled. sequential: match only
-    neighbours in the order of names. likely: if not `sequential`, match only photos that look
-    alike. If both are False, all pairs are matched. features: largest number of features in a
-    photo. threads: number of CPU threads. seed: random seed.
+    (H, W) in pixels of the original photos, to which intrinsics are scaled. matching:
+    "sequential" matches neighbours in the order of names, "alike" photos that look alike,
+    "exhaustive" all pairs. features: largest number of features in a photo. threads: number of CPU
+    threads. seed: random seed.
     """
 
     images: str
@@ -20,8 +20,7 @@ class Job:
     models: str
     groups: list[list[str]]
     sizes: dict[str, tuple[int, int]]
-    sequential: bool
-    likely: bool
+    matching: str
     features: int
     threads: int
     seed: int

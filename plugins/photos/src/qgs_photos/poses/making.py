@@ -170,16 +170,19 @@ def _made(source: Path, out: Path, working: Path, options: Options, show: Show) 
             f"{source} has {counted(len(photos), 'photo')} that can be read, but poses need at "
             f"least {LEAST}: replace the damaged photos ({why})"
         )
-    # neighbours in a video share most
-    ordered = source.is_file() or len(photos) > MANY
+    matching = options.matching
+    if matching == "auto":
+        # neighbours in a video share most
+        ordered = source.is_file() or len(photos) > MANY
+        unordered = "alike" if len(photos) > FEW else "exhaustive"
+        matching = "sequential" if ordered else unordered
     job = Job(
         images=str(small),
         database=str(working / "database.db"),
         models=str(models),
         groups=camera_groups(photos),
         sizes={photo.name: photo.size for photo in photos},
-        sequential=ordered if options.matching == "auto" else options.matching == "sequential",
-        likely=options.matching == "auto" and len(photos) > FEW,
+        matching=matching,
         features=options.features,
         threads=options.threads,
         seed=options.seed,

@@ -108,12 +108,12 @@ def mapped(job: Job) -> Mapping[str, Any]:
         "verification_options": {"ransac": {"random_seed": job.seed}},
         "device": COLMAP.Device.cpu,
     }
-    if job.sequential:
+    if job.matching == "sequential":
         pairing = {"overlap": 10, "quadratic_overlap": True, "loop_detection": False}
         # loops need a vocabulary file, which would be downloaded
         COLMAP.match_sequential(job.database, pairing_options=pairing, **settings)
     else:
-        if job.likely:
+        if job.matching == "alike":
             _leave_out_unlikely_pairs(job.database)
         # blocks of 5 for steps of progress
         COLMAP.match_exhaustive(job.database, pairing_options={"block_size": 5}, **settings)
