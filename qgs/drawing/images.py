@@ -26,8 +26,7 @@ GAP = 4
 
 def rgb_picture(image: Tensor) -> Picture:
     """Convert an RGB tensor (3, H, W), clipped to [0, 1], to a picture."""
-    pixels = image.detach().float().clamp(0, 1).mul(255).round().byte()
-    return pixels.permute(1, 2, 0).cpu().numpy()
+    return image.detach().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0).cpu().numpy()
 
 
 def depth_picture(depth: Tensor, near: float, far: float) -> Picture:

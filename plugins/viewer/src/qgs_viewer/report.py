@@ -44,11 +44,6 @@ class Comparison:
     notes: Sequence[str] = ()
 
 
-def sample_count(models: Sequence[Model]) -> int:
-    """Return the number of samples on which every model was scored."""
-    return sum(len(score.views) for score in models[0].evaluation.scores)
-
-
 def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
     """Return the table of scores as rows by name: first the models, then the baselines.
 
@@ -58,7 +53,7 @@ def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
     columns = models[0].evaluation.columns
     means = [model.evaluation.means() for model in models]
     baselines = {name: models[0].evaluation.means(name) for name in BASELINES}
-    rivals = [*means, *baselines.values()] if sample_count(models) >= RANKED else []
+    rivals = [*means, *baselines.values()] if models[0].evaluation.samples >= RANKED else []
     rows = {}
     for model, own in zip(models, means, strict=True):
         cells = rows[model.name] = list[tuple[str, bool]]()
@@ -85,7 +80,7 @@ def show_scores(comparison: Comparison, console: Console) -> None:
     for name, row in score_rows(comparison.models).items():
         lines.append([name, *(Text(cell, "green" if best else "") for cell, best in row)])
     look = {"box": box.SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True}
-    samples = sample_count(comparison.models)
+    samples = comparison.models[0].evaluation.samples
     marks = "best in green" if samples >= RANKED else "too few to rank models"
     title = f"{comparison.scenes}, {counted(samples, 'sample')}, {marks}"
     print_table(console, title, lines, **look)
@@ -110,7 +105,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     height, width = first.recipe.tree["data"]["image_size"]
     data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
     judged = "beside" if first.windows else "between"
-    samples = counted(sample_count(models), "sample")
+    samples = counted(first.evaluation.samples, "sample")
     views = f"{samples}, {first.recipe.views.inputs} inputs, scored on views {judged} the inputs"
     names = listed((model.name for model in models), most=3)
     metrics = [part for place, part in first.recipe.parts.items() if place[0] == "metrics"]
