@@ -120,6 +120,15 @@ def test_faults_of_masks(planted, shots):
     damaged.mask(masks)
     del damaged.files["masks/0.png"]
     damaged.files["masks/1.png"] = b"no image"
+    swapped = planted("warning: frames 1, 4 *: the mask fits another photo better*")
+    for number, shot in enumerate(shots):
+        thing = (slice(30, 60), slice(20 * number, 20 * number + 30))
+        image = shot.image.copy()
+        image[thing] = 255
+        masks[number] = 0
+        masks[number][thing] = 255
+        swapped.files[f"images/{number}.jpg"] = encoded(image, "JPEG")
+    swapped.mask(masks[[0, 4, 2, 3, 1, 5]])
     planted.check()
 
 

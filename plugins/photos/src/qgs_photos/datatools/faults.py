@@ -14,12 +14,14 @@ from qgs.data.photos.reader import (
     size_problems,
 )
 from qgs_photos.datatools.findings import Finding
-from qgs_photos.datatools.photos import DecodedScene
+from qgs_photos.datatools.photos import Decoded, DecodedScene
 
 # Of a rotation's entries.
 _SAME = 2e-6
 # Of the cameras' extent: the largest distance that counts as none, the rounding of float32.
 _OF_EXTENT = 5e-7
+# Times: the gain in edges that shows an exchange. Right masks of 69 photos gain at most 1.01.
+_BETTER = 1.2
 
 
 def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
@@ -42,12 +44,27 @@ def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
             problems = [FrameProblem(reason, UNLESS)]
         for problem in problems:
             yield scene.finding([frame], problem.reason, problem.fix)
+    if exchanged := _with_exchanged_masks(scene.decoded):
+        reason = "the mask fits another photo better, and the mask of that photo fits this one"
+        yield scene.finding(exchanged, reason, "give each photo its own mask", "warning")
     empty = [frame for frame, result in enumerate(scene.decoded) if result.empty_mask]
     if empty:
         every = all(result.empty_mask in (True, None) for result in scene.decoded)
         reason = "the mask is black, so that nothing of the photo is modelled"
         fix = "make masks white where the photo is to be modelled, or list no masks"
         yield scene.finding(empty, reason, fix, "error" if every else "warning")
+
+
+def _with_exchanged_masks(photos: Sequence[Decoded]) -> list[int]:
+    """Return the indices of photos that fit each other's masks better than their own.
+
+    A mask fits a photo if its border runs along edges of the photo.
+    """
+    edges = np.stack([photo.edges.flatten() for photo in photos])
+    borders = np.stack([photo.border.flatten() for photo in photos])
+    fits = edges @ borders.T / borders.sum(1).clip(1)
+    better = fits > _BETTER * fits.diagonal()[:, None]
+    return np.flatnonzero((better & better.T).any(0)).tolist()
 
 
 def pose_findings(scene: DecodedScene) -> Iterator[Finding]:
