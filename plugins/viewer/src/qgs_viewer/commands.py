@@ -88,7 +88,7 @@ Port = Annotated[
 ]
 OpenBrowser = Annotated[
     bool,
-    typer.Option("--open/--no-open", help="Whether to open the viewer in this machine's browser."),
+    typer.Option("--open/--no-open", help="Open the viewer in this machine's browser, or not."),
 ]
 Runs = Annotated[
     list[str],
@@ -267,7 +267,7 @@ def demo(
 
     Camera poses are computed first (qgs poses) for a video, and for photos without poses. With
     --train, two small recipes (TokenGS and LocusGS), or the recipes that you name, are trained from
-    the start, and the trained models are compared.
+    scratch, and the trained models are compared.
     """
     if train and models:
         raise ValueError(

@@ -20,7 +20,7 @@ from qgs_viewer.report import Comparison, write_report
 # The shipped models that are compared on unseen rooms.
 MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
 ON_PHOTOS = {64: ["worlds/landmark-64"], 128: ["worlds/landmark-128"]}
-"""Default models for a user's photos, by the size that they take, in pixels."""
+"""Default models for a user's photos, by the image size of the models in pixels."""
 # The recipes that `qgs demo --train` trains.
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
@@ -35,9 +35,9 @@ def compare_models(
 ) -> None:
     """Evaluate `models` (default: some that come with qgs), and write a report into `target`.
 
-    photos: folder or video; None evaluates on unseen scenes of the models' data. size: text of the
-    option --size, the size of the photos. scale: factor by which camera positions are multiplied;
-    None searches for a factor.
+    photos: folder or video; None evaluates on unseen scenes of the models' data. size: size
+    of the photos, as text of the option --size; None lets the models determine it. scale: factor by
+    which camera positions are multiplied; None searches for a factor.
     """
     pixels = parse_size(size)
     # models of 128 pixels need photos of that size at least

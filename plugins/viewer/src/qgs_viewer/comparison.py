@@ -48,8 +48,8 @@ OF_THE_METHOD = (
 )
 """Options that may differ between compared recipes.
 
-They belong to the method: details of its training, tuning (not used here), and the unit of the
-model's world, which changes no score.
+They belong to the method: learning rates of parts of the model, a loss on input views, what tuning
+changes and how fast, and the scale of the model's world, which changes no score.
 """
 
 
@@ -62,8 +62,8 @@ def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) ->
 
     The first window is the best of `ranked_windows`. Each further window is nearly as good, and far
     from the windows chosen before it. inputs: number of input photos in a window. trained_on:
-    measurements of the cameras of the training data, by which windows are ranked. Raises ValueError
-    if the scene has fewer photos than `inputs`.
+    ranges of distances and angles between the cameras in training, by which windows are ranked.
+    Raises ValueError if the scene has fewer photos than `inputs`.
     """
     frusta = Frusta(scene, trained_on)
     ranked = ranked_windows(frusta, inputs)
@@ -109,7 +109,7 @@ class PhotoWindows(Span):
 
 
 class ScaleSearch:
-    """Replace `scale: search` in settings of views by the scale found for each window.
+    """Callable that replaces `scale: search` in settings of views by the scale found for a window.
 
     A window is a scene with its input frames and its compared frames. found: the scale found for
     each window, by (scene name, inputs, compared frames), so that no window is searched twice.

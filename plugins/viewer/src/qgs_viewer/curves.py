@@ -44,7 +44,7 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def curves_of(file: Path) -> Curves:
-    """Return the records of all steps that a training did not skip; empty if none are stored.
+    """Return the records of a training without skipped steps; empty if no records are stored.
 
     file: checkpoint NAME.safetensors. The history is read from NAME.history.jsonl in the same
     folder, or else from history.jsonl.

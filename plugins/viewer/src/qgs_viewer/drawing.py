@@ -37,8 +37,9 @@ class Choice:
 
     query: index of the picked query; None for all. by_query: whether to colour Gaussians by query.
     layer: decoder layer whose anchors and attention are shown; 0 is before the first layer. others:
-    look of the Gaussians of queries that are not picked, such as "faint". patches: number of lines
-    from the picked query to the patches that it attends to most. anchors, photos: False hides them.
+    look of the Gaussians of queries that are not picked: "shown", "faint" or "hidden". patches:
+    number of lines from the picked query to the patches that it attends to most. anchors, photos:
+    False hides the anchors or the photos.
     """
 
     query: int | None = None
@@ -142,7 +143,7 @@ class Drawing:
         self.update(scene, choice)
 
     def update(self, scene: QueryScene, choice: Choice) -> None:
-        """Draw all again except photos and background, which do not depend on `choice`."""
+        """Draw the scene again, except photos and background, which do not depend on `choice`."""
         self._draw_gaussians(scene, choice)
         if (views := self.api.get_handle_by_name("/views")) is not None:
             views.visible = choice.photos

@@ -30,9 +30,9 @@ from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 PLY = "gaussians.ply"
 _SCENES = (".ply", ".splat", ".spz", ".sog", ".ksplat")
 CAMERAS = "cameras.json"
-"""The two files that `qgs reconstruct --out FOLDER` writes into FOLDER."""
+"""File with the cameras, which `qgs reconstruct --out FOLDER` writes beside gaussians.ply."""
 REFINED = "refined"
-"""The subfolder of a finished reconstruction with the result of `qgs refine`."""
+"""Name of the subfolder that `qgs refine` writes into a finished reconstruction."""
 # Median distance of means, per spread of the scene, up to which a model made a PLY's Gaussians.
 #
 # A finished reconstruction keeps its photos in 8 bits, which moves means by some thousandths.
@@ -45,8 +45,9 @@ class Source:
 
     The derived class `ModelSource` reconstructs a scene from photos that the user chooses. title:
     heading of the viewer. notes: remarks for the user. fixed: the Gaussians to show; None in
-    `ModelSource`. frames: indices of the first input photos in their scene. labels: a name for
-    every photo of the scene; empty if the user cannot change the inputs.
+    `ModelSource`. frames: indices, within the scene, of the input photos that the viewer uses
+    at the start. labels: a name for every photo of the scene; empty if the user cannot change the
+    inputs.
     """
 
     title: str
@@ -67,7 +68,8 @@ class Source:
 class ModelSource(Source):
     """A model and a scene: the user may choose any photos of the scene as inputs.
 
-    All reconstructions are shown in the world coordinates of the first inputs, `frames`.
+    The viewer's world is that of the reconstruction from `frames`, the inputs at the start. All
+    later reconstructions are moved into this world.
     """
 
     def __init__(
@@ -108,7 +110,7 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
     """Open the file of Gaussians, the reconstruction, the run folder or the model `name`.
 
     options: passed to `open_model`. Raises ValueError if options are given for a file of Gaussians
-    or a reconstruction, which take no options, and what the readers of files raise.
+    or a reconstruction, which take no options. Errors of the readers of files pass through.
     """
     path = Path(name).expanduser()
     finished = is_finished(path)
@@ -240,8 +242,8 @@ class FinishedScene(Scene):
     def label(self, frame: int) -> str:
         """Return the file name of a photo; without one, text with its frame number.
 
-        frame: index of the view in cameras.json. It may differ from the frame number, which counts
-        in the original scene.
+        frame: index of the view in cameras.json. The frame number in the text is the index of the
+        photo in the original scene, which may differ from `frame`.
         """
         view = self._views[frame]
         return str(view.get("photo") or f"frame {view['frame']}")
@@ -295,10 +297,10 @@ def open_finished(folder: Path, device: str) -> Source:
 def _with_queries(
     plain: QueryScene, scene: FinishedScene, record: Mapping[str, Any], device: str
 ) -> ModelSource:
-    """Return the reconstruction `plain` with the model that made it, whose queries can be shown.
+    """Return the reconstruction `plain` with its model, so that the queries can be shown.
 
     record: content of cameras.json. Raises ValueError or OSError if the model is unknown or cannot
-    be read, or if it now makes other Gaussians than those of `plain`.
+    be read, or if it does not make the Gaussians of `plain` (any more).
     """
     for change in ("refinement", "tuning"):
         if record.get(change):
@@ -307,8 +309,8 @@ def _with_queries(
     # nothing is fetched because a file says so
     if not name or "://" in name:
         raise ValueError(
-            f"the model that made the Gaussians is {name or 'not known'}; to see queries, use "
-            "`qgs view MODEL PHOTOS`."
+            f"cameras.json must name a model on this machine (model: {name or 'not known'}); to "
+            "see queries, use `qgs view MODEL PHOTOS`."
         )
     with CheckpointFile(name) as file:
         model = file.model(device)

@@ -55,11 +55,12 @@ def quiet_server(
 
 
 def foreign(headers: Mapping[str, str], host: str) -> bool:
-    """Return True for a request to refuse: from a page of another server, or by a wrong host name.
+    """Return True for a request to refuse: from a page of another server, or to a wrong host name.
 
-    Such a page, open in the same browser, could otherwise read the scene. With a host name of its
-    own that resolves to this machine (DNS rebinding), it would look like a page of this server.
-    Right host names are IP addresses, localhost, the name of this machine, and `host`.
+    A page of another server, open in the same browser, could otherwise read the scene. The host
+    name is checked too, because the other server may let its host name resolve to this machine
+    (DNS rebinding). Right host names are IP addresses, localhost, the name of this machine, and
+    `host`.
     """
     named = headers.get("Host", "")
     origin = headers.get("Origin")
@@ -79,7 +80,7 @@ def foreign(headers: Mapping[str, str], host: str) -> bool:
 def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options: Any) -> Any:
     """Call `serve` so that the server answers requests that are `foreign` with status 403.
 
-    serve: the function `websockets.asyncio.server.serve`. host: see `foreign`.
+    serve: the function `websockets.asyncio.server.serve`. host: address of the server.
     """
 
     def checked(connection: Any, request: Any) -> Any:
@@ -140,7 +141,7 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
-    """Return an HTML page of `scene`, which a reader can turn and film.
+    """Return an HTML page that shows `scene` in 3D; a reader can turn the scene and record a video.
 
     The page takes 0.8 MB plus 40 bytes for each Gaussian. choice: what is shown; by default all
     Gaussians in their own colours, and the anchors after the last layer.

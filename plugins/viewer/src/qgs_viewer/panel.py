@@ -104,7 +104,7 @@ class Panel:
                 self.boxes.append(box)
 
     def _bind(self, name: str, control: Any) -> None:
-        """Make changes of `control` set the field `name` of `self.choice`."""
+        """Let `control` set the field `name` of `self.choice` whenever the user changes it."""
         control.on_update(lambda _: self.choose(**{name: control.value}))
 
     def _typed(self, event: Any) -> None:

@@ -77,8 +77,8 @@ class Splats:
 def splats(gaussians: Gaussians, placement: Placement) -> Splats:
     """Return the Gaussians (1, G) of one scene, placed in the viewer's world.
 
-    Their colours do not depend on the direction. A warning says so if `gaussians` has spherical
-    harmonics.
+    Spherical harmonics above degree 0 are left out, with a warning, so the colours do not depend on
+    the viewing direction.
     """
     if gaussians.sh is not None:
         warn_once(

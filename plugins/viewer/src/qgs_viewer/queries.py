@@ -219,9 +219,9 @@ def notable_queries(
 
 
 def _widths(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return the widths (G,) of G Gaussians in the first view, as shares of its longer side.
+    """Return the widths (G,) of G Gaussians in the first view, relative to the longer image side.
 
-    The width is 4 sigma of a Gaussian's longest axis; 0 for Gaussians behind the camera.
+    The width is 4 sigma on a Gaussian's longest axis; it is 0 for Gaussians behind the camera.
     """
     depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2]
     focal = cameras.intrinsics[0, 0, :2].mean()

@@ -76,7 +76,7 @@ class QueryScene:
         """Raise ValueError if the scene has no query with the index `query`. None is accepted."""
         if query is not None and query >= self.queries:
             last = self.queries - 1
-            there = f"queries are 0 to {last}" if self.queries else "this source has no queries"
+            there = f"choose one from 0 to {last}" if self.queries else "this source has no queries"
             raise ValueError(f"--query {query} cannot be picked: {there}")
 
     @cached_property
@@ -152,7 +152,7 @@ class QueryScene:
         """Return the `count` photo patches that a query attends to most, averaged over heads.
 
         depth: distance from a camera at which its photo is drawn, in the viewer's world. Returns
-        None where `attention` returns None.
+        None if `attention` gives None for the query and layer.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:

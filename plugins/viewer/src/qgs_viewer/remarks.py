@@ -69,7 +69,7 @@ def next_commands(
     photos: str | None = None,
     options: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Return what each shell command does that a reader may run next, by command.
+    """Return shell commands that a reader may run next, each with a phrase that says what it does.
 
     names: the models as given on the command line. target: folder of the report, into which the
     commands write. photos: folder or video of the user; None for unseen scenes. options: options

@@ -102,7 +102,7 @@ def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample
     names = dict.fromkeys(sample.scene for sample in samples)
     if scene is not None and scene not in names:
         raise ValueError(
-            f"--scene {scene!r} is none of the evaluated scenes: choose from {listed(names)}"
+            f"--scene {scene!r} is not one of the evaluated scenes: choose from {listed(names)}"
         )
     # sorting is stable: the others keep their order
     return sorted(samples, key=lambda sample: sample.scene != scene)
@@ -114,8 +114,8 @@ def scenes_of(
 ) -> ModelScenes:
     """Reconstruct `samples` by `network`, and keep the queries of the first sample.
 
-    file: checkpoint of the network, beside which the history of the training may lie; None gives no
-    curves.
+    file: checkpoint of the network. If the training history lies beside it, the result has the
+    training curves. None gives no curves.
     """
     # components draw random numbers in training mode
     network.eval()

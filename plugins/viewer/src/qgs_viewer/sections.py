@@ -128,7 +128,8 @@ def queries(models: Shown, detail: Detail) -> Section:
 def anchors(models: Shown, detail: Detail) -> Section:
     """Return a section with anchors and support ellipsoids of queries on the first input photo.
 
-    Columns: at the start and after some decoder layers. A model without anchors has no row.
+    There is one row for each model with anchors. The columns show the anchors before the first
+    decoder layer and after some layers.
     """
     rows = {}
     for model in models:
@@ -156,7 +157,8 @@ def anchors(models: Shown, detail: Detail) -> Section:
 def attention(models: Shown, detail: Detail) -> Section:
     """Return a section with the attention of one query of each model to photo patches.
 
-    Columns: logits from content, bias from geometry, and the attention that results from both.
+    The columns show logits from content, bias from geometry, and the attention that results from
+    both.
     """
     rows = {}
     for model in models:
@@ -184,8 +186,8 @@ def training_curves(models: Shown, detail: Detail) -> Section:
 def novel_views(models: Shown, detail: Detail) -> Section:
     """Return a section with the middle target view of up to three scenes.
 
-    Each scene has three rows: renders, their errors, depths. The columns are the inputs, the real
-    photos (truth) and the models.
+    Each scene has three rows: renders, errors of the renders, depths. The columns are the inputs,
+    the real photos (truth) and the models.
     """
     rows: dict[str, Sequence[Tile | None]] = {}
     for place, sample in enumerate(models[0].samples[:NOVEL_SCENES]):
@@ -205,9 +207,9 @@ def novel_views(models: Shown, detail: Detail) -> Section:
 def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[str, Any]:
     """Return the pictures of a scene as a dict for the template.
 
-    `name` of the scene; `inputs`, tiles of the input photos; `kinds`, tiles of the target views by
-    kind (Render, Error, Depth), then by column (Truth, names of models); `most`, the error that is
-    shown brightest.
+    Keys are `name`, the name of the scene; `inputs`, tiles of the input photos; `kinds`, tiles of
+    the target views by kind (Render, Error, Depth), then by column (Truth, names of models); and
+    `most`, the absolute error that the error pictures show as the brightest colour.
 
     place: index of the scene among the samples. targets: indices of the target views to show.
     """

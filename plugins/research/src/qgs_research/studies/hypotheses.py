@@ -11,9 +11,9 @@ NAME = r"[A-Za-z0-9_][A-Za-z0-9_.]*"
 """Pattern of allowed names of variants and evaluations, which are used as folder names."""
 
 MAIN = ""
-"""Name of the default evaluation, which the variants' own recipes describe."""
+"""Name of the default evaluation, whose options are those of the variants' recipes."""
 
-_FORM = "write `A < B` or `A > B`, each side a variant or a sum such as `A@noisy - A`"
+_FORM = "write `A < B` or `A > B`; each side is a variant, or a sum such as `A@EVALUATION - A`"
 _TERM = re.compile(rf"\s*([+-]?)\s*({NAME})(?:@({NAME}))?\s*")
 
 
@@ -54,8 +54,8 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     # A sum that does not cancel would depend on the data set, not on the variants.
     if sum(terms.values()):
         raise OptionError(
-            f"the two sides of `{text}` have different numbers of terms and cannot be compared",
-            "write differences on both sides, such as `A@noisy - A < B@noisy - B`",
+            f"the weights (1 or -1) of the terms of `{text}` have different sums on its two sides",
+            "write one variant on each side, or differences, such as `A@noisy - A < B@noisy - B`",
         )
     terms = {term: coefficient for term, coefficient in terms.items() if coefficient}
     if not terms:
@@ -66,4 +66,4 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
 def _check_known(noun: str, name: str, known: Collection[str], text: str) -> None:
     if name not in known:
         fix = did_you_mean(name, known, f"{noun}s")
-        raise OptionError(f"there is no {noun} `{name}` in `{text}`", fix)
+        raise OptionError(f"`{text}` names the unknown {noun} `{name}`", fix)

@@ -120,8 +120,8 @@ INDEX = "evaluation.index"
 def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
     """Add a problem for each option in which a variant differs from the reference.
 
-    Options in the study's `differs`, and the sections model and optimizer, may differ. Adds a
-    problem too for each entry of `differs` that is the same in all variants.
+    Options in the study's `differs`, and the sections model and optimizer, may differ. Also adds a
+    problem for each option in `differs` whose value is the same in all variants.
     """
     settings = study.settings
     first = recipes[settings.reference]
@@ -199,7 +199,7 @@ def check_data(plan: Plan) -> None:
 
 
 def refuse_changed(plan: Plan) -> None:
-    """Raise ValueError if a recipe has changed since existing results were made by it."""
+    """Raise ValueError if a recipe has changed since it made results in the study folder."""
     for variant, name in product(plan.recipes, plan.evaluations):
         recipe = plan.evaluation_recipe(variant, name)
         file = recipe_file(plan.folder, variant, name)

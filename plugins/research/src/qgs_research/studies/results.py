@@ -38,10 +38,11 @@ A random order of three variants equals the published order in 1 of 6 cases; of 
 
 
 class Judgement(NamedTuple):
-    """Verdict on a hypothesis, with a reason: "seen" (supported), "contradicted" or "undecided".
+    """Verdict on a hypothesis.
 
-    estimate: left side of the hypothesis minus its right side; None if the runs of the two sides
-    have no scores for a common seed and scene.
+    verdict: "seen" (the scores support the hypothesis), "contradicted" or "undecided". reason: text
+    that explains the verdict; "" if it needs none. estimate: left side of the hypothesis minus its
+    right side; None if the runs of the two sides have no scores for a common seed and scene.
     """
 
     hypothesis: Hypothesis

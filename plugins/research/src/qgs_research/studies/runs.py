@@ -16,7 +16,7 @@ from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.study import Study
 
 BESIDE = ("seed", "plugins")
-"""Keys of a recipe that do not change the model."""
+"""Keys of a recipe that are ignored when the recipes of variants are compared."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def write_plan(plan: Plan) -> None:
 
 
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[str | None, str | None]]:
-    """Return the options in which two recipes differ: both values, by path of the option.
+    """Return the options in which two recipes differ: pairs of values, by path of the option.
 
     A missing value is None. The options `seed` and `plugins` are left out.
     """

@@ -79,7 +79,7 @@ class Scores:
     ) -> dict[str, Estimate]:
         """Return the differences to the reference model in `self.metric`, by model.
 
-        Models without a difference (see `difference`) are left out.
+        Models for which `difference` returns None are left out.
         """
         found: dict[str, Estimate] = {}
         for model in self.models(evaluation):

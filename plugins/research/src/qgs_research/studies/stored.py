@@ -18,11 +18,12 @@ from qgs.recipe.yaml_text import load_mapping
 class StoredResults:
     """Results of one evaluation, read from a folder.
 
-    name: path of the folder as given. columns: table format of each value. scenes: values such as
-    "model_psnr" of each scene. frames: input and target frames of each scene. missing: scenes
-    without a score. step: number of training steps. recipe: recipe of the training as JSON, with
-    defaults filled in, without seed and evaluation; "" if unknown. seed: seed of the training. step
-    and seed are None if unknown. trained: facts about the training, such as data and duration.
+    name: path of the folder as given. columns: table format of each metric. scenes: for each scene,
+    its values by name, such as "model_psnr". frames: input and target frames of each scene.
+    missing: scenes without a score. step: number of training steps. recipe: recipe of the training
+    as JSON, with defaults filled in, without seed and evaluation; "" if unknown. seed: seed of the
+    training. step and seed are None if unknown. trained: facts about the training, such as data and
+    duration.
     """
 
     name: str

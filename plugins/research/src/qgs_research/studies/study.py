@@ -20,7 +20,7 @@ from qgs.wording import did_you_mean
 from qgs_research.studies.hypotheses import NAME, Contrast, parsed
 
 _BY_NAME = ("variants", "evaluations", "published")
-"""Keys of which a study that extends another study replaces single entries, not the whole."""
+"""Keys whose entries a study replaces one by one in the study that it extends."""
 
 
 def _folder_name(name: str) -> str:
@@ -129,8 +129,8 @@ class StudySettings(ComponentConfig):
     """Options, outside the sections model and optimizer, in which variants may differ, such as
     `training.batch_size`."""
     hypotheses: tuple[Annotated[Hypothesis, AfterValidator(_known_terms)], ...] = ()
-    """Statements to check, such as `A > B`. Each is a text, or a mapping with the text as
-    `claim`."""
+    """Statements to check. Each is a text such as `A > B`, or a mapping with this text under the
+    key `claim`."""
     published: dict[VariantName, float] = Field(default_factory=dict)
     """Published values of the metric, by variant. The table shows them beside the measured values.
     A note gives the rank correlation of published and measured values."""
@@ -260,7 +260,7 @@ def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
 
 
 def _locate_index(node: MapNode) -> None:
-    """Make `evaluation.index` absolute if this path, taken from the study's folder, exists."""
+    """Make the path `evaluation.index` absolute if, relative to the study file, it names a file."""
     section = node.child("evaluation")
     index = section.get("index")
     if isinstance(index, str):

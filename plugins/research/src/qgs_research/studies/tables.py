@@ -129,9 +129,9 @@ def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, 
 
 
 def training_notes(scores: Scores) -> Iterator[str]:
-    """Yield a note for each model that was trained unlike the reference model.
+    """Yield a note for each model whose training differs from that of the reference model.
 
-    The trainings' data, steps, seconds and batch sizes are compared.
+    The data, number of steps, seconds and batch size of the trainings are compared.
     """
 
     def facts(model: str) -> set[tuple[str, str]]:
@@ -147,7 +147,10 @@ def training_notes(scores: Scores) -> Iterator[str]:
 
 
 def interval_notes(differences: Iterable[Estimate]) -> Iterator[str]:
-    """Yield notes on whether intervals hold for new trainings, or only for new scenes."""
+    """Yield notes that say which variation the confidence intervals of `differences` cover.
+
+    With several seeds, an interval covers trainings and scenes; with one seed, only scenes.
+    """
     seeds = {len(estimate.seeds) for estimate in differences}
     if max(seeds, default=0) > 1:
         yield "95 % intervals cover trainings and scenes; sd is the standard deviation over seeds"
