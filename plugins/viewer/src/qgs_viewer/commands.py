@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class FigureName(StrEnum):
-    """Names of the figures that `qgs figures` draws, in the order in which figures.md has them."""
+    """Names of the figures that `qgs figures` draws, in the order of their texts in figures.md."""
 
     NOVEL_VIEWS = auto()
     QUERIES = auto()

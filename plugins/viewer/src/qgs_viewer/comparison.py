@@ -111,8 +111,9 @@ class PhotoWindows(Span):
 class ScaleSearch:
     """Callable that replaces `scale: search` in settings of views by the scale found for a window.
 
-    A window is a scene with its input frames and its compared frames. found: the scale found for
-    each window, by (scene name, inputs, compared frames), so that no window is searched twice.
+    A window is a scene with its input frames and the frames that renders are compared to. found:
+    the scale found for each window, by (scene name, input frames, compared frames), so that no
+    window is searched twice.
     """
 
     def __init__(self, model: QueryGaussianModel, views: ViewsConfig) -> None:

@@ -68,7 +68,7 @@ class DrawnScene(Scene):
 
     @cached_property
     def cameras(self) -> Cameras:
-        """See `Scene`."""
+        """Cameras (F,) of all frames, with lengths in metres."""
         intrinsics = torch.from_numpy(self.lens).float().expand(len(self), 4)
         # float() copies float64, so the poses of the ray caster keep their units
         c2w = torch.from_numpy(self.c2w).float()
@@ -90,7 +90,7 @@ class DrawnScene(Scene):
         """Return a rendered image (H, W, 3) uint8 for each of `frames`."""
 
     def images(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`."""
+        """Return images (F, 3, H, W) of F frames, float32 in [0, 1], from the cache or rendered."""
         config = self._config
         cache = self._cache
         images = {frame: cache[self.name, frame] for frame in frames if (self.name, frame) in cache}

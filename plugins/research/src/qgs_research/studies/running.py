@@ -188,7 +188,7 @@ def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -
 
 
 def _end_with(parent: int) -> None:
-    """Send SIGTERM to this process when its parent process has ended."""
+    """Send SIGTERM to this process when the parent process, of id `parent`, has ended."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os.kill(os.getpid(), signal.SIGTERM)

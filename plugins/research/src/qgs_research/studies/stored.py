@@ -73,8 +73,8 @@ def read_results(path: str | Path) -> StoredResults:
     folder = next((folder for folder in folders if (folder / "summary.json").is_file()), None)
     if folder is None:
         raise FileNotFoundError(
-            f"no results in {path}; give a folder that `qgs eval` wrote, or a run folder with a "
-            "folder evaluation/"
+            f"no results in {path}; give a folder that `qgs eval` wrote, or a run folder that "
+            "contains evaluation/"
         )
     try:
         return _read(folder, str(path))

@@ -24,11 +24,11 @@ _FLAT = 0.03
 
 @inner
 def _range(low, high, lamp, reach, extent, cells):
-    """Return the range of floor cells, on one axis, that a shape and its shadow cover.
+    """Return first and end index of the floor cells that a shape and its shadow cover on one axis.
 
-    low, high: limits of the shape. lamp: position of the lamp. reach: distance of the shadow's edge
-    from the lamp, relative to the distance of the shape's edge. extent: size of the room. cells:
-    number of floor cells. All are values on this axis.
+    All arguments are values on this axis. low, high: limits of the shape. lamp: position of the
+    lamp. reach: distance from the lamp to the shadow's edge, divided by the distance from the lamp
+    to the shape's edge. extent: size of the room. cells: number of floor cells.
     """
     start = min(low, lamp + (low - lamp) * reach)
     end = max(high, lamp + (high - lamp) * reach)
@@ -39,7 +39,7 @@ def _range(low, high, lamp, reach, extent, cells):
 
 @inner
 def _darken(darkness, body, size, lamp):
-    """Darken the floor in the lamp's shadow of a shape and in the area below the shape.
+    """Darken the floor below a shape and in the shadow that the lamp casts behind the shape.
 
     darkness: share of light lost in each cell of the floor, (C, C). size: extent of the
     room in metres. lamp: position of the lamp.
@@ -122,7 +122,8 @@ def _on_round(body, part, p):
 def _surface(shape, part, place):
     """Return texture index, world normal and four texture coordinates of a point on a shape.
 
-    The first two coordinates are in metres; the last two run from -1 to 1 across the surface.
+    part: number of the face that the ray hit. place: the point in the world frame. The first two
+    coordinates are in metres; the last two run from -1 to 1 across the surface.
     """
     body = shape.body
     inside = body.kind == s.INTERIOR
@@ -152,7 +153,8 @@ def _edge(distance):
 def _wall_shadow(place, size, face):
     """Return a light factor for a point on a wall, the floor or the ceiling.
 
-    The factor is smaller near the edges, where two of these surfaces meet.
+    The factor is smaller near the edges, where two of these surfaces meet. face: number of the
+    surface, 0 to 5. size: extent of the room in metres.
     """
     x, y, z = place
     a = 1.0 if face < 2 else _edge(0.5 * size[0] - abs(x))
@@ -189,7 +191,10 @@ def _shadow(room, code, place, normal):
 
 @inner
 def _light(room, code, place, normal):
-    """Return the RGB light at a point: ambient light, and diffuse light of lamp and window."""
+    """Return the RGB light at a point: ambient light, and diffuse light of lamp and window.
+
+    code: face code of the surface. place, normal: the point and its normal in the world frame.
+    """
     # more light on surfaces that face down; otherwise ceilings would be dark
     even = 0.56 - 0.12 * normal[2]
     total = (even, even, even)

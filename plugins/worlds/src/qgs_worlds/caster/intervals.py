@@ -68,7 +68,7 @@ def ellipsoid(o, d):
 
 @inner
 def ball(o, d, radius):
-    """Return the interval of a ray in a sphere around the origin; its exit t is always inf."""
+    """Return the interval of a ray in a sphere around the origin; the exit t (not used) is inf."""
     inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
     x, y, z = along(o, middle, d)
@@ -150,7 +150,10 @@ def _shaft(o, d, radius, half):
 
 @inner
 def cylinder(o, d, h):
-    """Return the interval in a cylinder of radius h[0], half height h[2]; face 1 is a cap."""
+    """Return the interval of a ray in an upright cylinder around the z axis.
+
+    The radius is h[0] and the half height is h[2]. Face 0 is the side, face 1 a cap.
+    """
     near, far, low, high = _shaft(o, d, h[0], h[2])
     return near, far, (ONE if near == low else ZERO), (ONE if far == high else ZERO)
 
@@ -257,8 +260,8 @@ def _above(heights, o, d, t):
 def _next_line(o, d, t, cells):
     """Return the t at which a ray crosses the next border of a height map's cells, on one axis.
 
-    o, d: start and direction of the ray on this axis. The search begins after `t`. cells: number of
-    cells.
+    o, d: start and direction of the ray on this axis. t: start of the search. cells: number
+    of cells.
     """
     if abs(d) < TINY:
         return NONE

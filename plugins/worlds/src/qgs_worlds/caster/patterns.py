@@ -73,7 +73,8 @@ def _planks(x, y, seed, fade):
 def _picture(p, q, seed):
     """Return the weights (m, n) that mix three colours to a painted landscape at (p, q).
 
-    The picture shows hills under a sky with a sun. p, q: in [-1, 1]. See `mixture`.
+    The picture shows hills under a sky with a sun. p, q: in [-1, 1]. The RGB is
+    lerp(lerp(a, b, m), c, n) for colours a, b and c.
     """
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
     # hills farther off are higher and paler
@@ -93,7 +94,8 @@ def _picture(p, q, seed):
 def _rug(p, q, x, y, seed):
     """Return the weights (m, n) that mix three colours to a rug at (p, q) in [-1, 1].
 
-    The rug has two borders, a centre ring and diamonds with period 1 in x, y. See `mixture`.
+    The rug has two borders, a centre ring and diamonds with period 1 in x, y. The RGB is
+    lerp(lerp(a, b, m), c, n) for colours a, b and c.
     """
     edge = min(1 - abs(p), 1 - abs(q))
     ring = abs(p) + abs(q)
@@ -113,7 +115,8 @@ def _rug(p, q, x, y, seed):
 def _window(p, q, seed):
     """Return the weights (m, n) that mix three colours to a window at (p, q) in [-1, 1].
 
-    The window has a frame and glazing bars, and shows trees and sky. See `mixture`.
+    The window has a frame and glazing bars, and shows trees and sky. The RGB is
+    lerp(lerp(a, b, m), c, n) for colours a, b and c.
     """
     if abs(p) < 0.03 or abs(q - 0.25) < 0.025 or abs(p) > 0.94 or abs(q) > 0.95:
         return 0.0, 1.0
@@ -127,7 +130,8 @@ def _window(p, q, seed):
 def _spines(x, seed):
     """Return the weights (m, n) that mix three colours to a row of book spines.
 
-    Some spines have a band. x: position in the row, in widths of a book. See `mixture`.
+    Some spines have a band. x: position in the row, in widths of a book. The RGB is
+    lerp(lerp(a, b, m), c, n) for colours a, b and c.
     """
     i = math.floor(x + 0.3 * _noise(x, 0.5, seed))
     return _hash(i, 1, seed), (0.9 * _hash(i, 2, seed) if _hash(i, 3, seed) > 0.5 else 0.0)

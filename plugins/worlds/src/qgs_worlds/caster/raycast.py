@@ -100,8 +100,8 @@ def _covered(corners, points, intrinsics):
 def _span(low, high, samples, first, count):
     """Return the first index and the end index of the samples between two pixel coordinates.
 
-    low, high: the coordinates. samples: samples per pixel. first: pixel of sample 0. count: number
-    of all samples.
+    All values are on one axis. low, high: the two coordinates. samples: samples per pixel. first:
+    pixel of sample 0. count: number of all samples.
     """
     # half a sample more on both sides, because bounds and rays round differently
     low = (low - first) * samples - 0.5
@@ -131,9 +131,9 @@ def _row_base(rays, v):
 def _ray(o, base, step, u):
     """Return a ray's point nearest to the origin, its direction, and the t of this point.
 
-    o, base, step: start of the ray, direction of its row's ray 0, and change of direction per
-    pixel. u: pixel in the row. Intersections start at the nearest point, because float32 would lose
-    thin shapes far from the camera.
+    o, base, step: start of the ray, direction of the ray at pixel 0 of its row, and change of
+    direction per pixel. u: pixel coordinate in the row. Intersections start at the nearest point,
+    because float32 would lose thin shapes far from the camera.
     """
     d = along(base, u, step)
     p, t = nearest(o, d)
@@ -153,8 +153,10 @@ def _store(spans, k, found, t):
 def _inside_row(kind, extra, heights, steps, o, base, step, spans):
     """Intersect the R rays of a row with a primitive, and write their intervals to `spans` (4, R).
 
-    An interval is entry t, exit t, entry face and exit face. Each kind of primitive has its own
-    loop, because LLVM vectorises loops without branches.
+    An interval is entry t, exit t, entry face and exit face. kind, extra: fields of the primitive.
+    steps: pixel coordinates (R,) of the rays in the row. o, base, step: start of the rays,
+    direction of the ray at pixel 0, and change of direction per pixel. Each kind of primitive has
+    its own loop, because LLVM vectorises loops without branches.
     """
     count = steps.shape[0]
     if kind == s.ELLIPSOID:
@@ -211,7 +213,8 @@ def _keep(t, code, k, own, found):
 def _cover_row(t, code, own, kind, extent, steps, o, base, step):
     """Update the hits of a row of rays where a room's shape is nearer than all earlier shapes.
 
-    Such a shape has no cut, so no intervals are stored, which saves two thirds of the time.
+    A room's shape has no cut, so no intervals are stored, which saves two thirds of the time.
+    extent: half sizes of the shape. The other arguments are those of `_closest` and `_inside_row`.
     """
     if kind == s.BLOCK:
         for k in range(t.shape[0]):
@@ -238,7 +241,10 @@ def _trace_primitive(primitive, heights, o, base, step, steps, spans):
 
 @inner
 def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
-    """Update the hits of rays in `area` where a room's shape is nearer than all earlier shapes."""
+    """Update the hits of rays in `area` where a room's shape is nearer than all earlier shapes.
+
+    body: primitive of the shape, which has no cut. The other arguments are those of `_trace_shape`.
+    """
     above, below, first, last = area
     kind = body.kind
     extent = triple(body.extent)
@@ -256,8 +262,10 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
 def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch):
     """Update the hits of rays in an area where a shape is nearer than all earlier shapes.
 
-    t, code: depths and face codes of the hits. own: code of the shape. area: first row, end row,
-    first column and end column of the rays. scratch: working memory.
+    t, code: depths and face codes of the hits. top: first pixel row of the band. samples: rays per
+    pixel along each axis. own: code of the shape. o: start of the rays. rays: the ray basis. steps:
+    pixel coordinates of the rays in a row. area: first row, end row, first column and end column of
+    the rays. scratch: working memory.
     """
     above, below, first, last = area
     step = narrow(rays[1])

@@ -92,7 +92,7 @@ def _on_primitive(primitive, heights, face, p):
 
 @inner
 def to_world(primitive, n):
-    """Turn the normal n from a primitive's frame to the world frame, without unit length."""
+    """Turn the normal n from a primitive's frame to the world frame, without normalising it."""
     axes = primitive.axes
     # `axes` leads into the frame, so its transpose leads normals out of it
     return dot(axes[:, 0], n), dot(axes[:, 1], n), dot(axes[:, 2], n)
@@ -119,7 +119,7 @@ def surface(shape, heights, part, place):
 
 @inner
 def _clouds(air, x, y, z):
-    """Return the share of cloud, from 0 to 1, in the direction (x, y, z).
+    """Return how much clouds cover the sky in the direction (x, y, z): 0 (clear) to 1 (overcast).
 
     The clouds are noise on a high plane.
     """
@@ -167,9 +167,11 @@ def _sky(air, lights, view):
 
 @inner
 def _light(light, shadows, own, place, normal, view, open_, shine):
-    """Return how strongly one light is reflected at a point: diffusely, and as a highlight.
+    """Return two factors by which a point reflects one light: diffuse light and highlight.
 
-    open_: share of ambient light at the point. shine: exponent of the highlight; 0 for none.
+    own: index of the shape, or -1 if the shape can cast a shadow on itself. view: direction from
+    the camera. open_: share of ambient light at the point, which replaces the shadow of a light
+    without shadow map. shine: exponent of the highlight; 0 for none.
     """
     toward = minus(light.place, times(light.lamp, place))
     square = dot(toward, toward)
@@ -194,9 +196,10 @@ def _light(light, shadows, own, place, normal, view, open_, shine):
 def _shade(world, around, code, place, view, footprint, distance):
     """Return the RGB, in linear light, of a surface seen from the camera.
 
-    around: boxes near earlier points, from `surroundings`. code: face code of the surface. place:
-    point on the surface. view: direction from the camera. footprint: distance between neighbouring
-    pixels at the point. distance: from the camera to the point. All lengths are in metres.
+    around: cache from `surroundings`, with boxes near an earlier point. code: face code of the
+    surface. place: point on the surface. view: direction from the camera. footprint: distance
+    between neighbouring pixels at the point. distance: from the camera to the point. All lengths
+    are in metres.
     """
     i = code >> 3
     shape = world.shapes[i]

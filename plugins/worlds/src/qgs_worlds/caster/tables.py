@@ -75,8 +75,8 @@ MAP = np.dtype([("begin", "i8"), ("side", "i8"), ("focal", "f8"), ("c2w", "f8", 
 class Shadows(NamedTuple):
     """Shadow maps of all lights.
 
-    maps: table of MAP, one row for each map. depths, codes: depth and face code of every pixel, of
-    all maps one after the other.
+    maps: table of MAP, one row for each map. depths, codes: depth and face code of every pixel; the
+    pixels of the maps follow one another.
     """
 
     maps: np.ndarray

@@ -137,7 +137,7 @@ def _glyphs(x, y, seed):
 
 @inner
 def _mean(kind, width):
-    """Return the mean share of the pattern's own colour, over the whole pattern."""
+    """Return the fraction of the surface that the colour of a pattern of this kind covers."""
     if kind == s.CHECKER:
         return 0.5
     if kind == s.TILES:
@@ -149,9 +149,10 @@ def _mean(kind, width):
 
 @inner
 def _pattern(kind, x, y, width, seed, blur):
-    """Return the share of the pattern's own colour at (x, y), and a random tone in [0, 1].
+    """Return how much of the pattern's colour covers (x, y), and a random tone, both in [0, 1].
 
-    x, y, blur: in periods of the pattern.
+    The tone differs from stripe to stripe or from tile to tile. x, y, blur (width of the edges): in
+    periods of the pattern.
     """
     if kind == s.STRIPES or kind == s.RINGS:
         place = x if kind == s.STRIPES else math.sqrt(x * x + y * y)

@@ -17,10 +17,10 @@ inner = partial(
     # Counting references to the passed arrays takes longer than the work on them.
     _nrt=False,
 )
-"""Decorator, like `kernel`, of functions that only kernels call and that allocate no arrays."""
+"""Decorator like `kernel`, for functions that only kernels call and that allocate no arrays."""
 
 reducing = partial(inner, fastmath={"contract", "reassoc", "arcp", "nsz", "nnan"})
-"""Decorator, like `inner`, of functions with a minimum over a loop. Values must not be NaN."""
+"""Decorator like `inner`, for functions that take a minimum in a loop over values without NaN."""
 
 
 @inner

@@ -147,7 +147,7 @@ for _kind in _KINDS.values():
 def _part(row: list[Any], sizes: Sizes) -> Shape:
     """Return the shape that a row of `parts` in furniture.toml describes.
 
-    sizes: the lengths in metres and material indices for which names in the row stand.
+    sizes: values of the names in the row: lengths in metres, or indices of materials.
     """
     make, lengths, material, *turn = row
     part = make(*_lengths(lengths, sizes), sizes[material])

@@ -66,7 +66,7 @@ class Materials:
     def table(self, first: Sequence[int]) -> np.ndarray:
         """Return a table of TEXTURE for the ray caster, one row for each material.
 
-        first: indices of materials whose rows come first. The rows of all materials follow.
+        first: indices of materials whose rows are repeated at the start, before all materials.
         """
         rows = [self._rows[i] for i in first] + self._rows
         table = np.zeros(len(rows), TEXTURE)

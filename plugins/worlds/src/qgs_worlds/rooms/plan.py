@@ -159,10 +159,10 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
 
 
 def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
-    """Return x and y of a point, given relative to a wall.
+    """Return x and y of a point that is given relative to the centre of the room and a wall.
 
-    side: number of the wall, 0 to 3. away: distance in metres from the centre of the room towards
-    the wall. along: distance in metres from this line, parallel to the wall.
+    side: number of the wall, 0 to 3. away: metres from the centre of the room towards the wall.
+    along: metres parallel to the wall, from the line that leads from the centre to the wall.
     """
     angle = math.pi + side * math.pi / 2
     cos = math.cos(angle)

@@ -64,7 +64,7 @@ class RoomScene(DrawnScene):
         return furnish(Random(self._plan_seed), self.size, self.c2w[:, :3, 3])
 
     def cast(self, frames: list[int]) -> np.ndarray:
-        """See `DrawnScene`."""
+        """Return rendered images (len(frames), H, W, 3) uint8."""
         from qgs_worlds.caster.casting import cast
         from qgs_worlds.caster.interiors import paint_room
 

@@ -29,7 +29,7 @@ _LAMPS = {"indoors": (1, 2), "outdoors": (0, 1), "objects": (0, 2)}
 _SUNNY = {"indoors": 0.5, "outdoors": 0.75, "objects": 0.45}
 
 Light = tuple[float, Sequence[float], np.ndarray, int]
-"""Row of the table LIGHT: lamp, place, color and shadows."""
+"""Row of LIGHT: 1 for a lamp, 0 for the sun; position or direction; RGB; 1 if it casts shadows."""
 # Height maps of a world.
 _MAPS = 4
 # Size in pixels of the images that determine exposure and depth of a scene.

@@ -213,7 +213,7 @@ def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
 def _far(rng: Random, things: Things, angle: float) -> Thing:
     """Return the shapes of a random distant hill, building or tree.
 
-    Its base is below the lowest ground. angle: direction from the origin, in radians.
+    The base of the object is below the lowest ground. angle: direction from the origin, in radians.
     """
     pick = rng.random()
     if pick < 0.3:
