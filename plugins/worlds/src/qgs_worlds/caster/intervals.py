@@ -150,10 +150,7 @@ def _shaft(o, d, radius, half):
 
 @inner
 def cylinder(o, d, h):
-    """Return the interval of a ray in an upright cylinder around the z axis.
-
-    The radius is h[0] and the half height is h[2]. Face 0 is the side, face 1 a cap.
-    """
+    """Return a ray's interval in a cylinder (radius h[0], half height h[2]); face 1 is a cap."""
     near, far, low, high = _shaft(o, d, h[0], h[2])
     return near, far, (ONE if near == low else ZERO), (ONE if far == high else ZERO)
 
@@ -260,8 +257,8 @@ def _above(heights, o, d, t):
 def _next_line(o, d, t, cells):
     """Return the t at which a ray crosses the next border of a height map's cells, on one axis.
 
-    o, d: start and direction of the ray on this axis. t: start of the search. cells: number
-    of cells.
+    o, d: start and direction of the ray on this axis. t: value after which the search begins.
+    cells: number of the map's cells on this axis.
     """
     if abs(d) < TINY:
         return NONE
