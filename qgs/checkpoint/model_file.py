@@ -113,7 +113,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def domain(self) -> Domain:
-        """Ranges of measurements of the training cameras, such as distances; empty if unknown."""
+        """Range of camera distances, angles and depths in the training data; empty if unknown."""
         key = _EXTRA + KEY
         if key not in self.metadata:
             return Domain()
@@ -151,8 +151,10 @@ class CheckpointFile(TensorFile):
 def load(name: AnyPath, device: str | torch.device | None = None) -> QueryGaussianModel:
     """Load the model of a checkpoint in evaluation mode.
 
-    name: checkpoint, as for `CheckpointFile`. The device and errors are those of
-    `CheckpointFile.model`.
+    name: path of a checkpoint file or of a run folder, PLUGIN/NAME of a model that an installed
+    plugin ships, or a URL. device: None means the CPU. Raises FileNotFoundError, CheckpointError
+    for a file that is not a checkpoint or does not fit the installed components, and ValueError for
+    NaN or infinite weights.
     """
     with CheckpointFile(name) as file:
         return file.model(device)

@@ -24,7 +24,8 @@ from qgs.terminal import without_secrets
 from qgs.wording import did_you_mean, warn_once
 
 CHECKPOINT = "checkpoint.safetensors"
-"""Name of the file in a run folder that holds the latest good weights."""
+"""Name of the checkpoint file in a run folder. It has the last weights before training diverged, or
+else the latest weights."""
 LARGEST = 20 * 10**9
 """Largest download, in bytes."""
 PATIENCE = 60.0
@@ -122,7 +123,7 @@ def _download(url: str, file: Path) -> None:
                 _copy(stream, local, file.parent)
             if not _is_whole(temporary):
                 raise ValueError(
-                    "the download is not a complete safetensors file, perhaps a web page"
+                    "the data are no complete safetensors file, perhaps a web page; check the URL"
                 )
     # The file system of the URL may raise anything.
     except Exception as error:
@@ -144,7 +145,9 @@ def _copy(stream: Any, local: IO[bytes], folder: Path) -> None:
         local.write(part)
         left -= len(part)
     if announced > limit or left <= 0:
-        raise OSError(f"the file is larger than the limit or the free space, {decimal(limit)}")
+        raise OSError(
+            f"the file is larger than the download limit or the free disk space, {decimal(limit)}"
+        )
 
 
 def _opened(url: str) -> Any:

@@ -72,9 +72,9 @@ class TensorFile:
                 raise
             if kind := pickle_kind(self.path):
                 raise CheckpointError(
-                    f"{self.path} is {kind}, which can run code when it is read; use the "
-                    "safetensors file of the run; if these are published weights, rename the file "
-                    "to NAME.pt"
+                    f"{self.path} is {kind}, which can run code when it is read. Use the "
+                    "safetensors file of the run; convert published weights by `qgs import`, which "
+                    "reads PyTorch files with the suffix .pt"
                 ) from error
             raise CheckpointError(
                 f"{self.path} is not a whole safetensors file ({name_shown(str(error))}); it may "

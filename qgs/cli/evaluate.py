@@ -24,7 +24,9 @@ def evaluate(
     overrides: Overrides = None,
     index: Annotated[
         str | None,
-        typer.Option(help="JSON file of scenes and frames to score: sets evaluation.index."),
+        typer.Option(
+            help="JSON file of scenes and frames to score. Default: the recipe's evaluation.index."
+        ),
     ] = None,
     tune: Tune = None,
     out: Annotated[

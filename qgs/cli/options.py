@@ -32,7 +32,7 @@ Size: TypeAlias = Annotated[
     typer.Option(
         metavar="HxW",
         help="Height and width to which photos are cropped and resized. Default: photos are not "
-        "cropped; their shorter side becomes that of the recipe's data.image_size.",
+        "cropped; the shorter side gets the length that it has in the recipe's data.image_size.",
     ),
 ]
 Inputs: TypeAlias = Annotated[
@@ -43,7 +43,7 @@ Frames: TypeAlias = Annotated[
     typer.Option(help="Numbers or file names of input photos: 0,8,x.jpg. Default: qgs chooses."),
 ]
 SceneName: TypeAlias = Annotated[
-    str | None, typer.Option("--scene", help="Name of the scene to use, if there are several.")
+    str | None, typer.Option("--scene", help="Scene to use, by name. Needed if there are several.")
 ]
 ViewsSettings: TypeAlias = Annotated[
     list[str] | None,
@@ -64,8 +64,8 @@ Tune: TypeAlias = Annotated[
     str | None,
     typer.Option(
         metavar="[WHAT:]STEPS",
-        help="Fit the queries to the input photos for STEPS steps before rendering. latents:STEPS "
-        "fits the encoder's features of the photos, not the queries. 0: no fitting.",
+        help="Fit the queries, or by latents:STEPS the encoder's features, to the input photos for "
+        "STEPS steps before rendering. 0: no fitting. Default: as in the recipe for eval, else 0.",
     ),
 ]
 

@@ -30,9 +30,11 @@ if TYPE_CHECKING:
 def reconstruct(
     checkpoint: Checkpoint,
     photos: Annotated[
-        str, typer.Argument(help="Folder of photos or a data set, its URL, or a video file.")
+        str, typer.Argument(help="Folder of photos or of a data set, URL of a folder, or video.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for results, or .ply or .splat of Gaussians.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder for results; or .ply or .splat file for Gaussians alone.")
+    ],
     inputs: Inputs = None,
     frames: Frames = None,
     holdout: Annotated[

@@ -147,11 +147,11 @@ class Component(metaclass=ABCMeta):
     `fields_written`."""
     scheduled: ClassVar[frozenset[str]] = frozenset()
     """Numeric options that a schedule in the recipe may change from step to step. The component
-    must read them from `self.config` in every call, and nowhere else."""
+    must read them from `self.config` in every call, because copies do not change."""
 
     schedules: Mapping[str, Any] = MappingProxyType({})
-    """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name of the option. The
-    attribute `followed` is the training step whose values of these options `config` holds."""
+    """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name of the option. In
+    `config`, these options have their values after `followed` optimiser steps."""
     followed: int = 0
 
     class Config(ComponentConfig):

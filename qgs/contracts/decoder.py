@@ -18,7 +18,7 @@ from qgs.types import ImageMemory, QueryState, Rendering, Views
 
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
-"""Slots of the decoder that each layer may fill differently."""
+"""Slots of the decoder for which each layer may have another component."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class Feedback(ModelComponent):
 
     A round renders the last layer's Gaussians from the cameras of the input photos, without
     gradients. Then it runs the last `layers` decoder layers again, which update the state once
-    more. They start from the image memory that the first of them read in the first pass.
+    more. Their image memory is the one that the first of them read before any feedback.
 
     layers: number of decoder layers that run again in each round.
     rounds: number of rounds in an evaluation; it may be changed on a built model.

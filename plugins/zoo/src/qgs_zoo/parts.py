@@ -22,16 +22,21 @@ The ray through the point (u, v), from (0, 0) to (1, 1), has the direction corne
 
 
 def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> Tensor:
-    """Return multi-head self-attention (B, T, D) for concatenated q, k and v (B, T, 3 D)."""
+    """Return multi-head self-attention (B, T, D) for concatenated q, k and v (B, T, 3 D).
+
+    mask: booleans that broadcast to (B, heads, T, T), True where a query (row) attends to a key
+    (column). None means that all queries attend to all keys.
+    """
     q_BhTd, k_BhTd, v_BhTd = (split_heads(part, heads) for part in qkv_BTX.chunk(3, -1))
     return merge_heads(F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask))
 
 
 @full_precision
 def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
-    """Return the rays of each part of images that are divided into rows x columns parts.
+    """Return the rays of each cell of images that are divided into rows x columns cells.
 
-    Result (B, V * rows * columns, 4, 3): origin, corner direction, steps across and down a part.
+    The result (B, V * rows * columns, 4, 3) has the encoding PIXEL_ENCODING: the camera's centre,
+    the direction through the upper left corner of the cell, and its steps across and down the cell.
     """
     height, width = cameras.size
     c2w = cameras.c2w

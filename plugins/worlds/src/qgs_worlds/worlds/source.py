@@ -75,26 +75,26 @@ class WorldScene(DrawnScene):
 
     @property
     def tables(self) -> "World":
-        """See `DrawnScene`."""
+        """Shapes, textures and lights of the scene, as tables for the ray caster."""
         return self.drawn.world
 
     @property
     def scale(self) -> float:
-        """See `DrawnScene`."""
+        """Factor from lengths in the units of `tables` to metres."""
         return self.drawn.scale
 
     @property
     def c2w(self) -> np.ndarray:
-        """See `DrawnScene`."""
+        """Poses (F, 4, 4) of the F cameras, with OpenCV axes, in the units of `tables`."""
         return self.drawn.rig.c2w
 
     @property
     def lens(self) -> np.ndarray:
-        """See `DrawnScene`."""
+        """Intrinsics fx, fy, cx, cy in pixels, the same for all cameras of the scene."""
         return self.drawn.rig.lens(self._config.image_size)
 
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
-        """See `DrawnScene`."""
+        """Return a rendered image (H, W, 3) uint8 for each of `frames`."""
         return self.drawn.photos(frames, self._config.image_size, self._config.samples)
 
 

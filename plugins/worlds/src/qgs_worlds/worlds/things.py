@@ -37,8 +37,8 @@ class Style(NamedTuple):
     kinds: kinds of primitives to choose from; a kind that is listed twice is chosen twice as often.
     tilted: share of primitives with a random 3D rotation. cut: share of composites with a piece cut
     out of their primitives. wired: share of objects made of rods: frames, wires and bars. repeated:
-    share of objects that repeat a shape in a row. even: True makes round primitives as wide as
-    deep. most: largest number of primitives in an object.
+    share of objects that repeat a shape in a row. even: True gives round primitives circular cross
+    sections, and makes ellipsoids spheres. most: largest number of primitives in an object.
     """
 
     kinds: tuple[int, ...]
@@ -72,13 +72,19 @@ class Things:
         self._textures = textures
 
     def texture(self) -> tuple[int, int]:
-        """Return a random index of a shape's first texture, and the number of textures, 1 or 6."""
+        """Return the random index of a shape's first texture, and its number of textures, 1 or 6.
+
+        If there are 6 textures, their indices are consecutive, and each is for one face.
+        """
         faces = 6 if self.rng.random() < 0.3 else 1
         # five more textures follow the first one if there are six faces
         return self.rng.randrange(self._textures - 5), faces
 
     def skinned(self, body: Primitive, scale: float = 1.0) -> Shape:
-        """Return the primitive `body` as a shape with random textures."""
+        """Return the primitive `body` as a shape with random textures.
+
+        scale: metres per unit of a texture.
+        """
         first, faces = self.texture()
         return Shape(body, None, first, faces, self.rng.randrange(self._textures), scale)
 

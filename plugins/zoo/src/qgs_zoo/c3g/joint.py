@@ -63,9 +63,10 @@ class JointLayer(DecoderLayer):
         return state.replace(features=queries_BND), memory.replace(features=tokens_BMD)
 
     def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:
-        """Return attention (B, T, D) of all T tokens to image tokens and unmasked queries.
+        """Return multi-head self-attention (B, T, D) of all T tokens, after a last linear layer.
 
-        The result is softmax(q k / sqrt(d)) v after a linear layer.
+        mask: True for queries to which tokens attend. None means that tokens attend to all queries.
+        All tokens attend to all image tokens.
         """
         # Without a mask torch uses its fastest kernel.
         mask_B11T = None

@@ -25,11 +25,12 @@ from qgs_zoo.parts import load_weights, self_attention
 PATCH = 14
 """Side of a patch, pixels."""
 GRID = 37
-"""Patches along a side of the images, 518 x 518, with which position embeddings were trained."""
+"""Number of patches along a side of the 518 x 518 images that trained the position embeddings."""
 EPS = 1e-6
 """Number that every LayerNorm adds to the variance."""
 SHIFT = 0.1
-"""Number added to the number of patches when position embeddings are resized, as in DINOv2."""
+"""Number added to the rows and to the columns of patches when position embeddings are resized, as
+in DINOv2."""
 
 
 class VitConfig(ComponentConfig):
@@ -156,9 +157,9 @@ class DinoV2(nn.Module):
     def load(self, file: str | None) -> None:
         """Read pretrained weights from a file. None keeps the present weights.
 
-        Tensors have the names in DINOv2's files, possibly after a prefix, such as `pretrained.` in
-        files of Depth Anything V2. Tensors with further names are ignored. Raises MissingExtraError
-        for a file that does not fit.
+        The names of the tensors must be those of DINOv2's files, possibly after a prefix, such as
+        `pretrained.` in files of Depth Anything V2. All other tensors in the file are ignored.
+        Raises MissingExtraError for a file that does not fit.
         """
         if file is not None:
             load_weights(

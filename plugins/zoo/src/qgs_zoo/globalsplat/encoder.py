@@ -22,8 +22,8 @@ REGISTER_STD = 0.02
 class PosedPatches(PatchEncoder):
     """Encoder with a token for each patch: embedded colours, then embedded rays and camera.
 
-    Both parts are concatenated, so tokens have `rgb_width` + `ray_width` channels, for any width of
-    the model. After the patches come registers: learned tokens that belong to no patch.
+    The two embeddings are concatenated, so tokens have `rgb_width` + `ray_width` channels, whatever
+    the model's width is. After the patches come registers: learned tokens that belong to no patch.
     """
 
     name = "patches"

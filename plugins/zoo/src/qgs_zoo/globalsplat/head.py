@@ -35,11 +35,12 @@ class MergingHead(Head):
     """Head that decodes each token into candidates and merges blocks of them into Gaussians.
 
     The geometry of a token gives position, log scale, 6D rotation, opacity and gate of each
-    candidate. Its texture gives coefficients of spherical harmonics. A token has 2^level blocks. A
-    merged Gaussian is the mean of its block, weighted by the softmax of the gates. The mean is over
-    positions, rotations, coefficients, log scales and log(1 - opacity). Then log(size of the block)
-    / 3 is added to log scales. At a fractional level, the Gaussians of both adjacent whole levels
-    are rendered, with their log(1 - opacity) multiplied by the share of their level.
+    candidate. Its texture gives coefficients of spherical harmonics. The candidates of a token form
+    2^level blocks of equal size. A merged Gaussian is the mean of its block, weighted by the
+    softmax of the gates. The mean is over positions, rotations, coefficients, log scales and
+    log(1 - opacity). Then log(size of the block) / 3 is added to log scales. At a fractional level,
+    the Gaussians of both adjacent whole levels are rendered. Their log(1 - opacity) is multiplied
+    by a blend weight: level - floor(level) for the upper level, and 1 minus this for the lower one.
     """
 
     name = "merging_head"
@@ -105,7 +106,7 @@ class MergingHead(Head):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Return the field of spherical harmonics; empty if `sh_degree` is 0."""
+        """Return the field for spherical harmonics' coefficients; no field if `sh_degree` is 0."""
         sh = "gaussians.sh"
         return {sh: GAUSSIAN_FIELDS[sh]} if config.sh_degree else {}
 
@@ -113,7 +114,8 @@ class MergingHead(Head):
     def gaussians_per_query(self) -> int:
         """Number of Gaussians per token.
 
-        It is 2^level for a whole level, and the sum for both adjacent whole levels otherwise.
+        It is 2^level for a whole level. For a fractional level, it is the sum of the numbers for
+        both adjacent whole levels.
         """
         return sum(count for count, _ in stages(self.config.level))
 
@@ -145,9 +147,9 @@ class MergingHead(Head):
         return self._attributes(torch.cat(parts, 2))
 
     def bounded(self, raw: Tensor) -> Tensor:
-        """Return candidates (..., 13) with bounded log scales, and log(1 - opacity) at the end.
+        """Return candidates (..., 13): position, bounded log scale, rotation, log(1 - opacity).
 
-        raw: position, log scale, rotation and opacity logit of candidates, (..., 13).
+        raw: raw position, log scale, rotation and opacity logit of the candidates, (..., 13).
         """
         place, log_scale, rotation, opacity = raw.split(CHANNELS, -1)
         config = self.config
@@ -184,7 +186,8 @@ LEAST_LENGTH = 1e-4
 def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
     """Average C candidates in `count` equal blocks, weighted by the softmax of each block's gates.
 
-    candidates: X channels each, (..., C, X). gates: (..., C). Returns (..., count, X).
+    candidates: (..., C, X), with X channels each. gates: (..., C). Returns the averages of the
+    blocks, (..., count, X).
     """
     # Gates compete only within their block, so that blocks stay independent.
     weights = gates.unflatten(-1, (count, -1)).softmax(-1)
@@ -200,10 +203,11 @@ def growth(candidates: int, count: int) -> float:
 
 
 def stages(level: float) -> list[tuple[int, float]]:
-    """Return the numbers of Gaussians per token that are rendered at a level, with their shares.
+    """Return the numbers of Gaussians per token that are rendered at a level, with blend weights.
 
-    A whole level s gives one number, 2^s, with share 1. A fractional level gives the numbers of
-    both adjacent whole levels, with shares that add up to 1.
+    A whole level s gives one number, 2^s, with weight 1. A fractional level gives the numbers for
+    both adjacent whole levels, with weights that add up to 1. The head multiplies log(1 - opacity)
+    of the Gaussians by these weights.
     """
     low = math.floor(level)
     share = level - low

@@ -31,7 +31,8 @@ from qgs_zoo.parts import mean_outcome
 class Frustum(Loss):
     """Mean distance of Gaussian means from the frusta of the input cameras.
 
-    `beyond_frusta` computes the distance.
+    The distance of a Gaussian is small if its mean is inside of any of the frusta; `beyond_frusta`
+    defines it.
     """
 
     name = "frustum"

@@ -133,7 +133,8 @@ def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     Both are in the world frame; directions have z = 1 in the frame of their camera. The rays of a
     patch go through the centres of a grid of K equal cells, row by row. Cells are as nearly square
-    as K allows. If K is the number of pixels of the patch, its cells are the pixels.
+    as K allows. If K is the number of pixels of the patch, its cells are the pixels. patch: the
+    field `gslrm.patch` of the queries.
     """
     origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
     index_K = torch.arange(count, device=patch_BN43.device)

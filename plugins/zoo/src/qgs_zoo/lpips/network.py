@@ -32,7 +32,8 @@ from qgs_zoo.parts import load_weights
 # The file of torchvision's VGG-16 in torch's cache.
 _VGG_FILE = "vgg16-397923af.pth"
 _BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
-"""Torchvision's indices of VGG-16's convolutions, in five blocks with 2 x 2 max pooling between."""
+"""Indices of VGG-16's convolutions in torchvision, grouped into five blocks. There is a 2 x 2 max
+pooling between consecutive blocks."""
 # mean and standard deviation of ImageNet, for images in [-1, 1]
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
@@ -53,7 +54,7 @@ class PerceptualDistance(nn.Module):
         if min(images.shape[-2:]) < SMALLEST_SIDE:
             raise ValueError(
                 f"LPIPS needs images of at least {SMALLEST_SIDE} pixels a side, got "
-                f"{images.shape[-2]}x{images.shape[-1]}"
+                f"{images.shape[-2]}x{images.shape[-1]}; use larger images, or leave out LPIPS"
             )
         # The truth is fixed, so it needs no gradients.
         with torch.no_grad():

@@ -107,7 +107,8 @@ def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
 def band_mask(degree: int, like: Tensor) -> Tensor:
     """Return the factors (K,) by which pixelSplat multiplies raw coefficients of harmonics.
 
-    The factors are 1 for degree 0, and 0.1 / 4^l for each higher degree l.
+    The factors are 1 for degree 0, and 0.1 / 4^l for each higher degree l. like: tensor whose dtype
+    and device the factors get.
     """
     # Higher degrees start small (pixelSplat): at first colours hardly depend on the direction.
     each = [1.0, *(0.1 * 0.25**n for n in range(1, degree + 1))]

@@ -68,7 +68,10 @@ class CNN(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images_N3HW: Tensor) -> Stages:
-        """Return feature maps of images that are normalised by ImageNet's mean and deviation."""
+        """Return the feature maps of N images.
+
+        images: normalised by ImageNet's mean and standard deviation.
+        """
         # All stages are returned: the upsamplers take the finer ones.
         first = self.layer1(F.relu(F.instance_norm(self.conv1(images_N3HW))))
         second = self.layer2(first)

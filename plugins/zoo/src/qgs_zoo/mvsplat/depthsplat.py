@@ -40,7 +40,8 @@ Width: TypeAlias = Annotated[int, Field(ge=1)]
 Block: TypeAlias = Annotated[int, Field(ge=0)]
 
 GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
-"""Channels of a raw Gaussian: opacity, position in the pixel, scale, quaternion; then harmonics."""
+"""Number of a raw Gaussian's channels for opacity, position in the pixel, scale and quaternion. The
+channels for harmonics come after these."""
 
 
 class DepthSplatConfig(ComponentConfig):
@@ -68,8 +69,9 @@ class DepthSplatConfig(ComponentConfig):
     """Indices of the ViT blocks whose tokens are read. The first block has index 0. Published
     values for a ViT-L: 4, 11, 17, 23."""
     dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)
-    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16 of the image size. Published values for
-    a ViT-B: 96, 192, 384, 768; for a ViT-L: 128, 256, 512, 1024."""
+    """Channels of the two DPT heads, for depths and for Gaussians, at 1/2, 1/4, 1/8 and 1/16 of the
+    image size. Published values for a ViT-B: 96, 192, 384, 768; for a ViT-L: 128, 256, 512,
+    1024."""
     full_features: int = Field(default=64, ge=4, multiple_of=4)
     """Channels of the full-size features from which Gaussians are predicted. The DPT head that
     corrects depths has half as many. Published values: 96 for a ViT-B, 128 for a ViT-L."""

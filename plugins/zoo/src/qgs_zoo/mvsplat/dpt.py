@@ -65,7 +65,8 @@ class Scratch(nn.Module):
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
         """Return a full-size map from maps at 1/2, 1/4, 1/8 and 1/16 of the image size.
 
-        The result for X images is (X, F, H, W), or (X, 1, H, W) with `ends_in_depth`. F: channels.
+        The result for X images has F channels, (X, F, H, W). With `ends_in_depth`, it is a
+        correction of depth, (X, 1, H, W).
         """
         path = None
         # From coarse to fine: each fusion doubles the size.

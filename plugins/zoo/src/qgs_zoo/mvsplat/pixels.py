@@ -28,7 +28,7 @@ PIXEL_FIELDS: Fields = {
     PIXEL: FieldSpec((4, 3), frame="world", encoding=PIXEL_ENCODING),
     TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
 }
-"""Fields of the rays through a query's pixel, and of the rotation of its camera."""
+"""Query fields: the rays through the pixel of a query, and the rotation of the pixel's camera."""
 RAY_FIELD: Fields = {PIXEL: PIXEL_FIELDS[PIXEL]}
 
 CHANNELS = (1, 1, 2, 3, 4)
@@ -40,7 +40,7 @@ LOG_DEPTH = 20.0
 
 
 WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 3, 4)}
-"""Degree of harmonics by width of a model, for the widths that are just enough for a degree."""
+"""Degree of harmonics for each model width that has exactly the channels that the degree needs."""
 
 
 def degree_of(width: int) -> int:

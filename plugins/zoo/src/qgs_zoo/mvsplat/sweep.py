@@ -33,7 +33,8 @@ outside its image."""
 MAX_SAMPLES = 1 << 24
 """Largest number of sampled values in memory at once (64 MiB in float32)."""
 PAIRS = 40
-"""Number of pixels per depth up to which all pairs of pixels are correlated before sampling."""
+"""Largest number of pixels, divided by the number of depths, at which `cost_volume` correlates all
+pairs of pixels before it samples."""
 
 
 def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
@@ -141,7 +142,11 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlate features of N views with samples of other views at D depths: (N, D, h, w)."""
+    """Correlate features of N views with samples of other views at D depths: (N, D, h, w).
+
+    own, other: features (N, C, h, w) of the N views, and of the other view that is compared with
+    each of them. depth, lens, pose: as in `warp_grid`.
+    """
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
@@ -233,7 +238,10 @@ class SweepEncoder(Encoder):
 
     @abstractmethod
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        """Predict log depth and raw Gaussian per pixel (B, V, C, H, W). near, far: world units."""
+        """Predict log depth and raw Gaussian per pixel: C numbers, (B, V, C, H, W).
+
+        near, far: least and largest depth of the sweep, in world units.
+        """
 
     @classmethod
     def problems(cls, config: DepthRange, context: RecipeContext) -> Iterable[Problem]:

@@ -63,7 +63,7 @@ class DepthError(Metric):
     column = Column("AbsRel", "lower")
 
     def forward(self, given: MetricInput) -> Tensor:
-        """Return |z - true z| / true z of all pixels with a known true depth.
+        """Return |z - true z| / true z of all pixels with a known true depth, as a 1-d tensor.
 
         z is the rendered depth. A pixel where nothing is rendered gives 1.
         """

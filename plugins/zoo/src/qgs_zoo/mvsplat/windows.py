@@ -114,10 +114,11 @@ class Attention(nn.Module):
         neighbours_BVJ: Tensor | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """Return x (B, V, 4, L, C), 4 windows of L pixels, after attention to those of `source`.
+        """Return `x` after attention to `source`; both have 4 windows of L pixels, (B, V, 4, L, C).
 
         neighbours: indices (B, V, J) of the J views whose windows each view reads. None makes each
-        view read its own windows.
+        view read its own windows. mask: numbers (4, L, L) to add to attention logits; None adds
+        nothing.
         """
         q = self.q_proj(x_BVWLC)
         k = self.k_proj(source_BVWLC)

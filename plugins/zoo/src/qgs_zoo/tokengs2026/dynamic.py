@@ -47,15 +47,15 @@ class DynamicQueries(Queries):
         """N, the number of static and dynamic queries together (TokenGS: 1024 static + 256
         dynamic)."""
         dynamic: int = Field(default=256, ge=0)
-        """Number of dynamic queries, which are the last of the N queries. 0 adds the time to all
-        queries."""
+        """Number of dynamic queries, which are the last of the N queries. 0 marks no query as
+        dynamic, and adds the embedding of the time to all queries."""
         std: float = Field(default=0.02, ge=0)
         """Standard deviation of the queries' initial features, which are normally distributed."""
         time_channels: int = Field(default=2, ge=0, multiple_of=2)
         """Number of channels that encode the requested time. 0 ignores the time."""
         patch_size: int = Field(default=8, ge=1)
-        """Side, in pixels, of the patch whose convolution embeds the time. The release uses the
-        encoder's patch size."""
+        """Side P of the convolution, P x P pixels, that embeds the time. Its input is a patch in
+        which every pixel holds the encoded time. The release uses the encoder's patch size."""
 
     config: Config
 
@@ -123,7 +123,7 @@ class BlockCausalSelfAttention(ContentSelfAttention):
 
 
 class DynamicObjective(Objective):
-    """Objective of one pass: the losses, plus the losses of dynamic Gaussians rendered alone.
+    """Objective of one prediction: its losses, plus those of its dynamic Gaussians rendered alone.
 
     Dynamic Gaussians are the Gaussians of dynamic queries.
     """
@@ -144,7 +144,7 @@ class DynamicObjective(Objective):
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
         """Return the losses of all Gaussians, plus the term `dynamic`.
 
-        This term has the losses of dynamic Gaussians, rendered alone.
+        This term is `weight` times the sum of the losses of dynamic Gaussians rendered alone.
         """
         prediction = passes.predict(inputs)
         whole = passes.judge(prediction, targets, inputs)

@@ -123,9 +123,10 @@ class MultiscaleReadout(PatchViT):
             )
 
     def embed(self, views: Views, plucker: Tensor) -> Tensor:
-        """Return the sum (B, M, D) of the embeddings of colours, rays and, if embedded, times.
+        """Return the sum (B, M, D) of the embeddings of colours, rays and times.
 
-        Raises ValueError for views without times, except with `time_channels: 0`.
+        plucker: Plücker rays of all pixels, (B, V, 6, H, W). Times are not embedded with
+        `time_channels: 0`; otherwise, raises ValueError for views without times.
         """
         x_BMD = super().embed(views, plucker)
         if not self.config.time_channels:
