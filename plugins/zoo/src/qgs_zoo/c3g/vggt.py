@@ -25,7 +25,7 @@ MODULE = "vggt.models.aggregator"
 """Module of VGGT's code. It is not on PyPI, so no extra can install it."""
 
 PREFIX = "aggregator."
-"""Prefix of the weights that are read. The file also has weights of other parts of VGGT."""
+"""Prefix of the names of weights to read. The file also has weights of other parts of VGGT."""
 
 
 class VggtFeatures(PatchEncoder):

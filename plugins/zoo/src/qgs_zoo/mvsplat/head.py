@@ -131,7 +131,10 @@ class WorldHead(PixelHead):
 
 
 def harmonics_of(features_BND: Tensor) -> Tensor:
-    """Return the K coefficients (B, N, K, 3) of rendered harmonics from the features of pixels."""
+    """Return the coefficients (B, N, K, 3) of K harmonics from the features of pixels.
+
+    Harmonics of degrees above 3 are left out, because they are not rendered.
+    """
     degree = degree_of(features_BND.shape[-1])
     first = sum(CHANNELS)
     sh_BNC = numbers_of(features_BND)[..., first : first + 3 * coefficients(degree)]

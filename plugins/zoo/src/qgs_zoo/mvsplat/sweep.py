@@ -160,9 +160,9 @@ def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Te
 def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
     """Correlate all pixels of N views with all pixels of other views, then sample: (N, D, h, w).
 
-    The result equals the result of `_of_warped`, because sampling is linear in the features. All
-    correlations are one matrix product, and sampling them handles one channel instead of C. This is
-    faster if there are few pixels per depth.
+    The result equals that of `_of_warped` for the same arguments, because sampling is linear in the
+    features. All correlations are one matrix product, and sampling them handles one channel instead
+    of C. This is faster if there are few pixels per depth.
     """
     count, _, height, width = own.shape
     grid_NPD2 = warp_grid(depth, lens, pose).permute(0, 2, 3, 1, 4).flatten(1, 2)

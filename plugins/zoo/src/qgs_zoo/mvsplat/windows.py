@@ -16,7 +16,7 @@ SPLIT = 2
 EXPANSION = 4
 TEMPERATURE = 10_000.0
 MASKED = -100.0
-"""Number added to logits of pixels in a shifted window that are not adjacent in the map (Swin)."""
+"""Number added to attention logits between pixels from opposite edges of a rolled map (Swin)."""
 
 
 def positions(width: int, rows: int, columns: int, device: torch.device) -> Tensor:
