@@ -113,7 +113,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def domain(self) -> Domain:
-        """Range of camera distances, angles and depths in the training data; empty if unknown."""
+        """Ranges of camera distances, angles and depths in the training data; empty if unknown."""
         key = _EXTRA + KEY
         if key not in self.metadata:
             return Domain()

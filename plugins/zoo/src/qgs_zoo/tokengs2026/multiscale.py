@@ -125,8 +125,8 @@ class MultiscaleReadout(PatchViT):
     def embed(self, views: Views, plucker: Tensor) -> Tensor:
         """Return the sum (B, M, D) of the embeddings of colours, rays and times.
 
-        plucker: Plücker rays of all pixels, (B, V, 6, H, W). Times are not embedded with
-        `time_channels: 0`; otherwise, raises ValueError for views without times.
+        plucker: Plücker rays of all pixels, (B, V, 6, H, W). `time_channels: 0` leaves out the
+        times. Raises ValueError for other values if the views have no times.
         """
         x_BMD = super().embed(views, plucker)
         if not self.config.time_channels:
