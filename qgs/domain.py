@@ -30,7 +30,7 @@ WORDS = {
     "depth": "the point they look at is {} away",
     "fov": "their field of view is {} degrees wide",
 }
-"""Names of the measurements of a sample, each with a phrase; lengths are in the model's units."""
+"""Phrases for messages, by name of a measurement of a sample's cameras; lengths in model units."""
 REMEDY = "try another scale of the world, other input views, or train on views like these"
 """Advice for views outside of the trained range."""
 

@@ -17,7 +17,7 @@ from rich.filesize import decimal
 from qgs.wording import listed
 
 AnyPath: TypeAlias = str | os.PathLike[str]
-"""A path, as text or object."""
+"""Path as a string or a path object."""
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 

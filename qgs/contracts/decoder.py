@@ -183,7 +183,10 @@ class Feedback(ModelComponent):
     def forward(
         self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
     ) -> tuple[QueryState, ImageMemory]:
-        """Return the state and memory from which the first repeated layer starts.
+        """Return the query state and image memory that the first repeated layer reads.
 
-        photos: posed photos (B, V) from `compared`, of the same image size as `rendering`.
+        state: the query state after the last layer. memory: the image memory that the first
+            repeated layer read in the first pass. rendering: the last layer's Gaussians, from the
+            cameras of `photos`. photos: the input photos (B, V), as `compared` returns them, of the
+            image size of `rendering`.
         """

@@ -28,7 +28,7 @@ MEMORY_FIELDS: Fields = {
 
 
 def memory_fields(*names: str) -> Fields:
-    """Return memory fields by full name: `memory_fields("keys")` has the key "memory.keys"."""
+    """Return fields of ImageMemory by full name: for the name "keys", the key is "memory.keys"."""
     return {f"memory.{name}": MEMORY_FIELDS[f"memory.{name}"] for name in names}
 
 
@@ -50,8 +50,8 @@ class Encoder(ModelComponent):
     reads_cameras: ClassVar[bool] = True
     tunable: ClassVar[bool] = False
     writes = MEMORY_FIELDS
-    """Parts of the ImageMemory that the encoder fills (default: all). The features may have another
-    width than the model."""
+    """Fields of the ImageMemory that the encoder fills (default: all). The width of
+    `memory.features` may differ from the model's width D."""
 
     @classmethod
     def size_multiple(cls, config: ComponentConfig) -> int | None:
@@ -74,7 +74,7 @@ class Encoder(ModelComponent):
         """
         # Recipes that need it are refused, see `tunable`.
         raise NotImplementedError(
-            f"{type(self).__name__} cannot recompute an image memory from new features"
+            f"{type(self).__name__} cannot recompute an image memory: set evaluation.tuning=queries"
         )
 
 

@@ -16,10 +16,11 @@ class Loss(Component, torch.nn.Module):
     """Loss: (LayerPrediction, Rendering, target Views, input Views) -> one term or several.
 
     A subclass defines `term`; this class multiplies the result by `weight`, which may follow a
-    schedule. Training calls the loss for each supervised layer, with a rendering from the target
-    cameras and all input views of the prediction. Training minimises the sum of all terms, weighted
-    by layer. A term is one number to minimise; `history.jsonl` lists it under its name, which is
-    unique within a recipe. Every term is differentiable in the prediction or in the rendering.
+    schedule. Training calls the loss for each supervised layer. The rendering is from the target
+    cameras; the input Views are all views that the model read. Training minimises the sum of all
+    terms, weighted by layer. A term is one number to minimise; `history.jsonl` lists it under its
+    name, which is unique within a recipe. Every term is differentiable in the prediction or in the
+    rendering.
 
     renderings: the target views that one call needs; training may render few at a time
         (`training.render_views`). "each": a term is a mean over views, so training may call the
@@ -79,6 +80,6 @@ class Supervision(Component):
 
         Layer numbers start at 1 and are in ascending order. 0 is the initial state, which is
         supervised only in a decoder without layers.
-        rounds: the number of the last layer in each repetition of layers by feedback. These layers
-            are supervised too.
+        rounds: for each feedback round, the number of its last layer. These layers are supervised
+            too.
         """

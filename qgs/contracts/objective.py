@@ -18,8 +18,8 @@ class Outcome:
     total: the sum of the terms, with gradients.
     terms: the weighted terms by name, detached.
     signs: numbers by which training detects that the model collapses, by name. "psnr" and "alpha"
-        are means over the renderings. "deviation" is the mean distance of a rendering to the
-        background colour, the largest over views.
+        are means over the renderings. "deviation" is the mean of |rgb - background| over the
+        pixels of a view, for the view where this mean is largest.
     """
 
     total: Tensor

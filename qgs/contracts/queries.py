@@ -40,13 +40,12 @@ class Queries(ModelComponent):
     def resized(
         self, learned: Mapping[str, Tensor], generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Return a state dict for these queries, made from that of more or fewer queries.
+        """Return a state dict for N queries, made from the state dict of more or fewer queries.
 
-        learned: the old state dict, on the CPU. Its shapes differ from the new ones only in the
-            first axis, the queries. If the new number N is smaller, the first N queries are kept.
-            If it is larger than the old number n, all n queries are kept; each further query i
-            copies query i modulo n and adds noise of standard deviation 0.01 to all parameters
-            (LocusGS release, finetuning).
+        learned: the state dict of n queries, on the CPU. Its shapes differ from the new ones only
+            in the first axis, the queries. If N is smaller than n, the first N queries are kept. If
+            N is larger, all n queries are kept; each further query i copies query i modulo n and
+            adds noise of standard deviation 0.01 to all parameters (LocusGS release, finetuning).
         """
         own = {name: values.shape for name, values in self.state_dict().items()}
         return {

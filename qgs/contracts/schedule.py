@@ -19,7 +19,7 @@ class Schedule(ComponentConfig):
     """A number that depends on how many optimiser steps are finished (0 during the first step)."""
 
     schedule: str
-    """Kind of schedule."""
+    """Name of the kind of schedule, such as linear."""
 
     @abstractmethod
     def number(self, step: int) -> float:

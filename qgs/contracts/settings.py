@@ -37,8 +37,9 @@ class ViewsConfig(ComponentConfig):
     view."""
     gap: Annotated[tuple[int, int], AfterValidator(ascending)] = (10, 40)
     """Distance from the first to the last input view, as [min, max] in frames. Neighbouring frames
-    have distance 1. In scenes with times, neighbouring times have distance 1. A scene shorter than
-    max uses at most its own length; a scene shorter than min logs a warning."""
+    have distance 1. In scenes with times, neighbouring times have distance 1. If a scene is shorter
+    than max, its length replaces max. If it is shorter than min, its length replaces both, and a
+    warning is logged."""
     frame: Literal["first_cam", "mean_cam", "given"] = "first_cam"
     """Camera whose pose becomes the identity: "first_cam" is the first input camera, "mean_cam" the
     mean of the input cameras. "given" changes no pose of the data."""
@@ -46,8 +47,8 @@ class ViewsConfig(ComponentConfig):
     """Rule for scaling camera positions. "constant" multiplies them by `scale_factor`. "distance"
     divides them by the largest distance from the first input camera to any other camera, and then
     multiplies them by `scale_factor`. "auto" computes one factor per scene, which brings the point
-    nearest to all optical axes to depth 1. "search" takes the factor at which the model
-    renders photos best, and works only for reconstructions."""
+    nearest to all optical axes to depth 1. "search" takes the factor at which a trained model
+    renders a user's photos best, and works only for these."""
     scale_factor: float = Field(default=0.15, gt=0)
     """Factor for all camera positions, see `scale`. It has no effect if `scale` is "auto" or
     "search"."""
@@ -56,8 +57,8 @@ class ViewsConfig(ComponentConfig):
     pose_noise: float = Field(default=0.0, ge=0, le=45)
     """Standard deviation of noise on the input poses in training and evaluation, in degrees about
     each axis. One random rotation turns each camera; another turns the camera's position about the
-    first input camera. The first input camera and the target cameras stay exact. Reconstructions
-    ignore this option. 0: no noise."""
+    first input camera. The first input camera and the target cameras stay exact. Reconstruction of
+    a user's photos adds no noise. 0: no noise."""
 
 
 class TrainingConfig(ComponentConfig):
@@ -136,12 +137,13 @@ class EvaluationConfig(ComponentConfig):
     """Number of samples scored per scene, each with randomly chosen views. It has no effect if
     `index` is set, or for scenes with held-out frames."""
     seed: int = Field(default=0, ge=0)
-    """Seed of the random choice of views, where `samples` has an effect, and of noise on the input
-    poses, see `views.pose_noise`."""
+    """Seed of the noise that `views.pose_noise` adds to input poses, and of the random choice of
+    views. Views are chosen at random unless `index` is set or the scene has held-out frames."""
     index: str | None = None
     """JSON file with the views to score, relative to the working directory, in pixelSplat's format:
-    {scene: null | {"context": [frames], "target": [frames]}}. Scenes with null are skipped. null:
-    no file; views are chosen at random."""
+    {scene: null | {"context": [frames], "target": [frames]}}. A scene with null in the file is
+    skipped. Without a file (null), targets are the held-out frames of a scene or, in scenes without
+    held-out frames, views are chosen at random."""
     protocol: str | None = None
     """Name of these evaluation settings in tables. null uses the name of the file in `index`,
     or "drawn" without an index."""

@@ -21,7 +21,7 @@ from qgs.paths import LARGEST, open_file
 from qgs.types import Size
 from qgs.wording import name_shown
 
-TURNED = "have an EXIF orientation, which is ignored: their pixels are read as stored"
+TURNED = "have an EXIF orientation, which is ignored; pixels are read as stored"
 TURN = "poses must belong to the stored pixels; `mogrify -auto-orient` rotates the stored pixels"
 
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV")
@@ -178,7 +178,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
         # Rounded, so that 65535 becomes 255.
         return Image.fromarray(((numbers + 128) // 257).astype(np.uint8))
     if image.mode not in _EIGHT_BITS:
-        raise OSError(f"pixels have the mode {image.mode!r}: use 8 or 16 bits per channel")
+        raise OSError(f"its pixels have Pillow's mode {image.mode!r}: use 8 or 16 bits per channel")
     return image
 
 

@@ -27,7 +27,7 @@ BASELINE = (0.06, 0.25)
 TURN = 20.0
 """Largest angle in degrees between input cameras, if that of training is unknown."""
 VARIED = 20.0
-"""Ratio of largest to least baseline of training, above which BASELINE replaces this range."""
+"""Largest ratio of largest to least baseline in training; above it, BASELINE replaces both."""
 
 # Most frames to consider, because time grows with the square of their number.
 _MOST = 300
@@ -59,9 +59,10 @@ def ranked_windows(
 
     Each target has one window. Targets are the held-out photos, or all photos if none is held out.
     The `inputs` input photos of a window are near the target, together see most of its view,
-    overlap, and are as far apart as in training. The list is empty if all photos are inputs. The
-    result is deterministic and does not depend on the order of the frames. held_out: held-out
-    frames, by default the scene's. Raises ValueError if there are fewer photos than inputs.
+    overlap, and are as far apart as in training. The list is empty if the scene has just `inputs`
+    photos, so that none is left as a target. The result is deterministic and does not depend on the
+    order of the frames. held_out: held-out frames, by default the scene's. Raises ValueError if
+    there are fewer photos than inputs.
     """
     scene = frusta.scene
     held = sorted(scene.held_out if held_out is None else held_out)
@@ -96,8 +97,8 @@ def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
 class Frusta:
     """Cameras of a scene, in units of the scene's depth, and the overlap of their views.
 
-    trained_on: measurements of the cameras of training. depth: depth of the scene in its unit, by
-        default from `scene_depth`.
+    trained_on: measurements of the cameras of training. depth: depth of the scene in the scene's
+        unit; None computes it by `scene_depth`.
     """
 
     def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:
@@ -136,7 +137,7 @@ class Frusta:
         """Choose `inputs` input frames among `usable` for a target; return (cost, frames).
 
         The weights of the cost's terms come from a regression of novel-view PSNR on 580 windows of
-        three scenes. A cost of 1 predicts a PSNR about 2 dB lower.
+        three scenes. A cost of 1 predicts a PSNR about 2 dB lower than a cost of 0.
         """
         near = self._near(target, usable)
         seen = self.seen(target, near)
@@ -192,9 +193,9 @@ class Frusta:
         return (*chosen, last)
 
     def compared(self, window: Frames, target: int | None = None) -> Frames:
-        """Return up to NOVEL frames to score: the target, and near frames in view of the inputs.
+        """Return up to NOVEL frames to score: the target, and frames whose view the inputs see.
 
-        Frames are near if they are near the target or, without a target, the inputs. If the scene
+        Frames nearest to the target or, without a target, to the inputs come first. If the scene
         has held-out frames, only these are chosen besides the target.
         """
         inputs = list(window)

@@ -32,7 +32,7 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
                 found.append(kind)
         # A failing plug-in must not stop the others.
         except Exception as error:
-            warn_once(f"{kind} failed to check whether it can read {path}: {one_line(error)}")
+            warn_once(f"{kind} failed to recognise {path} and is not used: {one_line(error)}")
     if len(found) > 1:
         warn_once(
             f"{path} looks like data of {' and of '.join(found)}, and is read as {found[0]}; to "
@@ -45,7 +45,8 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
 def is_training_data(path: str, trained: SceneSourceConfig | None) -> bool:
     """Return whether the data at `path` was training data of a model.
 
-    trained: data options of the model; None if unknown, which returns False.
+    trained: options of the data that the model was trained on. The result is False if it is None
+        (unknown).
     """
     root = getattr(trained, "path", None)
     if trained is None or not isinstance(root, str):
@@ -64,8 +65,8 @@ def open_for(
 
     Training data opens with the options of the training, including held-out frames. Other data
     opens with the source from `recognised`; `with_cameras` adds cameras to photos without cameras.
-    trained: data options of the model, or None if unknown. image_size: (H, W), by default that of
-    `trained`. Raises the errors of `recognised` and of the source.
+    trained: options of the data that the model was trained on, or None if unknown. image_size:
+    (H, W), by default that of `trained`. Raises the errors of `recognised` and of the source.
     """
     size = image_size or (trained or SceneSourceConfig()).image_size
     source: Any

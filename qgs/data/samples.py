@@ -106,10 +106,10 @@ def make_sample(
 
 
 def _asked(times: Tensor, inputs: int) -> Tensor | None:
-    """Return the time (1, 1) of all targets, at which to reconstruct; None if target times differ.
+    """Return the time (1, 1) at which to reconstruct a scene: the time of all its targets.
 
-    Without targets, return the median time of the inputs. times: times (1, V) of inputs, then
-    targets. inputs: number of inputs.
+    If target times differ, return None. Without targets, return the median time of the inputs.
+    times: times (1, V) of inputs, then targets. inputs: number of inputs.
     """
     asked = times[:, inputs:].unique() if times.shape[1] > inputs else times.median()
     return asked.reshape(1, 1) if asked.numel() == 1 else None
@@ -220,7 +220,7 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
         return reference, factor / distance
     warn_once(
         f"the cameras of scene {scene.name!r} look at no common point, so views.scale: auto makes "
-        f"the largest distance from the first camera 1, a factor of {1 / float(distance):.4g}; if "
+        f"the largest distance from the first camera 1 (factor {1 / float(distance):.4g}); if "
         "the scene is too near or too far, set `scale: constant` and a scale_factor"
     )
     return reference, 1 / distance

@@ -116,8 +116,8 @@ class SampleStream(Dataset[Batch | Exception]):
 
     skips: replace a failing sample by a sample of the next scene, up to MAX_REPLACED times.
     sampler: view sampler, by default `Span`.
-    per_step: number of samples per optimiser step; gives the step at which a sample is used, on
-        which options of the sampler may depend.
+    per_step: number of samples per optimiser step. The stream computes from it the step that uses a
+        sample, because options of the sampler may depend on the step.
     depths: read depth maps if a scene has them.
     """
 
@@ -284,7 +284,10 @@ def _from_workers(
 
 
 def _prepare_worker(number: int) -> None:
-    """Ignore SIGINT and SIGTERM in a worker process, which the training process ends itself."""
+    """Ignore SIGINT and SIGTERM in a worker process; the training process ends its workers.
+
+    number: number of the worker, not used.
+    """
     show_safely()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)

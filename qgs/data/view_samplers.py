@@ -92,7 +92,7 @@ def refuse_too_many(frames: int, scene: Scene) -> None:
 def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
     """Return one frame of each group of frames in `chosen`.
 
-    cameras: position in its group of the frame to return, for each group, modulo the group's size.
+    cameras: for each group, the index of its frame to return, taken modulo the group's size.
     """
     turns = zip(chosen, cycle(cameras), strict=False)
     return tuple(moment[camera % len(moment)] for moment, camera in turns)

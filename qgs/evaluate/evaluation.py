@@ -40,8 +40,9 @@ def evaluate(
 
     The model keeps its device and its mode. For a scene that fails, the result has the reason.
     step: number of optimiser steps after which the weights were saved. observe: called after each
-    scene with the numbers of finished and of all scenes. views_of: see `EvaluationPlan`. sampler:
-    view sampler, by default the recipe's. show: called with each sample and its rendered targets.
+    scene with the numbers of finished and of all scenes. views_of: function that returns the view
+    settings of a sample, by default the recipe's. sampler: view sampler, by default the recipe's.
+    show: called with each sample and its rendered targets.
 
     Raises the errors of the data source, of `read_index` and of `Measures`, and ValueError if no
     scene could be scored.
@@ -150,7 +151,7 @@ class Measures:
         return values
 
     def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
-        """Return why scenes in `scores` lack a value, by name of the value."""
+        """Return the reasons why scenes in `scores` lack values, by name of the value."""
         found: dict[str, str] = {}
         for name, metric in self._owners.items():
             if metric.unavailable:

@@ -112,7 +112,7 @@ class EvaluationPlan:
         Raises ValueError for an unknown scene, and the errors of the scene's reader.
         """
         if name not in self._places:
-            raise ValueError("the data has no test scene of this name")
+            raise ValueError("the data has no test scene of this name: correct the index")
         place = self._places[name]
         scene = self._scenes[place]
         # a generator for each scene: a failing one changes no noise of the others

@@ -23,9 +23,9 @@ _C3 = (
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
-    """Return the first `count` (3, 8, 15) real spherical harmonics from degree 1 on, (..., count).
+    """Return the values (..., count) of the first `count` real spherical harmonics from degree 1.
 
-    directions: unit vectors (..., 3).
+    directions: unit vectors (..., 3). count: 3, 8 or 15, for degrees up to 1, 2 or 3.
     """
     x, y, z = directions.unbind(-1)
     xx = x * x

@@ -12,7 +12,7 @@ from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians
 
 MOVED = 1e-3
-"""Part of a Gaussian's size by which a smaller dtype may move it."""
+"""Largest shift of a mean by rounding to a smaller dtype, as a fraction of the Gaussian's size."""
 
 
 @full_precision
@@ -32,7 +32,7 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 def unit(vectors: Tensor, otherwise: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> Tensor:
     """Normalise vectors (..., C); zero vectors become `otherwise`.
 
-    By default this is the identity quaternion, w x y z.
+    The default of `otherwise` is the identity quaternion, w x y z.
     """
     length = vectors.norm(dim=-1, keepdim=True)
     divisor = torch.where(length > 0, length, 1)

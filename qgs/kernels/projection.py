@@ -109,9 +109,9 @@ def _dots(a, rows):
 def _axis(axis, seen, turned, focal, principal, size, margin):
     """Return x/z of the mean, x/z clamped, and the row of J W R S of an image axis (0: x, 1: y).
 
-    For the y axis, x stands for y. seen: mean (x, y, z) in the camera's frame. turned: rows of W R
-    S, symbols of the module. margin: part of the image size by which x/z may lie outside of the
-    image before it is clamped.
+    For the image axis y, x/z means y/z. seen: mean (x, y, z) in the camera's frame. turned: rows of
+    W R S; the module explains the symbols. margin: fraction of the image size by which x/z may lie
+    outside of the image before it is clamped.
     """
     slope = seen[axis] / seen[2]
     low = (-margin * size - principal) / focal
@@ -280,9 +280,9 @@ def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
 
 @kernel
 def _sum_parts(given, g, slopes):
-    """Write the gradients of splat `g`, summed over P parts of an image, to `slopes` (10,).
+    """Write the gradients of splat `g`, summed over P stripes of an image, to `slopes` (10,).
 
-    given: gradients (P, G, 10) of G splats in each part.
+    given: gradients (P, G, 10) of G splats in each stripe.
     """
     slopes[:] = given[0, g]
     for part in range(1, given.shape[0]):

@@ -6,9 +6,9 @@ back. A row of a tile is 16 lanes (pixels) without branches, in a flat float32 b
 offsets, so that LLVM can vectorise the lanes.
 
 A splat has 9 float32 fields: pixel u, v; conic (inverse 2D covariance) xx, xy, yy; depth; half
-extents in x and y (pixels; not positive for invisible splats); and the power of 2 below which alpha
-cannot reach alpha_min. An image has 5 sums over splats, w r, w g, w b, w z and w, where w is the
-weight of a splat at a pixel, r, g, b its colour and z its depth.
+extents in x and y (pixels; not positive for invisible splats); and the least exponent p at which
+alpha = opacity * 2^p reaches alpha_min. An image has 5 sums over splats, w r, w g, w b, w z and w,
+where w is the weight of a splat at a pixel, r, g, b its colour and z its depth.
 
 For each row of a tile the buffer has 9 blocks of 16 lanes. Block 0 is the transmittance. Block 1 is
 1 while the pixel still takes splats, then 0. The other blocks are the sums (forward pass) or the
@@ -97,10 +97,10 @@ def _touching_rows(order, splats, top, bottom, out):
 
 @kernel
 def _open(state, live, rows, columns):
-    """Initialise `state`, the buffer of a tile (see the module), and `live`, its rows.
+    """Initialise `state`, the buffer of a tile (see the module), and `live`, a flag for each row.
 
     Block 0 becomes 1, block 1 becomes 1 inside the image, all else 0. live: becomes True for each
-    tile row inside the image. rows, columns: numbers of the tile's rows and columns inside the
+    tile row inside the image. rows, columns: how many of the tile's rows and columns lie inside the
     image.
     """
     state[:] = _ZERO
@@ -246,9 +246,10 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
 
 @kernel
 def _rows_within(above, reach):
-    """Return the first and last row of a tile whose pixel centres lie within `reach` of a splat.
+    """Return the first and the last of those rows of a tile that lie within `reach` of a splat.
 
-    above: distance in pixels from the pixel centres of the tile's first row down to the splat.
+    reach: largest distance in pixels from a row's pixel centres to the splat's centre, in y. above:
+    distance in pixels from the pixel centres of the tile's first row down to the splat's centre.
     """
     first = max(0, int(np.ceil(above - reach)))
     last = min(TILE - 1, int(np.floor(above + reach)))

@@ -117,7 +117,7 @@ class Mask(Loss):
 def too_small(context: RecipeContext, side: int, option: str, measure: str) -> Iterator[Problem]:
     """Yield a problem of `option` if the data's images have a side shorter than `side` pixels.
 
-    measure: name of what needs images of this size, the subject of the message.
+    measure: name of the loss or metric that needs images of this size, for the message.
     """
     if context.image_size and min(context.image_size) < side:
         given = "{} x {} (H x W)".format(*context.image_size)

@@ -9,7 +9,7 @@ from qgs.contracts import Column, Metric, MetricInput
 from qgs.precision import full_precision
 
 OPACITY_USED = 1 / 255
-"""Gaussians of a lower opacity are never rendered, because renderers skip alpha below 1/255."""
+"""Opacity below which a Gaussian is never rendered: renderers skip alpha below 1/255."""
 
 
 class Dispersion(Metric):
@@ -30,7 +30,7 @@ class Dispersion(Metric):
         return {key: Column(h, "lower", unit="world units") for key, h in headings.items()}
 
     def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
-        """Return the distances (1, G), of which "mean" is the average, and their "median" (1,)."""
+        """Return "mean", the distances (1, G) to average, and "median", their median (1,)."""
         assert given.gaussians is not None
         distances = token_dispersion(given.gaussians.means, given.gaussians_per_query)
         return {"mean": distances, "median": torch.quantile(distances, 0.5, dim=-1)}

@@ -17,7 +17,7 @@ from qgs.paths import listing
 from qgs.wording import listed, name_shown, warn_once
 
 _Index: TypeAlias = Mapping[object, list[UPath]]
-"""Content of a folder, by each of the `_spellings` of its name."""
+"""Files and subfolders of a folder; the keys are the `_spellings` of their names."""
 
 
 def located(found: Listing, folder: UPath, images: str | None, outside: bool) -> Listing:
@@ -55,8 +55,8 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     }
     for file in [*moved][:1]:
         warn_once(
-            f"{len(moved)} of {len(where)} files are in another folder or spelling than "
-            f"{found.file} lists: {name_shown(f'{moved[file]} for {file}')}"
+            f"{len(moved)} of {len(where)} files are in another folder or have another name than "
+            f"{found.file} lists, for example {name_shown(f'{moved[file]} instead of {file}')}"
         )
     return replace(found, frames=frames, present={*where.values()})
 
@@ -105,9 +105,9 @@ def found_files(
 def _resolved(
     place: UPath, parts: Sequence[str], indexed: Callable[[UPath], _Index]
 ) -> UPath | None:
-    """Return the file below the folder `place` that matches the path `parts`; None without one.
+    """Return the file below the folder `place` that matches the path `parts`; None if none does.
 
-    Names match by `_spellings`. Raises ValueError if two files match.
+    Names match if one of their `_spellings` is equal. Raises ValueError if two files match.
     """
     for part in parts:
         index = indexed(place)
@@ -133,7 +133,7 @@ def _index(folder: UPath) -> _Index:
 
 
 def _spellings(name: str) -> enumerate[str]:
-    """Yield (0, name), (1, name in lower case and normal form), (2, the latter without suffix)."""
+    """Yield (0, name), (1, name in lower case and Unicode form NFC), (2, (1) without suffix)."""
     key = unicodedata.normalize("NFC", name).casefold()
     stem, dot, suffix = key.rpartition(".")
     known = dot + suffix in (*Image.registered_extensions(), ".npy", ".heic")

@@ -18,7 +18,7 @@ from qgs.wording import listed, numbered, warn_once
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 GROUP = "qgs.photo_readers"
-"""Entry-point group for readers of plug-ins: FORMAT = "module:subclass of `PhotoReader`"."""
+"""Entry-point group in which plug-ins list their subclasses of `PhotoReader` by format name."""
 UNLESS = (
     "correct the intrinsics, unless the photo is cut from a larger one; fx and cx refer to the "
     "width, fy and cy to the height"
@@ -71,10 +71,11 @@ class Lens(ABC):
 
     @abstractmethod
     def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
-        """Return the smallest zoom of a centre crop without black edges in an undistorted photo.
+        """Return the least zoom at which a centre crop of the undistorted photo has no black edges.
 
-        intrinsics: fx, fy, cx, cy in pixels of the photo. size: (H, W) of the photo. target: (H, W)
-            whose aspect ratio the crop has.
+        The zoom, at least 1, is the factor by which the crop is smaller than the largest crop of
+        its aspect ratio, that of the size `target` (H, W). intrinsics: fx, fy, cx, cy in pixels of
+        the photo. size: (H, W) of the photo.
         """
 
     @abstractmethod
@@ -206,10 +207,11 @@ def numbers(value: object) -> np.ndarray:
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:
-    """Return the folder of a scene's photos: `wanted`, or by default the first that exists.
+    """Return the folder of a scene's photos: `wanted` in `folder`, or a default one if it is None.
 
-    The defaults are the subfolder images, its largest scaled copy such as images_2, and `folder`.
-    Raises FileNotFoundError if `wanted` is given and does not exist.
+    The default is the first of these that exists: the subfolder images, the subfolder with the
+    largest scaled copies, such as images_2, and `folder`. Raises FileNotFoundError if `wanted` is
+    given and does not exist.
     """
     if wanted is None:
         copies = [item for item in listing(folder) if _COPY.fullmatch(item.name.lower())]

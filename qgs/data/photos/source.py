@@ -40,7 +40,7 @@ from qgs.wording import listed, warn_once
 _CACHED = 512 * 2**20
 """Size in bytes of the cache of decoded images."""
 _TURNS = {3: 2, 6: 1, 8: 3}
-"""Clockwise quarter turns by EXIF orientation. The others mirror, which no camera does."""
+"""Clockwise quarter turns by EXIF orientation. Orientations that mirror are ignored."""
 _QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 """Rotation for a clockwise quarter turn: the new x axis is the old -y, the new y the old x."""
 
@@ -194,7 +194,7 @@ class PhotoScene(Scene):
     def _delivered(
         self, image: Image.Image, frame: PhotoFrame, file: UPath, nearest: bool = False
     ) -> np.ndarray:
-        """Return `image`, decoded from `file`, turned upright, undistorted, cropped and resized."""
+        """Turn `image`, the content of `file`, upright; then undistort, crop and resize it."""
         # A mask or depth map follows the photo.
         if file != frame.path and frame.size is None:
             frame = replace(frame, size=read_image(frame.path, image_size))
@@ -208,7 +208,10 @@ class PhotoScene(Scene):
         return self._crop(frame, size).image(image, kernel)
 
     def _crop(self, frame: PhotoFrame, size: Size) -> CropResize:
-        """Return the crop of a photo of `size` (H, W) without black edges of undistortion."""
+        """Return the centre crop that leaves out the black edges of an undistorted photo.
+
+        size: (H, W) of the photo.
+        """
         target = self.config.image_size
         lens = frame.lens
         zoom = 1.0 if lens is None else lens.whole_zoom(frame.at_size(size), size, target)
@@ -292,7 +295,10 @@ class PhotosSource(LazySource):
     def config_for(
         cls, path: str, image_size: tuple[int, int], trained: SceneSourceConfig | None
     ) -> SceneSourceConfig:
-        """Return options for data outside of training, in which no frame is held out."""
+        """Return options that open all photos at `path` for a model trained on other data.
+
+        No frame is held out. trained: options of the training data; None if unknown.
+        """
         config = super().config_for(path, image_size, trained)
         return config.model_copy(update={"holdout": 0})
 
@@ -337,7 +343,7 @@ def upright(frame: PhotoFrame) -> PhotoFrame:
     if not _quarters(_swapped(size), frame):
         return frame
     if turns % 2 and size[0] == size[1]:
-        warn_once(f"square photos in {frame.path.parent} are turned by EXIF: {TURN}")
+        warn_once(f"square photos in {frame.path.parent} turn by EXIF, with their poses: {TURN}")
     frame = replace(frame, size=frame.size or size)
     for _ in range(turns):
         frame = _quarter(frame)
@@ -370,8 +376,8 @@ def _quarters(size: Size, frame: PhotoFrame) -> int:
 def _header(path: str, changed: int) -> tuple[Size, int]:
     """Return the stored (H, W) of an image file, and the quarter turns that make it upright.
 
-    For a file that is no image, return (1, 1) and 0. changed: time when the file was last changed,
-    which makes the cache read a changed file again.
+    For a file that is no image, return (1, 1) and 0. changed: time of the file's last change; if it
+    differs from the cached one, the file is read again.
     """
     try:
         with open(path, "rb") as file, opened_image(file) as image:
