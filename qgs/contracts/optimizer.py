@@ -93,4 +93,4 @@ class Optimizer(Component):
         return {}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore values that `state` returned in another process."""
+        """Restore the values that the method `state` returned in another process."""

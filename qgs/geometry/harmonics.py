@@ -62,7 +62,7 @@ def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
 
 @full_precision
 def rotated(sh: Tensor, rotation: Tensor) -> Tensor:
-    """Rotate coefficients `sh` (..., C, 3), and thus their colours, by `rotation` (3, 3).
+    """Rotate the colours that coefficients `sh` (..., C, 3) describe by `rotation` (3, 3).
 
     C is the number of harmonics. A rotated harmonic is a linear combination of the harmonics of its
     degree. The factors are fitted in float64 to values at random directions.

@@ -227,7 +227,7 @@ def image_folder(folder: UPath, wanted: str | None) -> UPath:
 
 
 def mended(found: Listing) -> Listing:
-    """Divide uniform scales out of rotations; poses far from all others become problems.
+    """Divide uniform scales out of rotations; add a problem to frames far from all others.
 
     Metashape multiplies all rotations by one number.
     """
