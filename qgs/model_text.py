@@ -10,9 +10,8 @@ from qgs.contracts import LAYER_SLOTS, SUBLAYER_SLOTS
 def parameter_counts(model: Any) -> dict[str, int]:
     """Count the parameters of each component of a model.
 
-    Parameters of all decoder layers are summed, with an entry for each kind of sublayer, such as
-    `decoder.self_attention`. The entry `decoder.layer` counts what layers have outside of
-    sublayers.
+    Keys are slots, such as `head` and `decoder.self_attention`. Counts of the decoder are sums over
+    all layers. `decoder.layer` counts the parameters of layers that belong to no sublayer.
     """
     sublayers: dict[str, int] = {}
     for slot in SUBLAYER_SLOTS:
@@ -55,10 +54,10 @@ def heading(model: Any) -> str:
 
 
 def slot_rows(model: Any) -> list[tuple[str, str, str]]:
-    """Return the rows of a table: a slot, the types of its components, their number of parameters.
+    """Return table rows: each slot, the types of its components, and their number of parameters.
 
-    Types are those of the recipe. For a model without a recipe, rows show class names in place of
-    types, and nothing for slots of decoder layers.
+    Types, such as `qgs/free`, come from the recipe. For a model without a recipe, rows show class
+    names in place of types, and "" for slots of decoder layers.
     """
     counts = {name: f"{count:,}" for name, count in parameter_counts(model).items()}
     counts |= {"supervision": "", "renderer": ""}

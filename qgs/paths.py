@@ -13,7 +13,7 @@ from upath import UPath
 from qgs.terminal import without_secrets
 
 LARGEST = 500_000_000
-"""Largest file in bytes that is read as a whole; an uncompressed 120-megapixel photo fits."""
+"""Size limit in bytes of files read as a whole; an uncompressed 120-megapixel photo fits."""
 
 # Parsed JSON may take forty times as much memory.
 _LARGEST_JSON = 50_000_000
@@ -54,7 +54,7 @@ def open_file(path: Path | UPath) -> IO[bytes]:
         return io.BytesIO(read_file(path))
     # Reading a pipe or device may never end.
     if path.is_fifo() or path.is_char_device():
-        raise OSError(f"{path} is a pipe or a device, not a regular file")
+        raise OSError(f"{path} is a pipe or a device: give a regular file")
     return path.open("rb")
 
 
@@ -68,7 +68,7 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
             # The header of an archive may promise less than it holds.
             content: bytes = file.read(most + 1)
     except _DAMAGED as error:
-        raise OSError(f"{path} is damaged: {error}") from error
+        raise OSError(f"{path} cannot be decoded ({error}): write or copy it again") from error
     if len(content) > most:
         raise OSError(f"{path} is larger than {decimal(most)}, the limit for files read as a whole")
     return content

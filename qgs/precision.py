@@ -34,8 +34,8 @@ def full_precision(function: F) -> F:
     """Decorate `function` to run outside autocast, with half-precision arguments cast to float32.
 
     Tensors inside containers, mappings, lists and tuples are cast too. Arguments without a
-    half-precision tensor are passed on unchanged. An ImageMemory that is cast becomes a copy with
-    an empty cache (see `once`). float64 stays float64, so that gradient checks work.
+    half-precision tensor are passed on unchanged. An ImageMemory that is cast becomes a copy
+    without the tensors that `once` cached. float64 stays float64, so that gradient checks work.
     """
 
     @wraps(function)

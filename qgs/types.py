@@ -71,7 +71,9 @@ class Cameras(TensorContainer):
 class Photos(TensorContainer):
     """Photos without cameras, for models whose encoder and queries do not need them.
 
-    images: (B, V, 3, H, W) in [0, 1]. times, target_time: see `Views`.
+    images: (B, V, 3, H, W) in [0, 1].
+    times: (B, V), time of each photo; None for static scenes.
+    target_time: (B, 1), time at which to reconstruct the scene; None for static scenes.
     """
 
     images: Tensor
@@ -253,7 +255,9 @@ class GaussianAttributes(TensorContainer):
     offsets: (B, N, K, 3) raw, before any activation; a `centers` component turns them into means.
     scales: (B, N, K, 3) positive, world units. quats: (B, N, K, 4) unit, w x y z.
     opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1], even if `sh` is set.
-    sh: (B, N, K, C, 3) or None, see `Gaussians`. features: (B, N, K, F) or None, see `Gaussians`.
+    sh: (B, N, K, C, 3) coefficients of spherical harmonics, as in `Gaussians`; None for colours
+        that are the same from all directions.
+    features: (B, N, K, F) further values to render; None if there are none.
     """
 
     offsets: Tensor
@@ -322,9 +326,10 @@ class Gaussians(TensorContainer):
 class Rendering(TensorContainer):
     """Rendered images: rgb (B, V, 3, H, W), alpha and depth (B, V, 1, H, W).
 
-    With the weight w of each Gaussian at a pixel: `rgb` is blended over the background. `alpha` is
-    sum(w), in [0, 1]. `depth` is the mean camera-frame z, sum(w z) / sum(w), or 0 where no Gaussian
-    was hit. `features` (B, V, F, H, W) is sum(w f); None for Gaussians without features f.
+    Each Gaussian has a blending weight w at a pixel. `rgb` is the sum of weighted colours plus
+    (1 - alpha) times the background. `alpha` is sum(w), in [0, 1]. `depth` is the mean camera-frame
+    z, sum(w z) / sum(w), or 0 where no Gaussian was hit. `features` (B, V, F, H, W) is sum(w f);
+    None for Gaussians without features f.
     """
 
     rgb: Tensor

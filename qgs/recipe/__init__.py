@@ -37,8 +37,9 @@ def compose(
 ) -> QueryGaussianModel:
     """Build the model that a recipe describes, with its initial parameters.
 
-    recipe, overrides: see `resolve`. device: device of the model; None means the CPU, and "meta"
-    allocates no memory.
+    recipe: path of a YAML file, name of a recipe that comes with qgs (tiny/locus.yaml), or mapping.
+    overrides: changes such as "model.queries.count=128", applied in order.
+    device: device of the model; None means the CPU, and "meta" allocates no memory.
     The same recipe gives the same parameters. The global random state does not change.
     Raises RecipeError (a ValueError) that lists all problems of the recipe.
     """

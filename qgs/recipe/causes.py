@@ -23,7 +23,8 @@ def at_their_causes(
 ) -> Iterator[RecipeProblem]:
     """Yield the problems `found` in the recipe `written`, moved to the lines that caused them.
 
-    Problems with the same cause become one. plugins: used in place of installed plugins.
+    Problems with the same cause become one.
+    plugins: Plugin objects that are used in place of installed plugins of the same names.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     left = found
@@ -58,9 +59,9 @@ def _blames(
 ) -> dict[RecipeProblem, RecipeProblem]:
     """Map each problem in `found` to a new problem, at the line that caused it.
 
-    `written` consists of `written.under` and of `written.over`, the last file or override. The
-    options of `written.over` are applied one by one. An option causes the problems that first
-    appear after it.
+    `written` is the result of merging `written.over`, the last file or override, into
+    `written.under`. The options of `written.over` are merged one by one. An option causes the
+    problems that first appear after it.
     found: problems that are absent without `written.over`. before: draft (recipe with components
         chosen, not yet checked) of `written.under`.
     """

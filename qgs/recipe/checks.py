@@ -242,7 +242,7 @@ def keys_are_read(parts: Parts) -> bool:
 
 
 def idle_fields(parts: Parts) -> Iterator[str]:
-    """Yield a warning for each learnable field of the queries that only refinements read."""
+    """Yield a warning for each learnable field of queries that only refinements read."""
     read = set[str]()
     for path, part in parts.items():
         # A refinement reads the fields that it updates; that alone does not use them.

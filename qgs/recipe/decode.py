@@ -1,4 +1,4 @@
-"""Decoding of what a recipe writes for a component into the component's class and Config."""
+"""Decoding of a component's entry in a recipe: its class, and its options as a Config."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def report_failure(
 ) -> None:
     """Add the problem that a plugin's code raised `error`.
 
-    called: name of this code in the message.
+    called: text that names this code in the message, such as "`Config` of `qgs/free`".
     """
     release = installed.released_as
     origin = f"the plugin `{installed.plugin.name}`{f' of {release}' if release else ''}"

@@ -51,7 +51,7 @@ class Recipe:
 
     @property
     def data_config(self) -> contracts.SceneSourceConfig | None:
-        """Options of the data source; None without a source or if not a SceneSourceConfig."""
+        """Options of the data source; None without a source or with options of another class."""
         config = self.parts["data",].config if ("data",) in self.parts else None
         return config if isinstance(config, contracts.SceneSourceConfig) else None
 
@@ -235,10 +235,11 @@ def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
 
 
 def _shown_parts(parts: Parts) -> dict[KeyPath, Chosen]:
-    """Return components in the short form of a recipe, by path.
+    """Return components by path, without components that a complete recipe need not repeat.
 
-    A component of the decoder stands for all layers; layers that differ from it follow. If all
-    layers have the same component, the decoder gets that component.
+    A path such as `model.decoder.layer` stands for all decoder layers. If all layers have the same
+    component, it has this path. Only layers with another component have separate paths, such as
+    `model.decoder.layers.0.layer`.
     """
     shown = {path: part for path, part in parts.items() if "layers" not in path}
     layers = {path: part for path, part in parts.items() if "layers" in path}

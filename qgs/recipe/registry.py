@@ -148,7 +148,7 @@ def load_plugin(name: str) -> InstalledPlugin:
     if len(entries) > 1:
         releases = ", ".join(sorted(map(_release, entries)))
         reason = f"several distributions offer a plugin `{name}`: {releases}"
-        raise PluginError(reason, "uninstall all but one of these")
+        raise PluginError(reason, "uninstall all of these distributions but one")
     entry = entries[0]
     release = _release(entry)
     assert entry.dist is not None
@@ -172,9 +172,9 @@ def _release(entry: EntryPoint) -> str:
 
 
 def _plugin_fault(plugin: object, name: str) -> str:
-    """Return what is wrong with `plugin`, to follow its name in a message; "" if nothing is wrong.
+    """Return text on the fault of `plugin`; "" if it has none.
 
-    name: the plugin's entry point.
+    Messages put the plugin's name before this text. name: name of the plugin's entry point.
     """
     if not isinstance(plugin, Plugin):
         return f"is not a qgs.Plugin: its entry point leads to an object of type {type(plugin)}"

@@ -63,8 +63,9 @@ class RecipeSettings(ComponentConfig):
     seed: int = Field(default=0, ge=0, lt=2**63)
     """Seed of the model's initial parameters and of training (default 0)."""
     init_from: str | None = None
-    """Path of the checkpoint with whose weights training starts. The number of its queries is
-    changed to that of this recipe, as in the LocusGS release. null means initial parameters."""
+    """Path of a checkpoint, from whose weights training starts. If its number of queries differs
+    from that of this recipe, queries are dropped or copied, as in the LocusGS release. null starts
+    from the initial parameters that `seed` gives."""
     plugins: tuple[str, ...] | None = ()
     """Plugins whose components the recipe may use besides the built-in ones; null means none."""
 

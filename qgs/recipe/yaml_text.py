@@ -27,7 +27,7 @@ _SCALARS = {
     "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
     r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
 }
-"""Pattern of unquoted YAML 1.2 scalars of each kind but strings."""
+"""Regular expression for unquoted YAML 1.2 scalars of each kind; all other scalars are strings."""
 _RESOLVERS: dict[str | None, list[tuple[str, re.Pattern[str]]]] = {
     None: [(_STANDARD + kind, re.compile(rf"({text})\Z")) for kind, text in _SCALARS.items()]
 }
@@ -225,7 +225,7 @@ def _read(
             key = key_node.value
             # The last of two equal keys would win in silence.
             if not isinstance(key_node, yaml.ScalarNode) or key in read:
-                raise _fault(f"the key {key!r:.100} is not a word, or appears twice", key_node)
+                raise _fault(f"the key {key!r:.100} appears twice, or is not text", key_node)
             read.put(key, below(value_node), origin(key_node.start_mark))
         return read
     if isinstance(node, yaml.SequenceNode):

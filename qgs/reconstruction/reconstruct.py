@@ -43,9 +43,12 @@ def reconstruct(
     photos: a folder of photos and cameras, or its URL. Or Views (1, V) with OpenCV cameras in any
         world; all of them are inputs unless `inputs` or `frames` is given.
     inputs: number of input photos; None uses the recipe's number.
-    frames: input photos, by number or file name; None chooses them, see `qgs.data.inputs`.
+    frames: input photos, by number or file name; None chooses photos that overlap and are about as
+        far apart as in the model's training.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
-    size: (H, W) of a folder's images, see `chosen_scene`. scene: name of a scene in the folder.
+    size: (H, W) to which a folder's images are cropped and resized; None uses the recipe's size for
+        training data, and keeps the aspect ratio of other photos.
+    scene: name of a scene in the folder; None stands for the only scene.
     overrides: changes of the recipe's `views`, such as "views.scale=auto".
     tune: what to fit to the inputs first, such as "queries:50"; None fits nothing.
 
@@ -109,9 +112,10 @@ def choose_frames(
     """Return the input frames of `scene` and the frames to compare the result with.
 
     inputs: number of inputs; None uses `views.inputs`.
-    frames, compare: input frames and compared frames that the user chose; None chooses them here.
-        In scenes with times, inputs are spread over time, and compared frames between them share
-        one time. In other scenes, the best window of `ranked_windows` is used.
+    frames: input frames that the user chose; None spreads them over time if the scene has times,
+        and otherwise takes them from the best window of `ranked_windows`.
+    compare: frames to compare with that the user chose; None chooses frames between the inputs that
+        share one time if the scene has times, and otherwise frames that the inputs see.
     trained_on: distances and angles of cameras in the model's training; None allows any.
     Raises ValueError for frames that do not exist or repeat, and for too few frames.
     """
@@ -161,7 +165,7 @@ def _over_time(
         usable = moments(scene)
         if views.inputs > len(usable):
             raise ValueError(
-                f"photos were taken at {len(usable)} moments, too few for {views.inputs} inputs: "
+                f"photos were taken at {len(usable)} times, too few for {views.inputs} inputs: "
                 "choose fewer inputs"
             )
         first = max(len(usable) - max(views.gap[1] + 1, views.inputs), 0) // 2

@@ -59,7 +59,7 @@ class Reconstruction:
 
     @property
     def worse_than_nearest(self) -> str:
-        """Remark if, on compared views, copies of the nearest input have a higher PSNR; else ""."""
+        """Remark if the nearest inputs match compared photos better than renderings do; else ""."""
         compared = [score for score in self.scores if score.baselines]
         if not compared:
             return ""
@@ -83,7 +83,7 @@ class Reconstruction:
         return replace(seen, depth=seen.depth / float(scale))
 
     def save(self, out: AnyPath) -> list[Path]:
-        """Write the files that `qgs reconstruct` writes to `out`, and return their paths."""
+        """Write the result to the folder or file `out`, as `qgs reconstruct`; return the paths."""
         # Matplotlib is slow to import.
         from qgs.reconstruction.saving import write_reconstruction
 

@@ -55,7 +55,7 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
 
     These files are in the model's world; cameras.json has the transform to the photos' world. The
     files of an earlier result are replaced together, once all new files are complete. Raises
-    FileExistsError if `out` holds files of these names that are no earlier result.
+    FileExistsError if `out` holds some of these files, but no gaussians.ply.
     If `out` has the suffix of a scene format (.ply, .splat, ...), only this file is written, with
     the Gaussians in the photos' world.
     """

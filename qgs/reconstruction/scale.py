@@ -2,8 +2,8 @@
 
 Camera positions of photos may be in any unit, but a model needs the unit of its training. So the
 model runs on the inputs at several factors, and the factor with the best PSNR of rendered photos is
-chosen. Inputs alone mislead: at a factor that is too small, surfaces close to the cameras reproduce
-them well. So a few photos that are not inputs are scored too.
+chosen. Inputs alone mislead: if the factor is too small, the model can reproduce the inputs by
+surfaces close to the cameras. So a few photos that are not inputs are scored too.
 """
 
 import math
@@ -37,21 +37,24 @@ BELOW = 2.0
 ABOVE = 4.0
 """Factor by which the search goes above the largest baseline of the training."""
 NEAREST = 0.8
-"""Smallest depth at which cameras look, to assume if the model does not record its training's."""
+"""Smallest depth of the point that cameras look at, to assume if the model does not record that of
+its training."""
 REACH = 6.0
-"""The search moves the point that cameras look at up to REACH times the smallest trained depth."""
+"""Factor by which the search goes above the smallest depth, in training, of the point that cameras
+look at."""
 PENALTY = 5.0
-"""Penalty in dB if depths are smaller than in training by a factor e. It applies only if no photo
-but the inputs is scored."""
+"""Penalty on a score, in dB per factor e by which depths are smaller than in training. It applies
+only if no photos but the inputs are scored."""
 POOR = 14.0
-"""PSNR in dB of the scored photos below which no scale fits; novel views then average 12 dB."""
+"""PSNR in dB that the best factor must reach. If it does not, no scale fits, and novel views have
+about 12 dB."""
 
 
 @dataclass(frozen=True)
 class FoundScale:
     """Result of the search: the best factor of camera positions, and its quality.
 
-    further: scored photos that are not inputs. names: file names of these photos.
+    further: scored frames that are not inputs. names: file names of these frames.
     psnr: mean PSNR in dB of inputs and further photos, where further photos have twice the weight.
     tried: pairs of a tried factor and its mean PSNR.
     """
@@ -158,7 +161,7 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
     """Return at most FURTHER photos near the inputs, by which `find_scale` scores factors.
 
     These are the photos whose largest `pose_distance` to an input is smallest. Inputs, compared
-    photos and held-out photos are left out. A scene with times gives no photos.
+    photos and held-out photos are left out. For a scene with times, the result is empty.
     """
     left = [f for f in range(len(scene)) if f not in {*inputs, *compared, *scene.held_out}]
     if scene.times is not None or not left:
@@ -195,7 +198,7 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
 
 @dataclass
 class _Trial:
-    """Scores of factors of camera positions; place p stands for the factor low * step ** p.
+    """Scores of factors of camera positions. A place p stands for the factor low * step ** p.
 
     views: (1, V), whose cameras have the factor 1; the first `inputs` of them are given to the
         model. weights: weights of the views in the mean PSNR. nearest: factor below which PENALTY
@@ -231,7 +234,7 @@ class _Trial:
         return max(self.tried, key=self.score)
 
     def past(self, place: float) -> Sequence[float]:
-        """Return two exponents beyond `place` if it is the least or largest tried, else none."""
+        """Return two places beyond `place` if it is the least or largest tried, else none."""
         if place == min(self.tried):
             return [place - 6, place - 3]
         return [place + 3, place + 6] if place == max(self.tried) else []

@@ -26,7 +26,8 @@ from qgs.types import SH_COUNTS, Gaussians
 from qgs.wording import listed, one_line, warn_once
 
 WRITER_GROUP = "qgs.scene_writers"
-"""Entry points of functions (gaussians, path): the name is the suffix that they write, undotted."""
+"""Group of entry points of writers, which are functions (gaussians, path). An entry point has the
+suffix of its files as its name, without the dot."""
 
 OPACITY_EPS = 1e-6
 """Least distance of a stored opacity from 0 and 1, where the logit is infinite."""
@@ -210,8 +211,9 @@ def _of_ply(path: Path) -> Gaussians:
 def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, str]:
     """Return one scene of Gaussians (G, ...) in float32 on the CPU, and its origin, for a file.
 
-    gaussians: (G, ...) or (1, G, ...). origin: see `about_origin`. kind: file type for messages.
-        lost: parts that the file cannot hold; they cause a warning.
+    gaussians: (G, ...) or (1, G, ...). kind: file type for messages. lost: names of fields that the
+        file cannot hold; a warning says if they are left out.
+    The origin is the point "X Y Z" from which means are measured, or "" for (0, 0, 0).
     Raises ValueError for several scenes or for numbers whose squares are not finite.
     """
     batch = gaussians.means.shape[:-2]
@@ -221,12 +223,12 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, s
             "write them one by one, as gaussians[i]"
         )
     if names := [f"`{name}`" for name in lost if getattr(gaussians, name) is not None]:
-        warn_once(f"{kind} files have no place for {listed(names)}: left out")
+        warn_once(f"{kind} files cannot hold {listed(names)}, which are left out")
     scene = gaussians[0] if batch else gaussians
     scene = map_tensors(Tensor.detach, scene).to("cpu")
     if broken := int((~_finite(scene)).sum()):
         raise ValueError(
-            f"{broken} of {scene.count} Gaussians have numbers that are not finite or too large"
+            f"{broken} of {scene.count} Gaussians have NaN, infinity or huge numbers: remove them"
         )
     return about_origin(replace(scene.to(torch.float32), means=scene.means))
 
@@ -242,5 +244,5 @@ def about_origin(gaussians: Gaussians) -> tuple[Gaussians, str]:
         return scene, ""
     middle = scene.means.flatten(0, -2).median(0).values.round()
     origin = " ".join(map(str, middle.tolist()))
-    warn_once(f"too far from zero for float32: positions are from the local origin {origin} on")
+    warn_once(f"positions too large for float32 are written relative to the local origin {origin}")
     return replace(scene, means=(scene.means - middle).float()), origin

@@ -62,9 +62,10 @@ def chosen_scene(
 
     The frames are None if `path` is not part of the model's training data.
     name: name of the scene; None stands for the only scene.
-    size: (H, W) of images; None uses the recipe's size for training data, else `whole_size`.
-    holdout: hold out every HOLDOUT-th photo if `path` is no training data and has no split of its
-        own.
+    size: (H, W) of images; None uses the recipe's size for training data, and the result of
+        `whole_size` for other photos.
+    holdout: whether to hold out every HOLDOUT-th photo. Training data, and scenes that already hold
+        out photos, are not changed.
     Raises ValueError if neither `size` nor the recipe gives a size.
     """
     if recipe.data_config is None and size is None:
@@ -92,8 +93,8 @@ def _resized(source: SceneSource, config: SceneSourceConfig, size: Size) -> Scen
 def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
     """Return `config` with every HOLDOUT-th photo held out.
 
-    `config` is returned unchanged if it or the scene already holds out photos, or if it has no
-    option `holdout`.
+    `config` is returned unchanged if `config` or `scene` already holds out photos, or if `config`
+    has no option `holdout`.
     """
     # A listing's own split, or one in the options, is somebody's decision.
     split = scene.held_out or getattr(config, "holdout", None) != 0
@@ -104,8 +105,9 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
     """Return the image size (H, W) at which photos of a user are resized without cropping.
 
     The shorter side is about as long as that of the training images, and the aspect ratio is about
-    that of the first photo. Both sides are multiples of `multiple`. If `multiple` is None or images
-    are generated, the size is that of the training images, at which `scene` must be opened.
+    that of the first photo. Both sides are multiples of `multiple`.
+    scene: must be opened at the size of the training images. This size is returned if `multiple` is
+        None, or if `scene` generates its images.
     """
     trained = scene.cameras.size
     stored = scene.stored_size(0)
@@ -167,7 +169,7 @@ def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
         # From a folder's start on: "1.png" is not "11.png".
         found = [frame for frame, name in enumerate(names) if f"/{name}".endswith(f"/{part}")]
         if len(found) != 1:
-            fits = f"fits {listed(map(scene.label, found))}" if found else "is no photo"
+            fits = f"matches {listed(map(scene.label, found))}" if found else "is no photo"
             raise ValueError(
                 f"{option}: {part!r} {fits}. Give numbers or file names of photos, separated by "
                 f"commas, such as 0,8,16, from {scene.label(0)} to {scene.label(len(names) - 1)}"

@@ -122,5 +122,5 @@ def _checked(wanted: Collection[int] | None, existing: range, what: str) -> list
     wanted = existing if wanted is None else wanted
     if unknown := [number for number in wanted if number not in existing]:
         last = existing.stop - 1
-        raise ValueError(f"{what} {unknown} do not exist; there are {existing.start}..{last}")
+        raise ValueError(f"{what} {unknown} do not exist; choose from {existing.start}..{last}")
     return list(wanted)

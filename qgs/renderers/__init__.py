@@ -30,7 +30,7 @@ class AutoRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render as `Renderer` says; raise RuntimeError if gsplat is needed and not installed."""
+        """Render every scene from each of its cameras; raise RuntimeError if gsplat is missing."""
         kind = GsplatRenderer if gaussians.means.is_cuda else CpuRenderer
         # Created in each call, because options may follow a schedule.
         return kind(self.config)(gaussians, cameras, background)

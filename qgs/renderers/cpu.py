@@ -37,7 +37,7 @@ class CpuRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render as `Renderer` says; raise ValueError for tensors that are not on the CPU."""
+        """Render every scene from each of its cameras; raise ValueError for tensors off the CPU."""
         check_inputs(gaussians, cameras)
         if gaussians.means.device.type != "cpu":
             raise ValueError(
@@ -173,9 +173,9 @@ def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
 
 
 def _parts(splats: Any, size: Size) -> tuple[list[_Part], list[_Part]]:
-    """Divide the work: return numbered ranges of Gaussians, and of rows of tiles in an image.
+    """Return the units of parallel work: numbered ranges of Gaussians, and of rows of tiles.
 
-    There is one range of rows, the whole image, unless there are few images.
+    The rows of an image are one range, unless there are few images.
     """
     batch, views, count, _ = splats.shape
     chunks = pairwise([*range(0, count, _CHUNK), count])

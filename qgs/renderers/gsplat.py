@@ -39,7 +39,7 @@ class GsplatRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render as `Renderer` says.
+        """Render every scene from each of its cameras.
 
         Raises ValueError for tensors that are not on CUDA, and RuntimeError if gsplat is missing.
         """

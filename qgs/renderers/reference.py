@@ -65,9 +65,10 @@ def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor
 
 
 def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
-    """Return the entries xx, xy, yy (..., 3) of inverse 2D covariances, and whether they exist.
+    """Return the entries xx, xy, yy (..., 3) of inverse 2D covariances, and a bool mask (...).
 
-    The covariance is F F^T + dilation * I, with F from `factors` (..., 2, 3).
+    The mask is False where the inverse does not exist. The covariance is F F^T + dilation * I, with
+    F from `factors` (..., 2, 3).
     """
     row_x, row_y = factors.unbind(-2)
     xx = (row_x * row_x).sum(-1)
@@ -93,7 +94,7 @@ class TorchRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """Render as `Renderer` says; half-precision inputs are rendered in float32."""
+        """Render every scene from each of its cameras; half-precision inputs become float32."""
         check_inputs(gaussians, cameras)
         config = self.config
         with torch.autocast(gaussians.means.device.type, enabled=False):

@@ -108,7 +108,7 @@ class SelfAttentionCore(nn.Module):
     ) -> AttentionWeights:
         """Return the attention weights of the tokens with indices `queries` (Q,).
 
-        mask: see `forward`.
+        mask: bool (B, T) or (B, T, T), where False hides a token, as in `forward`.
         """
         q_BhTd, k_BhTd, _ = self.project(x_BTD)
         bias_B1QT = None
@@ -158,7 +158,7 @@ class CrossAttentionCore(nn.Module):
     ) -> AttentionWeights:
         """Return the attention weights of the queries with indices `queries` (Q,).
 
-        bias: see `forward`.
+        bias: (B, N, M) or (B, h, N, M), added to the logits, as in `forward`.
         """
         q_BhQd = self.project(x_BND)[:, :, queries]
         full = (len(x_BND), -1, x_BND.shape[1], k_BhMd.shape[2])

@@ -45,7 +45,7 @@ class LatentQueries(LearnedQueries):
 class CrossSelfMlp(DecoderLayer):
     """Decoder layer of cross-attention, self-attention and MLP, in this order (TokenGS release).
 
-    It multiplies the update of each part by a LayerScale and adds it to the features.
+    The output of each sublayer is multiplied by a LayerScale and added to the features.
     """
 
     name = "cross_self_mlp"

@@ -95,7 +95,7 @@ class OneCycleAdamW(Optimizer):
         return _cosine(self.peak, self.last, min(part, 1.0))
 
     def state(self) -> Mapping[str, float | None]:
-        """Return the fraction of the budget at which the fall starts; None before the fall."""
+        """Return `descent_starts`: used fraction of the budget when the fall began, None before."""
         return {"descent_starts": self._descent_starts}
 
     def load_state(self, state: Mapping[str, Any]) -> None:

@@ -54,8 +54,9 @@ FREE = (
 
 They decide how long to train, where the data is and what is reported. They do not change what the
 model learns. If the budget changes, the learning rate follows the new budget from then on. The list
-`plugins` may change because the types of the model's components are compared. The options
-`training.batch_size` and `training.accumulate` are compared by the samples that a step sees.
+`plugins` may change because the types of the model's components are compared.
+`training.accumulate` may change too. `Counters` compares `training.batch_size` with the number of
+samples in a step of the run.
 """
 
 

@@ -130,7 +130,7 @@ class Guard:
             self._collapse(step + 1, found)
         self.save(step)
         raise NonFiniteError(
-            f"step {step + 1} is not finite; the run is saved as it was before this step. "
+            f"step {step + 1} has NaN or infinity; the run is saved as it was before this step. "
             "Continue without it by `--resume --set training.on_nonfinite=skip`, which skips at "
             f"most {MAX_SKIPPED} steps in a row.\n{found}.\nLikely causes:{NONFINITE_CAUSES}"
         )
@@ -249,7 +249,7 @@ class GoodWeights:
     grows to the whole window in long runs. No copy is made while the images are worse than before.
 
     Only the main process holds copies. psnr: running mean of the steps' PSNR in dB. best: largest
-    `psnr` so far at the times of possible copies.
+    `psnr` so far, of the steps after which a copy was due.
     """
 
     model: nn.Module

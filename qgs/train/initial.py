@@ -71,7 +71,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
 
 
 def _part(prefix: str, weights: Weights) -> dict[str, Tensor]:
-    """Return the weights whose names begin with `prefix`, by the rest of their names."""
+    """Return the weights whose names begin with `prefix`, by name without the prefix."""
     return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 

@@ -45,7 +45,7 @@ def judge(
 
     def between_scenes(done: int, wanted: int) -> None:
         if stop:
-            raise InterruptedError("evaluation ends early: training was asked to stop")
+            raise InterruptedError("evaluation ends early, because a signal asked training to stop")
 
     rows: list[Picture] = []
 

@@ -80,7 +80,10 @@ class Trackers:
         self._open: dict[str, Tracker] = {}
 
     def open(self, run: Path, options: Mapping[str, Any], step: int = 0) -> None:
-        """Start all trackers for the run in the folder `run`; options, step: see `Tracker`."""
+        """Start all trackers for the run in the folder `run`.
+
+        options: the recipe's options by dotted path. step: number of steps so far; 0 for a new run.
+        """
         for name, kind in self._kinds.items():
             try:
                 self._open[name] = kind(run, options, step)

@@ -229,7 +229,8 @@ class Trainer:
     def _fetch(self) -> None:
         """Load the batches of the next step, or store the error for `_refuse_missing_batches`.
 
-        It runs during a step, so that processes can agree on failures at its end.
+        Loading takes place during the present step, while a GPU still computes. Before the next
+        step, all processes stop if one of them failed to load.
         """
         try:
             self._batches = list(islice(self._stream, self.config.accumulate))

@@ -71,7 +71,8 @@ class TrainingPass(nn.Module):
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
         """Sum the losses of all supervised layers; implements `Passes.judge`.
 
-        The supervision sets the weight of each layer. `Outcome.signs` are those of the last layer.
+        The supervision sets the weight of each layer. `Outcome.signs` has the numbers of
+        `signs_of` (PSNR, alpha, deviation) for the last layer.
         Raises ValueError if two losses have a term of the same name.
         """
         parameters = dict(self.losses.named_parameters(prefix="losses"))
@@ -131,7 +132,7 @@ class TrainingPass(nn.Module):
         target: Views,
         inputs: Views,
     ) -> dict[str, Tensor]:
-        """Return the loss terms of the losses `names`; the other arguments are those of `Loss`."""
+        """Call the losses `names` with the other arguments; return all their terms by name."""
         terms: dict[str, Tensor] = {}
         for name in names:
             found = self.losses[name](prediction, rendering, target, inputs)
@@ -224,8 +225,9 @@ class DetachedLayer:
 def signs_of(rendering: Rendering, target: Views, background: Tensor) -> dict[str, Tensor]:
     """Return the 0-d numbers "psnr", "alpha" and "deviation" of a rendering.
 
-    psnr, alpha: means. deviation: mean |rgb - background| over the pixels of a view, largest of all
-        views. It is a mean, so that a single stray Gaussian does not hide that the model is dead.
+    psnr, alpha: means over all views. deviation: |rgb - background|, averaged over the pixels of a
+        view; the largest average of all views. Because of the average, a single stray Gaussian does
+        not hide that the model is dead.
     """
     deviation = (rendering.rgb - background[:, None, None]).abs().mean((-3, -2, -1))
     return {
