@@ -133,7 +133,7 @@ class OnMeta(TorchFunctionMode):
 
 
 def build(chosen: Chosen, *arguments: Any) -> Any:
-    """Build a component. arguments: what the constructor takes after the Config.
+    """Build a component. arguments: further arguments of its constructor, after the Config.
 
     If the constructor of a plugin's component fails, raises RecipeError that names the plugin's
     distribution. Errors that a user can mend are not converted: missing packages or data, and

@@ -125,7 +125,7 @@ def apply_swaps(
 
 
 def matches(pattern: str, path: KeyPath, *, below: bool = False) -> bool:
-    """Return whether `pattern` matches `path` or, with `below`, a leading part of `path`."""
+    """Return whether `pattern` matches `path` or, if `below`, the first keys of `path`."""
     # `model.` is optional, so `*.renderer` matches no place of the model.
     wanted = pattern.removeprefix("model.").split(".")
     shown = path[1:] if path[0] == "model" else path

@@ -113,7 +113,7 @@ def _warn(name: str, error: Exception) -> None:
 
 
 class TrainingProgress(Progress):
-    """Progress bar with loss, PSNR and time left; without a terminal, occasional lines."""
+    """Progress bar with loss, PSNR and time left; outside a terminal, a line now and then."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(
