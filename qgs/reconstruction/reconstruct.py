@@ -165,8 +165,8 @@ def _over_time(
         usable = moments(scene)
         if views.inputs > len(usable):
             raise ValueError(
-                f"photos were taken at {len(usable)} times, too few for {views.inputs} inputs: "
-                "choose fewer inputs"
+                f"photos were taken at {len(usable)} different times, too few for {views.inputs} "
+                "inputs: choose fewer inputs"
             )
         first = max(len(usable) - max(views.gap[1] + 1, views.inputs), 0) // 2
         frames = spread(usable[first : len(usable) - first], views.inputs)
