@@ -146,7 +146,7 @@ class EvaluationConfig(ComponentConfig):
     held-out frames, views are chosen at random."""
     protocol: str | None = None
     """Name of these evaluation settings in tables. null uses the name of the file in `index`,
-    or "drawn" without an index."""
+    or "held-out views" without an index."""
     tuning: Literal["queries", "latents"] = "queries"
     """Part of the model's state that test-time tuning fits to a scene's input views: "queries", or
     the features of the image memory ("latents"). "latents" needs an encoder that can recompute keys

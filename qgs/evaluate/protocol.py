@@ -90,7 +90,7 @@ def protocol_of(
         "tuning": tuning,
     }
     # The name is for people: it is not part of the hash.
-    file = (evaluation.index or "drawn").replace("\\", "/").rsplit("/", 1)[-1]
+    file = (evaluation.index or "held-out views").replace("\\", "/").rsplit("/", 1)[-1]
     return Protocol(evaluation.protocol or file.removesuffix(".json"), content)
 
 
