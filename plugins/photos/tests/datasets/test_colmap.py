@@ -203,5 +203,5 @@ def test_which_model_is_read(tmp_path, photos, caplog):
         paths = [Path(frame.path) for frame in read_frames]
         assert paths == [folder / images / file.name for file in photos.files]
     assert re.search(
-        r"of 2 COLMAP models .*1 with 3 photos is read, and not .*0 \(2\)", caplog.text
+        r"2 COLMAP models exist: .*1 with 3 photos is read, and not .*0 \(2\)", caplog.text
     )

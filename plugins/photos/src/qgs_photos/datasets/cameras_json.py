@@ -226,14 +226,14 @@ class _Camera:
         return matrix
 
     def _photo_size(self) -> Size | None:
-        """Return (H, W) as listed, or else of the image file; None if the image is unreadable."""
+        """Return the listed (H, W), or that of the image file; None if the file is unreadable."""
         if self.size is None:
             with suppress(ValueError):
                 self.size = read_image(self.find().get(self.path, self.path), image_size)
         return self.size
 
     def frame(self, folder: UPath) -> PhotoFrame:
-        """Return the photo with its camera; its name is relative to the scene's `folder`."""
+        """Return the photo and its camera; the photo's name is its path relative to `folder`."""
         name = "" if self.path == folder else "/".join(inside(folder, self.path))
         if not name:
             self._wrong("no image is named")

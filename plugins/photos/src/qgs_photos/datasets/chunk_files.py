@@ -4,16 +4,18 @@ pixelSplat published RealEstate10K and ACID in this format, DepthSplat published
 the folder of a data set, train/index.json and test/index.json map the key of a scene to a chunk
 file such as 000000.torch. A chunk file is a list with a mapping for each scene of V frames:
 
-- `key`: name of the scene. `url`: address of its video. `timestamps`: times in it, (V,).
+- `key`: name of the scene. `url`: address of its video. `timestamps`: the frames' times in the
+  video, (V,).
 - `cameras`: (V, 18) float32. A row is fx, fy, cx, cy divided by the image's width and height, two
   unused numbers, and the rows of the 3 x 4 OpenCV world-to-camera matrix.
 - `images`: a list of V uint8 tensors with the bytes of JPEG or PNG files.
 
 `qgs data pack` adds keys that other readers ignore:
 
-- `names`: V strings. `sizes`: (V, 2), height and width of every image.
+- `names`: V names of the frames. `sizes`: (V, 2), height and width of every image.
 - `masks`: a list of V uint8 tensors with the bytes of PNG files, empty for frames without a mask.
-- `held_out`: indices of frames that training must not use. `times`: (V,) float64, see `Scene`.
+- `held_out`: indices of frames that training must not use.
+- `times`: (V,) float64, times of the frames; missing for a static scene.
 """
 
 import io
@@ -54,9 +56,12 @@ _DIVIDED_TWICE = 0.02
 
 @dataclass(frozen=True)
 class Record:
-    """A scene as stored in a chunk file, with the values that this module's docstring explains.
+    """A scene of V frames as stored in a chunk file; the module's docstring gives the formats.
 
-    where: names of the file and the scene, for error messages.
+    where: names of the file and the scene, for error messages. key: name of the scene. cameras:
+    (V, 18). images, masks: bytes of image files. names: of the frames. sizes: (V, 2), height and
+    width of the images. held_out: indices of frames that training must not use. times: (V,) of the
+    frames. sizes, masks and times are None if the file does not have them.
     """
 
     where: str
@@ -85,7 +90,7 @@ class Record:
 
     @cached_property
     def image_sizes(self) -> list[Size]:
-        """(H, W) of every image, from the chunk's list; without a list, that of the first image."""
+        """Sizes (H, W) of the images as listed; without a list, all have the first image's size."""
         if self.sizes is not None:
             return [(int(height), int(width)) for height, width in self.sizes.tolist()]
         return [self.stored_size(0)] * len(self)
@@ -207,7 +212,7 @@ def read_mask(record: Record, frame: int) -> np.ndarray | None:
             f"the mask of {record.place(frame)} cannot be read ({error}): {fix}"
         ) from error
     for problem in size_problems(mask.shape[:2], record.image_sizes[frame]):
-        raise ValueError(f"the mask of {record.place(frame)}: {problem}")
+        raise ValueError(f"the mask of {record.place(frame)} has a wrong size: {problem}")
     return mask
 
 
@@ -390,7 +395,7 @@ def _scanned(folder: UPath) -> dict[str, UPath]:
                 )
             files[key] = path
     warn_once(
-        f"{folder} has no {INDEX}, so that all of its {len(paths)} chunks are opened at every "
-        f"start to list {len(files)} scenes"
+        f"{folder} has no {INDEX}, so all of its {len(paths)} chunks are opened at every "
+        f"start to list {len(files)} scenes: `qgs data pack` writes this file"
     )
     return files

@@ -85,18 +85,21 @@ class ChunkScene(Scene):
 
     @cached_property
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
-        """See `Scene`: as the option `holdout` says; if it is 0, as the chunk lists them."""
+        """Held-out frames: every Nth for the option `holdout` N, or for 0 as the chunk lists."""
         every = self._config.holdout
         return held_out_frames(len(self), every) if every else self._record.held_out
 
     @cached_property
     def times(self) -> Tensor | None:  # type: ignore[override]  # known once the chunk is open
-        """See `Scene`."""
+        """Times (F,) of the frames, float64; None for a static scene."""
         return self._record.times
 
     @cached_property
     def cameras(self) -> Cameras:
-        """See `Scene`; in float64. Raises ValueError for a pose or intrinsics that are invalid."""
+        """Cameras (F,) of all frames, float64, with intrinsics for the size that `images` returns.
+
+        Raises ValueError for a pose or intrinsics that are invalid.
+        """
         record = self._record
         target = self._config.image_size
         require_usable(record)
@@ -113,16 +116,22 @@ class ChunkScene(Scene):
         return self._record.names[frame]
 
     def stored_size(self, frame: int) -> Size:
-        """See `Scene`."""
+        """Return (H, W) of the stored photo of `frame`. Raises ValueError if it is unreadable."""
         return self._record.stored_size(frame)
 
     def images(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`. Raises ValueError for an image that cannot be decoded."""
+        """Return images (len(frames), 3, H, W), float32 in [0, 1].
+
+        Raises ValueError for an image that cannot be decoded.
+        """
         record = self._record
         return to_tensor(np.stack([self._pixels(record, frame) for frame in frames]))
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`. The mask of a frame without one is 1 everywhere."""
+        """Return masks (len(frames), 1, H, W), 1 on the object; None if the scene has no masks.
+
+        In a scene with masks, the mask of a frame without one is 1 everywhere.
+        """
         record = self._record
         if record.masks is None:
             return None
@@ -203,9 +212,10 @@ class ChunksSource(LazySource):
         return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
 
     def scenes(self, split: Split) -> LazyScenes:
-        """See `SceneSource`. Without test chunks, test scenes are the training scenes.
+        """Return the scenes of a split.
 
-        This holds if scenes have held-out frames, which is looked up in the first chunk.
+        Without test chunks, the test scenes are the training scenes if frames are held out in the
+        first chunk; otherwise there are no test scenes.
         """
         if split in self.splits:
             return self.splits[split]
@@ -215,7 +225,7 @@ class ChunksSource(LazySource):
         return train if any(train[i].held_out for i in first) else self._nothing
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
-        """See `SceneSource`. The scenes of each chunk file are one group."""
+        """Return the indices of a split's scenes, in one group for each chunk file."""
         by_file: dict[str, list[int]] = {}
         for index, file in enumerate(self.scenes(split).places.values()):
             by_file.setdefault(str(file), []).append(index)

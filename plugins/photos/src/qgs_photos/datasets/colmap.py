@@ -43,7 +43,7 @@ _PLACES = (
     "dense/sparse",
     "dense/*/sparse",
 )
-_LONGER = "a file goes on after the number of records that it announces at its start"
+_LONGER = "a file has data after its last record: the count of records at its start is wrong"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 
@@ -58,12 +58,16 @@ class Colmap(PhotoReader):
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
-        """See `PhotoReader`."""
+        """Return whether `folder` has a COLMAP model, itself or in a folder such as sparse/0."""
         return any(_models(folder))
 
     @classmethod
     def lens(cls, model: str, coefficients: Mapping[str, float]) -> Lens | None:
-        """See `PhotoReader`."""
+        """Return the lens of a camera model; None if the model or a coefficient is unknown.
+
+        model: name of the model in nerfstudio or COLMAP. coefficients: nonzero distortion
+        coefficients by name, such as k1.
+        """
         # nerfstudio has a k3 in models where COLMAP has none
         kind = "FULL_OPENCV" if model in PINHOLE else model
         with suppress(ValueError):
@@ -75,17 +79,22 @@ class Colmap(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`."""
+        """Read the posed photos of a COLMAP model that `folder` has.
+
+        Of several models, the one with most photos is read; models whose folder of photos exists
+        come before others. A warning names the models that are not read. Raises ValueError for an
+        unreadable model.
+        """
         found = [_read(*model) for model in _models(folder)]
         # beside its own photos first: those of dense/0 are undistorted; then the largest
         best = max(found, key=lambda one: (_has_photos(one.folder or folder), len(one.frames)))
         if others := [f"{one.file} ({len(one.frames)})" for one in found if one is not best]:
             warn_once(
-                f"of {len(found)} COLMAP models {best.file} with {len(best.frames)} photos is "
+                f"{len(found)} COLMAP models exist: {best.file} with {len(best.frames)} photos is "
                 f"read, and not {listed(others)}"
             )
         if best.folder and not is_inside(folder, best.folder):
-            warn_once(f"{folder} is a COLMAP model of {best.folder}, whose photos are read")
+            warn_once(f"{folder} holds a COLMAP model: its photos are read from {best.folder}")
         return best
 
 
@@ -117,10 +126,10 @@ def _read(model: UPath, suffix: str) -> Listing:
 
 
 def _project(model: UPath) -> UPath:
-    """Return the folder to whose photos a model belongs.
+    """Return the folder of the scene to which a COLMAP model belongs; it holds the photos.
 
-    It is the folder around sparse/ or colmap/sparse/; the model's own folder if the model lies in
-    no sparse/ or has photos beside it.
+    For a model in sparse/ or colmap/sparse/, this is the folder that contains sparse/ or colmap/.
+    For a model elsewhere, or with photos beside its files, it is the model's folder.
     """
     places = (model, model.parent)
     sparse = next((place for place in places if place.absolute().name == "sparse"), None)
@@ -232,9 +241,10 @@ def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
 
 
 def _camera(model: str, width: float, height: float, values: Sequence[float]) -> dict[str, Any]:
-    """Return the fields of `PhotoFrame` that a camera decides: size, intrinsics, lens, problems.
+    """Return the size, intrinsics, lens and problems of a camera, as fields of `PhotoFrame`.
 
-    model: COLMAP's name of the camera model. width, height: in pixels. values: its parameters.
+    model: COLMAP's name of the camera model. width, height: in pixels. values: the model's
+    parameters.
     """
     size, problems = listed_size(height, width)
     try:

@@ -72,7 +72,7 @@ class Dl3dvSource(LazySource):
             train = {name: place for name, place in places.items() if name not in test}
             if absent:
                 count = f"{len(absent)} of {len(named)}"
-                warn_once(f"{count} test scenes are missing in the data: {listed(absent, 3)}")
+                warn_once(f"{count} test scenes do not exist and are left out: {listed(absent, 3)}")
         same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
         photos = PhotosConfig(format="nerfstudio", **same)
         opener = partial(_opened, config=photos, cache=BoundedCache(0))

@@ -18,7 +18,7 @@ from qgs.data.photos.nerfstudio import PINHOLE
 from qgs.data.photos.reader import Intrinsics, Lens, Size
 
 FOCAL = ("f", "fx", "fy")
-"""Parameters of a camera model that are focal lengths."""
+"""Names of focal lengths among the parameters of COLMAP's camera models."""
 MOST_ZOOM = 2.0
 # Rows that are undistorted at once: photos of phones would take gigabytes.
 _ROWS = 64
@@ -29,8 +29,8 @@ class BendingLens(Lens):
     """Lens with the distortion of any of COLMAP's camera models, computed by pycolmap.
 
     model: COLMAP's name of the camera model; OpenCV's models are among them. parameters: in
-    COLMAP's order, with focal lengths of 1 and the principal point at 0. turns: number of clockwise
-    quarter turns from the camera that has these parameters to the camera of this lens.
+    COLMAP's order, with focal lengths of 1 and the principal point at 0, for the camera before it
+    was turned. turns: number of clockwise quarter turns of the camera.
     """
 
     model: str
@@ -48,17 +48,22 @@ class BendingLens(Lens):
         return torch.view_as_real(torch.from_numpy(turned)).to(points)
 
     def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) of the plane z = 1 are nearer the middle than `_reach`."""
+        """Return whether the lens shows points (..., 2) of the plane z = 1, within its `_reach`."""
         return points.norm(dim=-1) < _reach(self)
 
     def turned(self) -> Self:
-        """See `Lens`."""
+        """Return the lens of this camera after a clockwise turn by 90 degrees."""
         return replace(self, turns=self.turns + 1)
 
     def undistorted(
         self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
     ) -> np.ndarray:
-        """See `Lens`."""
+        """Return the photo that a pinhole camera with the same intrinsics would have taken.
+
+        pixels: the photo, (H, W) or (H, W, C); the result has the same shape and dtype, with 0
+        outside of the photo. intrinsics: fx, fy, cx, cy in pixels of the photo. nearest: take the
+        nearest pixel instead of interpolating.
+        """
         height, width = pixels.shape[:2]
         focal, centre = torch.tensor(intrinsics).split(2)
         x = (torch.arange(width) + 0.5 - centre[0]) / focal[0]
@@ -78,9 +83,11 @@ class BendingLens(Lens):
         return result
 
     def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
-        """See `Lens`. Same choice as the default of COLMAP's undistorter (blank_pixels 0).
+        """Return the smallest zoom of a centre crop without black pixels in an undistorted photo.
 
-        Returns 1 if black pixels remain even at MOST_ZOOM.
+        COLMAP's undistorter makes the same choice by default (blank_pixels 0). intrinsics: fx, fy,
+        cx, cy in pixels of the photo. size: (H, W) of the photo. target: (H, W) whose aspect ratio
+        the crop has. Returns 1 if black pixels remain even at MOST_ZOOM.
         """
         return _whole_zoom(intrinsics, self, size, target)
 

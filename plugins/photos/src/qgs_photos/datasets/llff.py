@@ -28,7 +28,11 @@ class Llff(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`. Raises ValueError if there are not as many photos as rows."""
+        """Read the photos of `folder` and their cameras in poses_bounds.npy.
+
+        images: folder with scaled copies of the photos to read, such as images_4; None reads the
+        default folder. Raises ValueError if there are not as many photos as rows.
+        """
         file = folder / cls.listing
         photos = image_folder(folder, images)
         rows = _rows(file)

@@ -29,7 +29,8 @@ from qgs.data.view_samplers import (
 from qgs.domain import Domain
 
 _SHARE = 0.5
-"""Share of the photos from which a sample chooses its inputs. Each sample draws other photos."""
+"""Fraction of the photos among which the inputs of a training sample are chosen. Each sample has a
+new random subset."""
 _JUDGED = 4
 """Number of photos on which a scene without held-out photos is evaluated."""
 
@@ -37,8 +38,9 @@ _JUDGED = 4
 class Bounded(ViewSampler):
     """Sampler of inputs at both ends of a random gap in a video, and of targets between them.
 
-    The gap widens over `warm_up_steps`. For two inputs this is pixelSplat's sampler `bounded`;
-    further inputs are sampled between the ends. On camera paths that are no closed loop, pixelSplat
+    The gap is the number of frames from the first to the last input; it widens over
+    `warm_up_steps`. For two inputs this is pixelSplat's sampler `bounded`; further inputs are
+    sampled between the ends. On camera paths that are no closed loop, pixelSplat
     replaces the largest gap by the least gap; here only the number of frames limits the gap.
     Targets may repeat. `views.gap` is used only for evaluation windows around held-out frames.
     """
@@ -67,7 +69,7 @@ class Bounded(ViewSampler):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """See `Component`."""
+        """Yield a problem for a single input, and for a least gap that is above the largest."""
         if context.inputs == 1:
             yield Problem("", "it needs two inputs, but `views.inputs` is 1", "take qgs/span")
         for low, high in (("min_gap", "max_gap"), ("initial_min_gap", "initial_max_gap")):
@@ -77,7 +79,11 @@ class Bounded(ViewSampler):
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
     ) -> tuple[Frames, Frames]:
-        """See `ViewSampler`."""
+        """Return random input frames, in ascending order, and target frames between them.
+
+        step: number of optimiser steps before the sample is used, on which the gap depends. Raises
+        ValueError for a scene with too few frames.
+        """
         span = self.span(scene, views, rng, step)
         between = rng.choice(range(1, len(span) - 1), views.inputs - 2, replace=False)
         places = [0, *sorted(map(int, between)), len(span) - 1]
@@ -90,7 +96,8 @@ class Bounded(ViewSampler):
     ) -> list[Frames]:
         """Return the frames in a random gap of the video, as one tuple of frames for each time.
 
-        parts: number by which the bounds of the gap are divided. Raises ValueError for a scene with
+        A tuple has several frames if several cameras took photos at that time. parts: number by
+        which the bounds of the gap are divided. Raises ValueError for a scene with
         too few frames.
         """
         refuse_too_many(views.inputs + views.targets, scene)
@@ -164,7 +171,7 @@ class Farthest(Bounded):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """See `Component`."""
+        """Yield the problems that `Bounded` finds, and one if `fewest` is above `views.inputs`."""
         yield from super().problems(config, context)
         if context.inputs and config.fewest > context.inputs:
             reason = f"it is larger than `views.inputs`, {context.inputs}"
@@ -173,7 +180,11 @@ class Farthest(Bounded):
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
     ) -> tuple[Frames, Frames]:
-        """See `ViewSampler`."""
+        """Return input frames that are far apart, in ascending order, and target frames.
+
+        step: number of optimiser steps before the sample is used, on which the gap and the number
+        of inputs depend; END in evaluation. Raises ValueError for a scene with too few frames.
+        """
         most = views.inputs
         fewest = self.config.fewest
         count = most if step == END else fewest + step % (most - fewest + 1)
@@ -207,11 +218,12 @@ def farthest_points(points: Tensor, count: int) -> list[int]:
 class Overlapping(ViewSampler):
     """Sampler for photos in any order: overlapping inputs around a random photo.
 
-    The inputs are those that `qgs demo` would choose for the random photo. Their distances are .06
+    The inputs are those that `qgs demo` would choose for the random photo. Their baselines are .06
     to .25 of the scene's depth, times a random factor, log-uniform between the bounds of `apart`.
     Targets are the random photo and the photos nearest to it. In evaluation the factor is 1, and
-    each held-out photo is a target; a scene without held-out photos has four targets. A scene that
-    moves can only be evaluated, on windows of `views.gap` in the order of time.
+    each held-out photo is a target; a scene without held-out photos has four targets. For
+    a scene that moves, training is refused, and evaluation uses windows in the order of time whose
+    length is given by `views.gap`.
     """
 
     name = "overlapping"
@@ -231,7 +243,10 @@ class Overlapping(ViewSampler):
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
     ) -> tuple[Frames, Frames]:
-        """See `ViewSampler`. Raises ValueError for a scene that moves."""
+        """Return overlapping input frames, in ascending order, and target frames near them.
+
+        step: has no effect. Raises ValueError for a scene that moves or has too few photos.
+        """
         if scene.times is not None:
             raise ValueError(
                 f"scene {scene.name!r} moves, but this view sampler trains on static scenes: set "
@@ -276,7 +291,7 @@ class Overlapping(ViewSampler):
 
 
 def apart(domain: Domain, factor: float) -> Domain:
-    """Return `domain` with the ranges of distances and angles between inputs times `factor`."""
+    """Return `domain` with its ranges of baselines and angles of inputs multiplied by `factor`."""
     low, high, turn = trained_ratios(domain)
     ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
     return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)
