@@ -48,7 +48,7 @@ class BendingLens(Lens):
         return torch.view_as_real(torch.from_numpy(turned)).to(points)
 
     def sees(self, points: Tensor) -> Tensor:
-        """Return whether the lens shows points (..., 2) of the plane z = 1, within its `_reach`."""
+        """Return whether the distortion is one-to-one at points (..., 2) of the plane z = 1."""
         return points.norm(dim=-1) < _reach(self)
 
     def turned(self) -> Self:

@@ -23,9 +23,10 @@ from qgs_photos.datatools.photos import Candidate, DecodedScene, Photo, decode, 
 from qgs_photos.datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
 
 PHOTOS = 400
-"""Photos to match in a whole data set. Matching takes about half a second for each photo."""
+"""Number of photos to match in a data set, divided among the scenes whose poses are checked.
+Matching takes about half a second for each photo."""
 FEWEST = 20
-"""Least number of photos to match in a scene whose poses are checked."""
+"""Number of photos to match in a scene, if PHOTOS divided by the number of scenes is less."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class Options:
     """Options of `qgs data check`.
 
     geometry: number of scenes whose poses are checked by matching photos. headers_only: read only
-    the headers of images. threads: number of threads that decode images. format: name of a format,
-    PLUGIN/NAME of a data source, or auto. images: folder of photos inside each scene; None takes
-    the format's default.
+    the headers of images, and match no photos. threads: number of threads that decode images.
+    format: name of a format, PLUGIN/NAME of a data source, or "auto" to recognise the format.
+    images: folder of photos inside each scene; None takes the format's default.
     """
 
     geometry: int = 20
@@ -101,7 +102,7 @@ def check(
 
 
 def faults_of_poses(path: UPath, scene: str | None, most_photos: int) -> list[Finding]:
-    """Return the errors that a quick check of the cameras of one scene finds.
+    """Check one scene without decoding all photos, and return the errors that are found.
 
     scene: name of the scene if `path` holds several; None takes the first. most_photos: largest
     number of photos to match. Raises the errors of `check`.
@@ -128,7 +129,7 @@ def _items(path: UPath, options: Options) -> Iterator[Candidate | Finding]:
         is_chunk = path.is_file() and path.suffix == ".torch"
         kind = "chunks" if is_chunk else kind_of(path)
     if kind == "chunks" and options.images is not None:
-        raise ValueError("chunks hold their images: leave --images out")
+        raise ValueError("chunks have no folders of images to choose: leave --images out")
     if kind == "chunks":
         return chunk_scenes(path)
     if kind == "dl3dv":

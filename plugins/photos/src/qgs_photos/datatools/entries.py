@@ -42,7 +42,10 @@ class Encoding:
 
 
 def encoded(pixels: np.ndarray, format: str = "PNG", **options: int) -> bytes:
-    """Encode uint8 pixels (H, W, 3) or (H, W) as an image. options: those of Pillow's `save`."""
+    """Encode uint8 pixels (H, W, 3) or (H, W) as the bytes of an image file.
+
+    format, options: arguments of Pillow's `save`.
+    """
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format, **options)
     return file.getvalue()

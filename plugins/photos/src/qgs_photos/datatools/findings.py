@@ -16,12 +16,13 @@ _FEW = 3
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of a scene or a file, and its remedy.
+    """A fault of a scene or a file, and how to correct it.
 
-    scene: name of the scene or of the file. frames: indices, in the data set's list, of the photos
-    with this fault; names: their file names; both empty if the whole scene is at fault. severity:
-    an error makes results wrong, a warning may make them wrong. numbers: frame numbers of these
-    photos for messages, see `DecodedScene.numbers`.
+    scene: name of the scene or of the file. reason: what is wrong. fix: what to do. frames: indices
+    of the faulty photos in the list of photos. names: file names of the faulty photos. numbers:
+    frame numbers of the faulty photos in the loaded scene; None for a photo that is not loaded.
+    frames, names and numbers are empty if the whole scene is at fault. severity: an error makes
+    results wrong; a warning marks what may make results wrong.
     """
 
     scene: str
@@ -96,10 +97,12 @@ def _joined(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> list[
 class SceneReport:
     """Findings and measurements of one scene.
 
-    kind: its format. split: train, test, or empty for a format without splits. listed, decodable,
-    missing: numbers of photos. numbered: number of photos that readers return as frames.
-    pose_problems: number of frames with a wrong pose. epipolar: median distance of matches from
-    epipolar lines in pixels, as text; "-" or a reason if it was not measured. depth: median
+    kind: format of the scene. split: train, test, or empty for a format without splits. listed:
+    number of photos that the data set lists. decodable: number of these photos that can be decoded.
+    missing: number of listed photos whose file does not exist. numbered: number of photos that are
+    loaded as frames. pose_problems: number of frames with a wrong pose. epipolar: median distance,
+    in pixels, of matched points from their epipolar lines, as text; "-" if no photos were matched,
+    "not checked" if the matches do not allow a measurement. depth: median
     distance from the cameras to the point that they look at, in scene units; 0 if they have no
     common point.
     """

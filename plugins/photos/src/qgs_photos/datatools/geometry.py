@@ -45,7 +45,7 @@ Features: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Features of one photo: points (P, 2), x and y in pixels, and SIFT descriptors (P, 128)."""
 Pairs: TypeAlias = Sequence[tuple[tuple[int, int], float]]
 """Pairs of frames, and for each pair the median distance of matched points from the epipolar lines
-that the poses predict, as a share of the photo's diagonal."""
+that the poses predict, as a fraction of the photo's diagonal."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class Geometry:
 
     @property
     def fraction(self) -> float:
-        """Median distance of matches from epipolar lines, as a share of the photo's diagonal.
+        """Median distance of matches from epipolar lines, as a fraction of the photo's diagonal.
 
-        The median is over all pairs; 0 without pairs.
+        The median is over all pairs of photos; it is 0 if there are no pairs.
         """
         return float(np.median([distance for _, distance in self.pairs])) if self.pairs else 0.0
 
@@ -196,9 +196,10 @@ class _Matcher:
         ]
 
     def distance(self, first: int, second: int) -> float | None:
-        """Return the median distance of two photos' matches from their epipolar lines.
+        """Return the median distance of two photos' matched points from their epipolar lines.
 
-        The distance is a share of the photos' diagonal. None if they have too few matches.
+        The distance is a fraction of the photos' diagonal. Returns None if the photos have too few
+        matches.
         """
         one, lens_of_one, diagonal = self._features(first)
         two, lens_of_two, _ = self._features(second)

@@ -102,7 +102,7 @@ def _is_unfinished(path: UPath) -> bool:
 
 
 def _packed_before(folder: UPath) -> dict[str, str]:
-    """Return the chunk file of each scene packed in a folder, by name; delete unfinished files."""
+    """Return the chunk file of each packed scene by the scene's name; delete unfinished files."""
     files: dict[str, str] = {}
     for item in sorted(folder.iterdir(), key=str) if folder.is_dir() else ():
         if _is_unfinished(item):

@@ -15,7 +15,8 @@ from qgs_photos.datatools.entries import bytes_of, encoded
 from qgs_photos.datatools.photos import Candidate, Photo
 
 OF_FILES = ("qgs", "datasets")
-"""Plugins whose data sets are checked file by file; of other plugins, loaded scenes are checked."""
+"""Plugins whose data sets are checked file by file. For a data set of another plugin, the scenes
+that its data source loads are checked."""
 
 # Of the images that a source is asked for.
 _SIZE = (256, 256)
@@ -23,10 +24,11 @@ _SIZE = (256, 256)
 
 @cache
 def _imported(format: str) -> tuple[Registry, list[str]]:
-    """Import plugins; return their components, and a note on each that cannot be imported.
+    """Import plugins; return their components, and an error for each that cannot be imported.
 
-    format: "auto" imports all plugins, PLUGIN/NAME the plugin PLUGIN and those listed in OF_FILES,
-    any other format only those in OF_FILES.
+    format: "auto" imports all plugins; PLUGIN/NAME imports PLUGIN and the plugins in OF_FILES; any
+    other format imports only the plugins in OF_FILES. Unless `format` is "auto", a plugin that
+    cannot be imported raises PluginError.
     """
     if format == "auto":
         return load_usable_plugins()
@@ -35,29 +37,36 @@ def _imported(format: str) -> tuple[Registry, list[str]]:
 
 
 def sources(format: str = "auto") -> dict[str, type[Component]]:
-    """Return the data sources that have an option `path`, by PLUGIN/NAME.
+    """Return the data sources that have an option `path`, as a mapping from PLUGIN/NAME.
 
-    format: "auto" takes the sources of all plugins, PLUGIN/NAME those of OF_FILES and of PLUGIN.
-    Raises PluginError if PLUGIN cannot be imported.
+    format: "auto" searches all plugins; PLUGIN/NAME searches PLUGIN and the plugins in OF_FILES;
+    any other format searches only the plugins in OF_FILES. Raises PluginError if PLUGIN cannot be
+    imported.
     """
     found = _imported(format)[0].components("data")
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}
 
 
 def left_out(format: str = "auto") -> list[str]:
-    """Return a note on each plugin that cannot be imported (see `sources`)."""
+    """Return a line of text for each installed plugin that cannot be imported.
+
+    format: "auto" tries to import all plugins; for any other format, the list is empty.
+    """
     return [f"left out: {problem}" for problem in _imported(format)[1]]
 
 
 def kind_of(path: UPath) -> str:
-    """Return PLUGIN/NAME of the data source that reads `path`, or NAME if OF_FILES lists PLUGIN."""
+    """Return the type PLUGIN/NAME of the data source that recognises `path`.
+
+    For a source of a plugin in OF_FILES, return NAME alone; return photos if no source does.
+    """
     kind = recognised(path, sources())
     plugin, _, name = kind.partition("/")
     return name if plugin in OF_FILES else kind
 
 
 def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candidate]:
-    """Yield the scenes of a plugin's data source to check, with images as the source returns them.
+    """Yield the scenes of a plugin's data source as candidates for the check.
 
     kind: PLUGIN/NAME. images: value of the source's option `images`; None keeps its default. Raises
     ValueError if the source has no such option, and the errors of the source.
