@@ -4,5 +4,5 @@ from rich.console import Console
 
 
 def say(console: Console, text: str) -> None:
-    """Print `text` unchanged: without line breaks inside paths, and brackets are not markup."""
+    """Print `text` unchanged: do not break lines, and do not read brackets as markup."""
     console.print(text, soft_wrap=True, highlight=False, markup=False)

@@ -21,12 +21,13 @@ CAMERAS = "cameras.json"
 class Record:
     """A finished reconstruction, in the world coordinates of its Gaussians.
 
-    model: checkpoint of the model, "" if unknown. tuning: settings of `--tune`; None without this
-    option. world: reference pose (4, 4) and scale that map the world of the photos to that of the
-    Gaussians (see `own_world`). inputs, compared: indices of the input frames and of the frames
-    with which renders were compared. cameras: (1, V), first of the inputs, then of the compared
-    frames. photos: file of each frame, by index, where known. renderer: options with the background
-    of the model.
+    folder: folder of the files. scene: name of the scene. model: checkpoint of the model, "" if
+    unknown. tuning: settings of `--tune`; None without this option. world: reference pose (4, 4)
+    and scale that map the world of the photos to that of the Gaussians (see `own_world`). inputs:
+    indices of the input frames. compared: indices of the frames with which renders were compared.
+    cameras: (1, V), those of `inputs`, then those of `compared`. photos: photo file of each frame,
+    by the frame's index; frames whose file is unknown are missing. renderer: renderer options that
+    set the background of the model.
     """
 
     folder: Path

@@ -58,7 +58,7 @@ def left_out(format: str = "auto") -> list[str]:
 def kind_of(path: UPath) -> str:
     """Return the type PLUGIN/NAME of the data source that recognises `path`.
 
-    For a source of a plugin in OF_FILES, return NAME alone; return photos if no source does.
+    For a source of a plugin in OF_FILES, return NAME alone. Return "photos" if no source does.
     """
     kind = recognised(path, sources())
     plugin, _, name = kind.partition("/")
@@ -66,10 +66,11 @@ def kind_of(path: UPath) -> str:
 
 
 def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candidate]:
-    """Yield the scenes of a plugin's data source as candidates for the check.
+    """Yield the scenes of a plugin's data source to check.
 
-    kind: PLUGIN/NAME. images: value of the source's option `images`; None keeps its default. Raises
-    ValueError if the source has no such option, and the errors of the source.
+    The images to check are those that the source returns. kind: PLUGIN/NAME. images: value of the
+    source's option `images`; None keeps its default. Raises ValueError if the source has no such
+    option, and the errors of the source.
     """
     source = sources(kind)[kind]
     assert issubclass(source, SceneSource)

@@ -15,7 +15,7 @@ from qgs_photos.poses.photos import PosesError, photo_files
 from qgs_photos.printing import say
 
 SECONDS_OF_PHOTO = 1.8
-"""CPU time for the pose of a photo of many pixels."""
+"""Estimated CPU time, in seconds, to compute the pose of one large photo."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
@@ -24,9 +24,10 @@ class ColmapOrPhotos(Colmap):
 
     @classmethod
     def posed(cls, path: UPath) -> UPath | None:
-        """Return the folder NAME_poses beside `path` with the poses of its photos or its video.
+        """Return the folder NAME_poses with the poses of `path`, a folder of photos or a video.
 
-        Missing poses are computed. None if `path` is neither a video nor a folder with photos.
+        The folder lies beside `path`. COLMAP computes missing poses. Returns None if `path` is
+        neither a video nor a folder with photos.
         """
         # anything else is left to the readers of listings, whose errors say what it lacks
         is_video = path.suffix.lower() in VIDEOS and path.is_file()
@@ -84,8 +85,8 @@ def is_made(source: Path, out: Path) -> bool:
         if record["source"] == held:
             return True
         raise PosesError(
-            f"{out} has poses of other photos than {source} holds now: delete it to compute poses "
-            f"again, or run `qgs poses {source} --out FOLDER` and use FOLDER in place of the photos"
+            f"{out} has poses of other photos than {source} has: delete these poses to compute new "
+            f"ones, or run `qgs poses {source} --out FOLDER` and use FOLDER in place of the photos"
         )
     return False
 

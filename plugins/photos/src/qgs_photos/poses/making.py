@@ -38,9 +38,11 @@ from qgs_photos.poses.photos import (
 
 RECORD = "poses.json"
 FEW = 20
-"""Largest number of photos of which all pairs are matched; of more, pairs that look alike."""
+"""Largest number of photos for which all pairs are matched. For more photos, pairs that look alike
+are matched."""
 MANY = 80
-"""Largest number of photos for that; of more, and of videos, neighbours in time are matched."""
+"""Largest number of photos for which pairs that look alike are matched. For more photos, and for
+videos, neighbours in the order of names are matched."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,10 @@ class Options:
 
     frames: number of frames taken from a video; None lets the camera's motion decide. side: longer
     side in pixels of the photos for COLMAP. matching: "exhaustive" matches all pairs, "sequential"
-    neighbours; "auto" takes "sequential" for a video and for more than EXHAUSTIVE photos. features:
-    largest number of features in a photo. threads: number of CPU threads; with 1, equal seeds give
-    equal poses.
+    neighbours in the order of names; "auto" takes "exhaustive" for up to FEW photos, "sequential"
+    for a video and for more than MANY photos, and otherwise matches pairs that look alike.
+    features: largest number of features in a photo. threads: number of CPU threads; with 1, equal
+    seeds give equal poses.
     """
 
     frames: int | None = None
@@ -64,7 +67,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Poses:
-    """Result of `make_poses`: names of the photos.
+    """Result of `make_poses`, with the file names of photos.
 
     posed: photos with a pose. without: photos for which no pose was found. faulty: photos that
     cannot be read, with the reason. remarks: sentences for the user.
@@ -93,7 +96,7 @@ class Poses:
 
 
 def fingerprint(source: Path) -> dict[str, Any]:
-    """Return the size (bytes) and time of change (ns) of a video or of each photo, by file name.
+    """Return size (bytes) and modification time (ns) of a video or of each photo, by file name.
 
     Poses belong to `source` as long as its fingerprint stays the same.
     """

@@ -103,7 +103,7 @@ def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]
     """Return the pose (4, 4) of a photo of a transforms file, and its fy in pixels of `size`."""
     if frame.problems or frame.size is None:
         raise ValueError(
-            f"{frame.name}: {next(iter(frame.problems), 'its size is missing: add h and w')}"
+            f"{frame.name}: {next(iter(frame.problems), 'the photo has no size: add h and w')}"
         )
     return frame.c2w, frame.intrinsics[1] * size[0] / frame.size[0]
 

@@ -30,8 +30,8 @@ FEW_MATCHES = 15
 # Of a model; photos from one place give models of next to no points.
 FEW_POINTS = 30
 SMALL = {"init_min_tri_angle": 4.0, "init_min_num_inliers": 50}
-"""Weaker limits on the first two photos, used if COLMAP finds no pair with its own limits of 16
-degrees and 100 points."""
+"""Least triangulation angle (degrees) and number of inliers of the first pair of photos. Used if
+COLMAP finds no pair with its defaults of 16 degrees and 100 inliers."""
 SMALL_SIDE = 1000
 """Longer side in pixels up to which features are searched at twice the photo's size. This finds
 more features and takes longer."""
@@ -146,7 +146,10 @@ def _leave_out_unlikely_pairs(database: str) -> None:
 
 
 def _largest(opened: Any, image: int) -> Array:
-    """Return descriptors (LARGEST, 128) of the largest features of a photo, of length 1 or 0."""
+    """Return descriptors (LARGEST, 128), of length 1, of the largest features of a photo.
+
+    If the photo has fewer features, the remaining rows are 0.
+    """
     points = opened.read_keypoints(image)
     order = (-np.hypot(points[:, 2], points[:, 4])).argsort()[:LARGEST]
     found = opened.read_descriptors(image).data[order].astype(np.float32)
@@ -158,7 +161,8 @@ def likely(features: Array) -> Array:
     """Return which pairs of N photos to match, (N, N) of bool; True for a photo with itself.
 
     A photo is matched with the NEXT photos before and after it by name, and with the ALIKE photos
-    that share most features. features: (N, L, 128), of length 1; 0 where a photo has fewer than L.
+    that share most features. features: descriptors (N, L, 128), of length 1; rows are 0 if a photo
+    has fewer than L features.
     """
     shared = np.zeros((len(features), len(features)))
     for place, own in enumerate(features):

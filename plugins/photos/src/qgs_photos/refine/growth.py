@@ -84,8 +84,8 @@ class FreeGaussians:
 
         Parents are sampled with probabilities proportional to opacity. Parent and copies become
         smaller and more transparent, so that together they render like the parent before. The Adam
-        moments of parent and copies restart at 0. A Gaussian is dead if its
-        opacity is below DEAD, unless the opacities of all Gaussians are.
+        moments of parent and copies restart at 0. A Gaussian is dead if its opacity is below DEAD.
+        If all opacities are below DEAD, no Gaussian counts as dead.
         """
         opacities = self.values["opacity_logits"].sigmoid()
         faint = (opacities < DEAD) & (opacities >= DEAD).any()

@@ -26,8 +26,8 @@ from qgs_photos.refine.scene_photos import TIMED, ScenePhotos
 from qgs_photos.refine.sweeping import balls, swept
 
 ENOUGH = 4
-"""Number of photos from which on Gaussians placed at pixels are as good a start as those of a
-model, see docs/refine.md."""
+"""Least number of photos for which Gaussians at pixels are as good a start of the optimisation as
+the Gaussians of a model. docs/refine.md explains the choice."""
 _OPACITY = 0.1
 # Nearest points that give a size.
 _NEIGHBOURS = 3
@@ -98,9 +98,10 @@ def shipped_model() -> str:
 
 
 def photos_world(photos: ScenePhotos) -> tuple[Tensor, Tensor]:
-    """Return the world of the first camera, scaled so that the scene's depth is about 1.
+    """Return the world frame of the first camera, scaled so that the scene's depth is about 1.
 
-    Returns reference pose (4, 4) and scale, see `own_world`.
+    The result is the pose (4, 4) of this camera in the photos' world, and the scale: a point p of
+    the frame is the point pose @ (p / scale) of the photos' world.
     """
     scale = 1 / scene_depth(photos.small)
     views = ViewsConfig(scale="constant", scale_factor=scale)

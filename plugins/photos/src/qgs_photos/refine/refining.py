@@ -79,10 +79,11 @@ class RefinedScene:
 
 @dataclass(frozen=True)
 class Extras:
-    """Parts to optimise in addition to means, shapes, opacities and colours of the Gaussians.
+    """Quantities to optimise in addition to means, shapes, opacities and colours of the Gaussians.
 
     degree: spherical harmonics up to this degree, 0 to 3, are added in steps if the first Gaussians
-    have none. exposure: an affine map of the colours of each photo. poses: the pose of each photo.
+    have none; 0 adds none. exposure: an affine map of the colours of each photo. poses: the pose of
+    each photo.
     """
 
     degree: int = 0

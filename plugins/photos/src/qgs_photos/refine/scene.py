@@ -132,12 +132,12 @@ def masked(views: Views) -> Views:
     without masks.
     """
     if views.masks is None:
-        raise ValueError("--masks: the photos have no masks: leave --masks out, or add masks")
+        raise ValueError("--masks needs photos with masks: leave --masks out, or add masks")
     return replace(views, images=views.masks * views.images)
 
 
 def timed_sweep(views: Views) -> tuple[Gaussians, float]:
-    """Return Gaussians (1, TIMED) at pixels of photos (1, V), and the seconds that each took."""
+    """Return Gaussians (1, TIMED) at pixels of photos (1, V), and the seconds for each Gaussian."""
     began = perf_counter()
     found = swept(views, TIMED, 1.0, torch.Generator().manual_seed(0))
     return found, (perf_counter() - began) / found.count

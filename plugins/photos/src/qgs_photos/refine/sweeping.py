@@ -123,7 +123,7 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
 
 
 def _others(cameras: Cameras, photo: int, size: float) -> list[int]:
-    """Return the photos whose baseline and direction are best for matching `photo`.
+    """Return the indices of photos whose baseline and direction are best for matching `photo`.
 
     A single photo is matched with itself.
     """

@@ -29,7 +29,7 @@ def bench(
     views: InputViews = None,
     size: Size = None,
     batch: Annotated[int, typer.Option(min=1, help="Scenes per batch.")] = 1,
-    precision: Annotated[str, typer.Option(help="float32, or bf16 for autocast.")] = "float32",
+    precision: Annotated[str, typer.Option(help="Use float32, or bf16 for autocast.")] = "float32",
     step: Annotated[bool, typer.Option("--step", help="Also measure training steps.")] = False,
     memory: Memory = False,
     renderer: Annotated[bool, typer.Option("--renderer", help="Also measure rendering.")] = False,
@@ -41,7 +41,8 @@ def bench(
 ) -> None:
     """Measure size, latency and memory of the models of one or more recipes.
 
-    Weights, photos and poses are random. Latency and FLOPs are those from photos to Gaussians.
+    Weights, photos and poses are random. Latency and FLOPs are those of the model, from photos to
+    Gaussians, without rendering.
     """
     from rich.console import Console
 

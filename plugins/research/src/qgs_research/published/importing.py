@@ -32,8 +32,8 @@ from qgs_research.published.weight_files import WeightFile, read_weight_file
 class Transfer(NamedTuple):
     """Result of `import_weights`: the recipe of the model, and a report as lines of text.
 
-    The report says how the file was read and converted, which tensors are unused, and where options
-    that weights do not determine differ from the published model.
+    The report says how the file was read and converted, which tensors are unused, and which options
+    of the recipe differ from the published model although the weights fit, such as activations.
     """
 
     recipe: Recipe

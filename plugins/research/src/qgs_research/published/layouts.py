@@ -43,7 +43,7 @@ class Names:
     def from_published(
         self, weights: Mapping[str, Tensor], origin: object = "the file"
     ) -> dict[str, Tensor]:
-        """Rename the tensors of a published state dict as in qgs; leave out `unused` tensors.
+        """Rename the tensors of a published state dict to their names in qgs; leave out `unused`.
 
         origin: name of the published file, for the error message. Raises PublishedError that lists
         all differences in names and shapes.
@@ -63,7 +63,8 @@ class Names:
 def names_of(recipe: Recipe) -> Names:
     """Return the parameter names of `recipe` in qgs and in the first layout that fits it.
 
-    Raises PublishedError that lists the components that each layout does not know.
+    Raises PublishedError if no layout fits; the message lists, for each layout, the components that
+    the published codebase does not have.
     """
     reasons = []
     # Use only plugins of this recipe, because others could claim its names.

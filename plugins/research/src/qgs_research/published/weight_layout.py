@@ -31,7 +31,7 @@ def renamed(name: str, ours: str, theirs: str) -> str | None:
 
 @dataclass(frozen=True)
 class WeightLayout:
-    """Parameter names and shapes in the state dicts of one published codebase; see `layout`.
+    """Parameter names and shapes in the state dicts of one published codebase.
 
     name: name of the published model. plugin: qgs plugin with the model's components.
     source: where the weights are published.
@@ -40,8 +40,8 @@ class WeightLayout:
     renames: rules from names in qgs to published names, see `renamed`. The first rule that matches
         is used.
     marks: published names that identify this codebase. Every file of its weights has all of them.
-    unused: rules from a published name to the name of another parameter in the same file, which
-        the published code ignores.
+    unused: rules from the published name of a parameter to the name of a tensor that is stored
+        beside it, but that the published code ignores.
     read: function that takes names and shapes of a state dict and returns a recipe that fits, as a
         plain mapping. It raises LayoutError if none fits.
     undecided: texts about options that names and shapes do not determine, with the published value
@@ -71,7 +71,8 @@ def layout(
 ) -> WeightLayout:
     """Load the layout in `name`.toml.
 
-    read: see `WeightLayout`. base: layout from which missing entries of `renames` are taken.
+    read: function that returns a recipe for the names and shapes of a state dict. base: layout from
+    which missing entries of `renames` are taken.
     """
     text = Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8")
     fields = tomllib.loads(text)

@@ -64,14 +64,15 @@ def study(
         int | None, typer.Option(min=1, help="CPU threads per run. Default: cores / workers.")
     ] = None,
     only: Annotated[
-        int | None, typer.Option(min=0, help="Train only the run with this number, from 0.")
+        int | None, typer.Option(min=0, help="Train only this run; runs are numbered from 0.")
     ] = None,
     device: Device = "auto",
 ) -> None:
     """Train every variant with every seed, evaluate all runs alike, and compare the scores.
 
-    The whole study is checked before training. To continue after a stop, repeat
-    the command. It writes the answer to OUT/table.md and all numbers to OUT/results.json.
+    The whole study is checked before training. To continue after a stop, repeat the command.
+    OUT/table.md gets the answer of the study and tables of the scores; OUT/results.json gets all
+    numbers.
 
         study: 1
         base: tiny/locus.yaml

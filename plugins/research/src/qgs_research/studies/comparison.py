@@ -75,7 +75,8 @@ def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
 def _paired(reference: Runs, runs: Runs) -> Runs:
     """Pair `runs` with runs of `reference`; return `runs` by the seeds of their partners.
 
-    Runs are paired by equal seeds if enough seeds are equal. Otherwise runs are paired in order.
+    Runs are paired by equal seeds if at least two seeds are equal, or one if a side has only one
+    run. Otherwise runs are paired in order.
     """
     # Trainings with equal seeds saw the same data in the same order.
     if len(reference.keys() & runs.keys()) >= min(2, len(reference), len(runs)):
@@ -140,7 +141,7 @@ def _notes(scores: Scores) -> Iterator[str]:
 
 
 def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
-    """Return runs and scenes, by reason, that the difference from the reference leaves out.
+    """Return the runs and scenes that do not count in the difference from the reference, by reason.
 
     name: the model that is compared with the reference.
     """
