@@ -16,7 +16,7 @@ from qgs_photos.image_files import image_files
 
 
 class Llff(PhotoReader):
-    """Reader of LLFF's scenes. The Nth row of the file belongs to the Nth photo by name.
+    """Reader of LLFF's scenes. Row N of `poses_bounds.npy` belongs to the Nth photo by name.
 
     A row has 17 numbers: a (3, 5) matrix, then near and far. Columns of the matrix: the camera's
     axes down, right and back, and its centre, all in world coordinates; the last column is height,

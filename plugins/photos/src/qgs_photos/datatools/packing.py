@@ -211,7 +211,7 @@ def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEnt
 
 @contextmanager
 def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
-    """Open a temporary file that replaces `path` if the block ends without an error.
+    """Open a temporary file that replaces `path` if the `with` block ends without an error.
 
     Missing parent folders are made. On a local disk the replacement is atomic; an object store
     shows an object only when it is complete.

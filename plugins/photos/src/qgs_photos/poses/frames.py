@@ -18,9 +18,9 @@ from qgs_photos.poses.photos import LEAST, PosesError, Show
 # 120 at even steps of time are too few where the camera turns fast: of a walk through an office as
 # a video, 42 of 120 frames got poses, and 143 of the 143 that follow the motion.
 FEWEST, MOST, PER_SECOND = 40, 240, 2.0
-"""Least and largest number of frames to take from a video, and their least number per second."""
+"""Least and largest number of frames to take from a video, and least number for each second."""
 STEP = 0.06
-"""Motion of the picture after which the next frame is taken, as a fraction of its sides."""
+"""Motion after which the next frame is taken, as a fraction of the picture's sides."""
 # Frames of an interval that are compared.
 _JUDGED = 8
 # Longer side in pixels at which sharpness is measured.

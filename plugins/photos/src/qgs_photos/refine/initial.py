@@ -54,9 +54,9 @@ class Initialisation:
 def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisation:
     """Choose between a model and the photos alone as the start; if a model is chosen, run it.
 
-    Without --model, --frames and --scale, at least ENOUGH photos are used alone; with fewer photos,
-    a model is used. Raises ValueError for --frames or --scale with --model none, and if a model is
-    needed but none is installed.
+    Without --model, --frames and --scale, the photos alone are chosen if there are at least ENOUGH
+    of them; with fewer photos, a model is chosen. Raises ValueError for --frames or --scale with
+    --model none, and if a model is needed but none is installed.
     """
     of_model = options.frames is not None or options.scale is not None
     if options.model == NONE and of_model:
