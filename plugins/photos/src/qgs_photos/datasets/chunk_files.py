@@ -59,9 +59,10 @@ class Record:
     """A scene of V frames as stored in a chunk file; the module's docstring gives the formats.
 
     where: names of the file and the scene, for error messages. key: name of the scene. cameras:
-    (V, 18). images, masks: bytes of image files. names: of the frames. sizes: (V, 2), height and
-    width of the images. held_out: indices of frames that training must not use. times: (V,) of the
-    frames. sizes, masks and times are None if the file does not have them.
+    (V, 18). images, masks: bytes of image files. names: names of the frames, or their time stamps
+    if the file has no names. sizes: (V, 2), height and width of the images. held_out: indices of
+    frames that training must not use. times: (V,), times of the frames. sizes, masks and times are
+    None if the file does not have them.
     """
 
     where: str

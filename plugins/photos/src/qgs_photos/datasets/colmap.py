@@ -43,7 +43,7 @@ _PLACES = (
     "dense/sparse",
     "dense/*/sparse",
 )
-_LONGER = "a file has data after its last record: the count of records at its start is wrong"
+_LONGER = "a file has more data than the number of records at its start says"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 

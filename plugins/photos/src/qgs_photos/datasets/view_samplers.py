@@ -40,9 +40,9 @@ class Bounded(ViewSampler):
 
     The gap is the number of frames from the first to the last input; it widens over
     `warm_up_steps`. For two inputs this is pixelSplat's sampler `bounded`; further inputs are
-    sampled between the ends. On camera paths that are no closed loop, pixelSplat
-    replaces the largest gap by the least gap; here only the number of frames limits the gap.
-    Targets may repeat. `views.gap` is used only for evaluation windows around held-out frames.
+    sampled between the ends. On camera paths that are no closed loop, pixelSplat replaces the
+    largest gap by the least gap; here only the number of frames limits the gap. Targets may repeat.
+    `views.gap` is used only for evaluation windows around held-out frames.
     """
 
     name = "bounded"
@@ -79,10 +79,10 @@ class Bounded(ViewSampler):
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
     ) -> tuple[Frames, Frames]:
-        """Return random input frames, in ascending order, and target frames between them.
+        """Return random input frames, in ascending order, and target frames from the gap.
 
-        step: number of optimiser steps before the sample is used, on which the gap depends. Raises
-        ValueError for a scene with too few frames.
+        step: number of optimiser steps before the sample is used, on which the gap depends; END in
+        evaluation. Raises ValueError for a scene with too few frames.
         """
         span = self.span(scene, views, rng, step)
         between = rng.choice(range(1, len(span) - 1), views.inputs - 2, replace=False)
@@ -97,8 +97,8 @@ class Bounded(ViewSampler):
         """Return the frames in a random gap of the video, as one tuple of frames for each time.
 
         A tuple has several frames if several cameras took photos at that time. parts: number by
-        which the bounds of the gap are divided. Raises ValueError for a scene with
-        too few frames.
+        which the bounds of the gap are divided. Raises ValueError for a scene with too few
+        frames.
         """
         refuse_too_many(views.inputs + views.targets, scene)
         options = self.options(step)
@@ -221,8 +221,8 @@ class Overlapping(ViewSampler):
     The inputs are those that `qgs demo` would choose for the random photo. Their baselines are .06
     to .25 of the scene's depth, times a random factor, log-uniform between the bounds of `apart`.
     Targets are the random photo and the photos nearest to it. In evaluation the factor is 1, and
-    each held-out photo is a target; a scene without held-out photos has four targets. For
-    a scene that moves, training is refused, and evaluation uses windows in the order of time whose
+    each held-out photo is a target; a scene without held-out photos has four targets. For a
+    scene that moves, training is refused, and evaluation uses windows in the order of time whose
     length is given by `views.gap`.
     """
 

@@ -102,9 +102,8 @@ class SceneReport:
     missing: number of listed photos whose file does not exist. numbered: number of photos that are
     loaded as frames. pose_problems: number of frames with a wrong pose. epipolar: median distance,
     in pixels, of matched points from their epipolar lines, as text; "-" if no photos were matched,
-    "not checked" if the matches do not allow a measurement. depth: median
-    distance from the cameras to the point that they look at, in scene units; 0 if they have no
-    common point.
+    "not checked" if the matches do not allow a measurement. depth: median distance from the cameras
+    to the point that they look at, in scene units; 0 if they have no common point.
     """
 
     name: str

@@ -43,7 +43,7 @@ class Names:
     def from_published(
         self, weights: Mapping[str, Tensor], origin: object = "the file"
     ) -> dict[str, Tensor]:
-        """Rename the tensors of a published state dict to their names in qgs; leave out `unused`.
+        """Rename published tensors to their names in qgs; leave out the tensors in `unused`.
 
         origin: name of the published file, for the error message. Raises PublishedError that lists
         all differences in names and shapes.

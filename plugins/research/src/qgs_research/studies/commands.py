@@ -64,7 +64,7 @@ def study(
         int | None, typer.Option(min=1, help="CPU threads per run. Default: cores / workers.")
     ] = None,
     only: Annotated[
-        int | None, typer.Option(min=0, help="Train only this run; runs are numbered from 0.")
+        int | None, typer.Option(min=0, help="Train only this run, counted from 0. Default: all.")
     ] = None,
     device: Device = "auto",
 ) -> None:
