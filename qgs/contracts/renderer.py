@@ -95,8 +95,11 @@ class Renderer(Component, torch.nn.Module):
         """
 
 
-def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
-    """Raise ValueError unless Gaussians (B, G) and cameras (B, V) match in shape and device."""
+def prepared(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+    """Return Gaussians and cameras in float64 if the means are float64, else in float32.
+
+    Raises ValueError unless Gaussians (B, G) and cameras (B, V) match in shape and device.
+    """
     means = gaussians.means
     check_shapes(gaussians, means="B G 3")
     check_shapes(cameras, c2w="B V 4 4")
@@ -111,12 +114,8 @@ def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
             f"Gaussians are on {means.device}, cameras on {cameras.c2w.device}; "
             "move one with .to(device)"
         )
-
-
-def raise_precision(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """Return Gaussians and cameras in float64 if the means are float64, else in float32."""
     # Half precision would move the projection of a Gaussian by pixels.
-    dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
+    dtype = torch.promote_types(means.dtype, torch.float32)
     return gaussians.to(dtype), cameras.to(dtype)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.renderer import background_of, channels_of, check_inputs, raise_precision
+from qgs.contracts.renderer import background_of, channels_of, prepared
 from qgs.machine import in_threads
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering, Size
@@ -38,7 +38,7 @@ class CpuRenderer(Renderer):
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
         """Render every scene from each of its cameras; raise ValueError for tensors off the CPU."""
-        check_inputs(gaussians, cameras)
+        gaussians, cameras = prepared(gaussians, cameras)
         if gaussians.means.device.type != "cpu":
             raise ValueError(
                 f"qgs/cpu renders CPU tensors, got Gaussians on {gaussians.means.device}; move "
@@ -47,7 +47,6 @@ class CpuRenderer(Renderer):
         config = self.config
         # Half precision has no digits for pixels.
         with torch.autocast("cpu", enabled=False):
-            gaussians, cameras = raise_precision(gaussians, cameras)
             channels = channels_of(gaussians, cameras)
             count = channels.shape[-1]
             given = (

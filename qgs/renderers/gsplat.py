@@ -10,7 +10,7 @@ from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
 from qgs.contracts.component import MissingExtraError
-from qgs.contracts.renderer import background_of, channels_of, check_inputs, raise_precision
+from qgs.contracts.renderer import background_of, channels_of, prepared
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -43,7 +43,7 @@ class GsplatRenderer(Renderer):
 
         Raises ValueError for tensors that are not on CUDA, and RuntimeError if gsplat is missing.
         """
-        check_inputs(gaussians, cameras)
+        gaussians, cameras = prepared(gaussians, cameras)
         _check_supported(gaussians, cameras)
         # gsplat's kernels divide by their number.
         if not gaussians.means.shape[1]:
@@ -52,7 +52,6 @@ class GsplatRenderer(Renderer):
         rasterization = import_module("gsplat").rasterization
 
         with torch.autocast("cuda", enabled=False):
-            gaussians, cameras = raise_precision(gaussians, cameras)
             backdrop = background_of(background, self.config.background, gaussians.means)
             channels = channels_of(gaussians, cameras)
             # Features are over 0.

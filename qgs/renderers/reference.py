@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.renderer import background_of, channels_of, check_inputs, raise_precision
+from qgs.contracts.renderer import background_of, channels_of, prepared
 from qgs.geometry.constants import constant
 from qgs.geometry.transforms import quat_to_matrix, to_camera, to_pixels
 from qgs.types import Cameras, Gaussians, Rendering, Size
@@ -95,10 +95,9 @@ class TorchRenderer(Renderer):
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
         """Render every scene from each of its cameras; half-precision inputs become float32."""
-        check_inputs(gaussians, cameras)
+        gaussians, cameras = prepared(gaussians, cameras)
         config = self.config
         with torch.autocast(gaussians.means.device.type, enabled=False):
-            gaussians, cameras = raise_precision(gaussians, cameras)
             means, conics, depths, visible = project(
                 gaussians, cameras, config.near, config.far, config.dilation
             )
