@@ -94,6 +94,20 @@ class Renderer(Component, torch.nn.Module):
         cameras that require a gradient not listed in `camera_gradients`.
         """
 
+    def backdrop(self, background: Tensor | None, like: Tensor) -> Tensor:
+        """Return `background` as RGB (3,) in dtype and device of `like`.
+
+        None stands for the option `background`.
+        """
+        if background is None:
+            # A tensor of Python numbers would make the GPU wait for a copy.
+            return constant(self.config.background, like)
+        if background.shape != (3,):
+            raise ValueError(
+                f"background must be one RGB colour of shape (3,), got {tuple(background.shape)}"
+            )
+        return background.to(like)
+
 
 def prepared(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
     """Return Gaussians and cameras in float64 if the means are float64, else in float32.
@@ -130,17 +144,3 @@ def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
         return colors
     features = gaussians.features[:, None].expand(*colors.shape[:-1], -1)
     return torch.cat([colors, features], -1)
-
-
-def background_of(
-    background: Tensor | None, configured: tuple[float, float, float], like: Tensor
-) -> Tensor:
-    """Return `background` as RGB (3,), or `configured` if None, in dtype and device of `like`."""
-    if background is None:
-        # A tensor of Python numbers would make the GPU wait for a copy.
-        return constant(configured, like)
-    if background.shape != (3,):
-        raise ValueError(
-            f"background must be one RGB colour of shape (3,), got {tuple(background.shape)}"
-        )
-    return background.to(like)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.renderer import background_of, channels_of, prepared
+from qgs.contracts.renderer import channels_of, prepared
 from qgs.machine import in_threads
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering, Size
@@ -61,7 +61,7 @@ class CpuRenderer(Renderer):
             ]
             blended = torch.cat([part[:, :, :3] for part in parts], 2)[:, :, :count]
             sums = torch.cat([blended, parts[0][:, :, 3:]], 2)
-            backdrop = background_of(background, config.background, gaussians.means)
+            backdrop = self.backdrop(background, gaussians.means)
             return resolve(sums.to(gaussians.means.dtype), backdrop)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
 from qgs.contracts.component import MissingExtraError
-from qgs.contracts.renderer import background_of, channels_of, prepared
+from qgs.contracts.renderer import channels_of, prepared
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -52,7 +52,7 @@ class GsplatRenderer(Renderer):
         rasterization = import_module("gsplat").rasterization
 
         with torch.autocast("cuda", enabled=False):
-            backdrop = background_of(background, self.config.background, gaussians.means)
+            backdrop = self.backdrop(background, gaussians.means)
             channels = channels_of(gaussians, cameras)
             # Features are over 0.
             backdrop = F.pad(backdrop, (0, channels.shape[-1] - 3))

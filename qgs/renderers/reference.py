@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.renderer import background_of, channels_of, prepared
+from qgs.contracts.renderer import channels_of, prepared
 from qgs.geometry.constants import constant
 from qgs.geometry.transforms import quat_to_matrix, to_camera, to_pixels
 from qgs.types import Cameras, Gaussians, Rendering, Size
@@ -117,7 +117,7 @@ class TorchRenderer(Renderer):
                 )
                 summed = torch.cat([channels[image][order], z, torch.ones_like(z)], 1)
                 sums.append(torch.einsum("ghw,gc->chw", weights, summed))
-            backdrop = background_of(background, config.background, gaussians.means)
+            backdrop = self.backdrop(background, gaussians.means)
             return resolve(torch.stack(sums).unflatten(0, cameras.shape), backdrop)
 
 
