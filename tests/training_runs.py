@@ -90,9 +90,10 @@ def assert_equal_runs(first, second):
     assert one == other
 
 
-def batches(recipe, count, size, **options):
+def batches(recipe, count, size, skips=False, **options):
     """The first training batches."""
-    with closing(training_batches(recipe.build_data(), recipe.views, size, 0, **options)) as stream:
+    samples = SampleStream(recipe.build_data(), recipe.views, 0, skips)
+    with closing(training_batches(samples, size, **options)) as stream:
         return list(islice(stream, count))
 
 

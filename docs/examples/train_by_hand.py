@@ -18,7 +18,7 @@ from torch import Tensor
 import qgs
 from qgs.contracts import Loss
 from qgs.data.samples import Batch
-from qgs.data.stream import training_batches
+from qgs.data.stream import SampleStream, training_batches
 from qgs.recipe import Recipe, resolve
 
 
@@ -44,14 +44,14 @@ def train(recipe: Recipe, steps: int) -> qgs.QueryGaussianModel:
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3, betas=(0.9, 0.95))
     warmup = torch.optim.lr_scheduler.LinearLR(optimizer, 0.01, total_iters=20)
     # Batches are endless; batch k depends on the seed and k alone.
-    batches = training_batches(
+    samples = SampleStream(
         recipe.build_data(),
         recipe.views,
-        batch_size=2,
-        seed=recipe.seed,
+        recipe.seed,
         sampler=recipe.build_view_sampler(),
         depths=any(loss.reads_depths for loss in losses.values()),
     )
+    batches = training_batches(samples, batch_size=2)
     for step, batch in enumerate(islice(batches, steps)):
         loss = loss_of(model, losses, batch)
         optimizer.zero_grad()

@@ -43,53 +43,38 @@ class WorkerError(ChildProcessError):
 
 
 def training_batches(
-    source: SceneSource,
-    views: ViewsConfig,
+    stream: "SampleStream",
     batch_size: int,
-    seed: int,
     start: int = 0,
     *,
     rank: int = 0,
     processes: int = 1,
     workers: int = 0,
-    skips: bool = False,
-    sampler: ViewSampler | None = None,
-    accumulate: int = 1,
-    depths: bool = False,
 ) -> Generator[Batch, None, None]:
     """Return an endless generator of training batches, each with `batch_size` samples.
 
-    Samples are numbered, and sample k depends only on (seed, k). Batch n consists of the samples
-    from n * batch_size * processes on, split among the training processes by `rank`. The samples
-    therefore do not depend on the number of processes or workers. start: number n of the first
-    batch, to resume a run exactly.
+    Batch n consists of the samples of `stream` from n * batch_size * processes on, split among the
+    training processes by `rank`. The samples therefore do not depend on the number of processes or
+    workers. start: number n of the first batch, to resume a run exactly.
 
     workers: number of processes that decode; they end when the generator is closed. 0 decodes in a
-        thread. skips, sampler, depths: see `SampleStream`. accumulate: batches per optimiser step.
-    Raises ValueError if there are no training scenes or too few frames, SampleError for a sample
-    that fails, and WorkerError for a process that ends suddenly.
+        thread.
+    Raises ValueError if there are too few frames, SampleError for a sample that fails, and
+    WorkerError for a process that ends suddenly.
     """
     every = batch_size * processes
-    stream = SampleStream(source, views, seed, skips, sampler, every * accumulate, depths)
     firsts = count(start * every + rank * batch_size, every)
     numbers = (range(first, first + batch_size) for first in firsts)
     return _from_workers(stream, numbers, workers) if workers else _from_thread(stream, numbers)
 
 
-def trained_domain(
-    source: SceneSource,
-    views: ViewsConfig,
-    seed: int,
-    sampler: ViewSampler,
-    steps: int,
-) -> Domain:
+def trained_domain(stream: "SampleStream", steps: int) -> Domain:
     """Measure the cameras of the first MEASURED training samples, without decoding images.
 
-    Options of `sampler` may follow a schedule. So the samples are chosen as at optimiser steps
-    spread evenly from 0 to `steps`, the length of training. Scenes that fail are left out here;
-    training itself reports them.
+    Options of the view sampler may follow a schedule. So the samples are chosen as at optimiser
+    steps spread evenly from 0 to `steps`, the length of training. Scenes that fail are left out
+    here; training itself reports them.
     """
-    stream = SampleStream(source, views, seed, sampler=sampler)
     domain = Domain()
     for number in range(MEASURED):
         # A reader may raise any kind of error.

@@ -20,6 +20,7 @@ from qgs.contracts.schedule import follow
 from qgs.data.samples import Batch
 from qgs.data.stream import (
     SampleError,
+    SampleStream,
     scenes_fingerprint,
     trained_domain,
     training_batches,
@@ -140,12 +141,21 @@ class Trainer:
                 saved = saved_state(self.folder, recipe)
             self._build_model(initial=not saved)
             source = recipe.build_data()
-            self._build_watchers(source)
+            samples = SampleStream(
+                source,
+                recipe.views,
+                recipe.seed,
+                self.config.on_bad_sample == "skip",
+                recipe.build_view_sampler(),
+                self.config.batch_size,
+                self.training_pass.reads_depths,
+            )
+            self._build_watchers(source, samples)
             if saved:
                 self.saver.restore(saved)
             self.resumed_at = self.counters.step if saved else None
             self._follow_schedules()
-            self._stream = self._open_data(source)
+            self._stream = self._open_data(samples)
             resources.callback(self._stream.close)
             self._no_batches: Exception | None = None
             self._fetch()
@@ -179,15 +189,12 @@ class Trainer:
         self._gradients = partial(compute_gradients, self.accelerator, wrapped, self.config)
         self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
 
-    def _build_watchers(self, source: SceneSource) -> None:
+    def _build_watchers(self, source: SceneSource, samples: SampleStream) -> None:
         """Build the counters, the guard and the saver; check the metrics before training."""
         recipe = self.recipe
         # Only the main process writes checkpoints, which carry the range of the training views.
         if self.accelerator.is_main_process:
-            sampler = recipe.build_view_sampler()
-            self.model.trained_on = trained_domain(
-                source, recipe.views, recipe.seed, sampler, self.config.steps
-            )
+            self.model.trained_on = trained_domain(samples, self.config.steps)
         self.counters = Counters(self.config, scenes_fingerprint(source))
         self.saver = Saver(self.folder, self.model)
         self.guard = Guard(self.training_pass, self.saver, self.config, self._gradients)
@@ -207,23 +214,17 @@ class Trainer:
         stateful["random"] = RandomStates()
         self.saver.stateful = stateful
 
-    def _open_data(self, source: SceneSource) -> Generator[Batch, None, None]:
+    def _open_data(self, samples: SampleStream) -> Generator[Batch, None, None]:
         """Return an iterator of batches, from the first batch that the run has not used yet."""
         processes = self.accelerator.num_processes
         return training_batches(
-            source,
-            self.recipe.views,
+            samples,
             self.config.scenes_per_batch(processes),
-            self.recipe.seed,
             # A step that accumulates takes several batches.
             start=self.counters.step * self.config.accumulate,
             rank=self.accelerator.process_index,
             processes=processes,
             workers=self.config.workers,
-            skips=self.config.on_bad_sample == "skip",
-            sampler=self.recipe.build_view_sampler(),
-            accumulate=self.config.accumulate,
-            depths=self.training_pass.reads_depths,
         )
 
     def _fetch(self) -> None:

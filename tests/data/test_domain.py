@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from line_scenes import DOWN, SPAN, samples_of
+from line_scenes import DOWN, samples_of
 from training_runs import resume, run, tiny
 from walk import pinhole
 
 from qgs.checkpoint.model_file import CheckpointFile, save
 from qgs.checkpoint.tensors import CheckpointError
 from qgs.data import stream
-from qgs.data.stream import trained_domain
+from qgs.data.stream import SampleStream, trained_domain
 from qgs.domain import KEY, Domain, verdict
 from qgs.geometry.poses import look_at
 from qgs.recipe import resolve
@@ -109,7 +109,9 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
     recipe = resolve(f"recipes/tiny/{name}.yaml", options)
     source = recipe.build_data()
     sampler = recipe.build_view_sampler()
-    trained = trained_domain(source, recipe.views, recipe.seed, sampler, recipe.training.steps)
+    trained = trained_domain(
+        SampleStream(source, recipe.views, recipe.seed, sampler=sampler), recipe.training.steps
+    )
     test = Domain()
     for sample in samples_of(source, recipe.views, recipe.evaluation, sampler):
         test.see(sample.inputs.cameras, sample.targets.cameras)
@@ -119,13 +121,13 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
 def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch):
     source = recipe().build_data()
     monkeypatch.setattr(type(source.scenes("train")[0]), "cameras", None)
-    assert trained_domain(source, recipe().views, 0, SPAN, 0).samples == 0
+    assert trained_domain(SampleStream(source, recipe().views, 0), 0).samples == 0
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(tmp_path):
     two = recipe("training.steps=2")
-    sampler = two.build_view_sampler()
-    expected = trained_domain(two.build_data(), two.views, two.seed, sampler, 2).ranges
+    samples = SampleStream(two.build_data(), two.views, two.seed, sampler=two.build_view_sampler())
+    expected = trained_domain(samples, 2).ranges
     file = run(recipe("training.steps=1"), tmp_path).folder.checkpoint
     assert CheckpointFile(file).domain.ranges == expected
     file.write_bytes(file.read_bytes()[:1000])

@@ -12,7 +12,7 @@ from training_runs import batches, same
 
 from qgs.containers import named_tensors
 from qgs.contracts import ViewsConfig
-from qgs.data.stream import SampleError, scenes_fingerprint, training_batches
+from qgs.data.stream import SampleError, SampleStream, scenes_fingerprint, training_batches
 from qgs.recipe import resolve
 
 ROOMS = resolve(
@@ -41,16 +41,15 @@ def test_running_out_of_memory_is_no_bad_sample(tmp_path, monkeypatch):
 
     monkeypatch.setattr("qgs.data.images.eight_bits", full)
     with pytest.raises(MemoryError):
-        batches(photos(tmp_path / "shelf"), 1, 2, skips=True)
+        batches(photos(tmp_path / "shelf"), 1, 2, True)
 
 
 def test_worker_processes_change_nothing_and_end_with_an_error_that_names_the_file(tmp_path):
     recipe = photos(tmp_path / "shelf")
 
     def until_broken(start, workers):
-        stream = training_batches(
-            recipe.build_data(), recipe.views, 1, 3, start=start, workers=workers
-        )
+        samples = SampleStream(recipe.build_data(), recipe.views, 3)
+        stream = training_batches(samples, 1, start, workers=workers)
         found = []
 
         def follow():
@@ -116,7 +115,8 @@ class Grouped(Lines):
 def test_groups_are_visited_one_after_another_in_changing_orders():
     groups = [range(3), range(3, 6), [8, 6, 7]]
     source = Grouped(9, groups)
-    stream = training_batches(source, ViewsConfig(inputs=2, targets=1, gap=(1, 3)), 9, seed=0)
+    samples = SampleStream(source, ViewsConfig(inputs=2, targets=1, gap=(1, 3)), 0)
+    stream = training_batches(samples, 9)
     epochs = [[int(name) for name in next(stream).scenes] for _ in range(20)]
     for epoch in epochs:
         parts = [frozenset(epoch[i : i + 3]) for i in (0, 3, 6)]

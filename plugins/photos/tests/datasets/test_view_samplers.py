@@ -10,7 +10,7 @@ from tables import must_refuse
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.stream import trained_domain, training_batches
+from qgs.data.stream import SampleStream, trained_domain, training_batches
 from qgs.recipe import RecipeError, resolve
 from qgs.types import Cameras
 
@@ -64,8 +64,8 @@ def opened(*options):
 
 def batches(recipe, source, sampler, start, count):
     """Two samples a batch, two batches a step."""
-    stream = training_batches(source, recipe.views, 2, 0, start, sampler=sampler, accumulate=2)
-    return [*islice(stream, count)]
+    samples = SampleStream(source, recipe.views, 0, sampler=sampler, per_step=4)
+    return [*islice(training_batches(samples, 2, start), count)]
 
 
 def test_a_training_widens_the_gap_and_resumes_where_it_was():
@@ -144,7 +144,8 @@ def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
     recipe, source, drawn = parts
     counts = [batch.inputs.images.shape[1] for batch in batches(*parts, 0, 8)]
     assert counts == [2, 2, 3, 3, 4, 4, 2, 2]
-    assert trained_domain(source, recipe.views, 0, drawn, steps=600).ranges["views"] == (2, 4)
+    samples = SampleStream(source, recipe.views, 0, sampler=drawn)
+    assert trained_domain(samples, steps=600).ranges["views"] == (2, 4)
 
 
 DEPTH = 10.0
