@@ -55,8 +55,8 @@ def compare_models(
         options = ["--size", size] if size else []
         options += ["--scale", f"{scale:g}"] if scale else []
         commands = next_commands(names, opened, target, photos, options)
-    trained = "; ".join(f"{model.name}: step {model.step or 'not known'}" for model in opened)
-    facts = {"Training": trained}
+    trained = "; ".join(f"{model.name}: {model.step or 'not known'}" for model in opened)
+    facts = {"Steps of the last training run": trained}
     write_report(Comparison(opened, facts, commands, scenes, warnings), target, console)
 
 
