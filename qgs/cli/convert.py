@@ -8,7 +8,7 @@ import typer
 
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="IN", help="File of Gaussians: 3DGS's PLY, or .splat.")
+        Path, typer.Argument(metavar="IN", help="File of Gaussians: PLY, .spz or .splat.")
     ],
     out: Annotated[
         Path,
@@ -21,7 +21,7 @@ def convert(
         typer.Option(min=1, help="Number of Gaussians to keep: the most opaque. Default: all."),
     ] = None,
 ) -> None:
-    """Convert a PLY or .splat file of Gaussians to PLY, .splat or a plug-in's format.
+    """Convert a file of Gaussians (PLY, .spz or .splat) to PLY, .splat or a plug-in's format.
 
     --count keeps only the most opaque Gaussians.
     """

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from qgs.containers import map_tensors, named_tensors
 from qgs.extensions import imported, installed
 from qgs.files import replacing
 from qgs.geometry.harmonics import SH_C0
-from qgs.geometry.transforms import narrowed
+from qgs.geometry.transforms import moved, narrowed
 from qgs.types import SH_COUNTS, Gaussians
 from qgs.wording import listed, one_line, warn_once
 
@@ -123,7 +124,7 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Return the Gaussians (1, G) of a file: a PLY in the layout of the 3DGS release, or a .splat.
+    """Return the Gaussians (1, G) of a file: a PLY of the 3DGS release or SuperSplat, .spz, .splat.
 
     They are in the world of the file. Gaussians that are not finite are left out, with a warning.
     The 3D filter of Mip-Splatting is applied. `sh` has all degrees up to the last that is not all
@@ -134,13 +135,14 @@ def load_ply(path: str | Path) -> Gaussians:
     if not path.is_file():
         raise FileNotFoundError(f"no file at {path}")
     try:
-        scene = (_of_splat if path.suffix.lower() == ".splat" else _of_ply)(path)
+        read = {".splat": _of_splat, ".spz": _of_packed}.get(path.suffix.lower(), _of_ply)
+        scene = read(path)
     # Readers raise anything of a damaged file.
     except Exception as error:
         raise ValueError(
-            f"{path} cannot be read as Gaussians ({one_line(error)}): copy it again if it is a PLY "
-            "or .splat; compressed PLY, .spz, .sog and others become a PLY by "
-            "`npx @playcanvas/splat-transform IN OUT.ply`"
+            f"{path} cannot be read as Gaussians ({one_line(error)}): copy it again if it is a PLY, "
+            ".spz or .splat; .sog and others become a PLY by `npx @playcanvas/splat-transform IN "
+            "OUT.ply`"
         ) from error
     # In float64 norms are finite; a quaternion of 0 becomes NaN, which is left out.
     quats = scene.quats.double()
@@ -169,6 +171,19 @@ def _of_splat(path: Path) -> Gaussians:
     return Gaussians(means, scales, quats - 128, rgba[:, 3] / 255, rgba[:, :3] / 255)
 
 
+def _of_packed(path: Path) -> Gaussians:
+    """Read an .spz, or a compressed PLY of SuperSplat."""
+    from gsply import plyread, read_spz
+
+    is_spz = path.suffix.lower() == ".spz"
+    with TemporaryDirectory() as folder:
+        plain = Path(folder, "plain.ply")
+        (read_spz if is_spz else plyread)(path).save(plain)
+        scene = _of_ply(plain)
+    # The axes of .spz are right, up, back.
+    return moved(scene, torch.tensor([1.0, -1, -1, 1]).diag(), 1.0) if is_spz else scene
+
+
 def _of_ply(path: Path) -> Gaussians:
     with path.open("rb") as file:
         header, end, _ = file.read(_HEADER).partition(b"end_header")
@@ -180,6 +195,8 @@ def _of_ply(path: Path) -> Gaussians:
             "elements than the file can hold"
         )
     elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
+    if "chunk" in elements:
+        return _of_packed(path)
     vertices = elements["vertex"]
     names = vertices.dtype.names or ()
     count = sum(name.startswith("f_rest_") for name in names)

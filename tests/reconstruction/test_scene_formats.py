@@ -3,6 +3,7 @@
 import os
 from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from torch.testing import assert_close
 import qgs
 from qgs.containers import named_tensors
 from qgs.extensions import ExtensionError
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.reconstruction.scene_formats import PROPERTIES, load_ply, save_gaussians, save_ply
 from qgs.types import Gaussians
 
@@ -132,13 +134,25 @@ def test_files_of_others_are_understood(tmp_path, caplog):
     assert np.abs(vertices_of(path)["y"]).max() < 20
 
 
-def test_compressed_files_are_named_with_their_converter(tmp_path):
-    chunk = np.zeros(1, [("min_x", "<f4")])
-    packed = ply(chunk=chunk, vertex=chunk.repeat(256))
-    for name, content in (("a.ply", packed), ("4.spz", b"NGSP\4\0\0\0\5\0\0\0")):
-        path = tmp_path / name
-        path.write_bytes(content)
-        must_refuse("splat-transform", load_ply, path)
+def test_packed_files_of_other_programs_are_read():
+    """PlayCanvas' splat-transform wrote the same Gaussians, each time in another order."""
+    folder = Path(__file__).parent / "packed"
+    expected = load_ply(folder / "scene.splat")[0]
+
+    def covariances(gaussians):
+        axes = quat_to_matrix(gaussians.quats) * gaussians.scales[:, None]
+        return axes @ axes.mT
+
+    harmonics = []
+    for name in ("scene.spz", "scene.compressed.ply"):
+        found = load_ply(folder / name)[0]
+        found = found[torch.cdist(expected.means, found.means).argmin(1)]
+        for part in ("means", "opacities", "colors"):
+            assert_close(getattr(found, part), getattr(expected, part), atol=0.01, rtol=0)
+        assert_close(covariances(found), covariances(expected), atol=4e-3, rtol=0)
+        harmonics.append(found.sh)
+    assert_close(*harmonics, atol=0.02, rtol=0)
+    assert harmonics[0].shape == (60, 15, 3)
 
 
 def test_files_of_fewer_degrees_are_read(tmp_path):

@@ -48,8 +48,8 @@ class FigureName(StrEnum):
 SourceName = Annotated[
     str,
     typer.Argument(
-        help="What to show: a run folder, a checkpoint, a shipped model (PLUGIN/NAME), a .ply or "
-        ".splat file, or a folder that qgs reconstruct wrote."
+        help="What to show: a run folder, a checkpoint, a shipped model (PLUGIN/NAME), a .ply, "
+        ".spz or .splat file, or a folder that qgs reconstruct wrote."
     ),
 ]
 ModelPhotos = Annotated[
