@@ -202,12 +202,14 @@ def _focal(values: _Values, axis: str, side: int | None) -> float | None:
 
 def _lens(values: _Values) -> Lens | None:
     fisheye = values.get("is_fisheye")
-    model = "OPENCV_FISHEYE" if fisheye else values.get("camera_model", "PINHOLE")
+    # No name is longer.
+    given = str(values.get("camera_model", "PINHOLE"))[:99]
+    model = "OPENCV_FISHEYE" if fisheye else given
     # An ignored coefficient would shift pixels against the poses without an error.
     found = {key: number for key in _COEFFICIENTS if (number := values.number(key))}
     if model in PINHOLE and not found:
         return None
-    lenses = (reader.lens(str(model), found) for reader in installed_readers().values())
+    lenses = (reader.lens(model, found) for reader in installed_readers().values())
     if (lens := next(filter(None, lenses), None)) is None:
         values.problem(
             f"no installed format knows the lens of camera model {model!r} with {found}",

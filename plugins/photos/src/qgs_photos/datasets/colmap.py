@@ -223,7 +223,7 @@ def _binary_images(model: UPath) -> Iterator[Image]:
             _, *pose, camera = _unpacked("<I7dI", file)
             name = b"".join(iter(lambda: _unpacked("<c", file)[0], b"\0")).decode("utf-8")
             if points := _unpacked("<Q", file)[0]:  # skipped unread: they are most of the file
-                file.seek(_BYTES_OF_A_POINT * min(points, 2**50) - 1, 1)
+                file.seek(_BYTES_OF_A_POINT * min(points, 2**32) - 1, 1)
                 _unpacked("<c", file)
             yield name, pose, camera
         if file.read(1):

@@ -60,11 +60,15 @@ def _with_exchanged_masks(photos: Sequence[Decoded]) -> list[int]:
 
     A mask fits a photo if its border runs along edges of the photo.
     """
-    edges = np.stack([photo.edges.flatten() for photo in photos])
-    borders = np.stack([photo.border.flatten() for photo in photos])
+    masked = [frame for frame, photo in enumerate(photos) if photo.edges is not None]
+    if not masked:
+        return []
+    both = np.stack([photos[frame].edges for frame in masked])
+    edges, borders = both.reshape(len(masked), 2, -1).swapaxes(0, 1)
+    borders = borders > 0
     fits = edges @ borders.T / borders.sum(1).clip(1)
     better = fits > _BETTER * fits.diagonal()[:, None]
-    return np.flatnonzero((better & better.T).any(0)).tolist()
+    return [masked[place] for place in np.flatnonzero((better & better.T).any(0))]
 
 
 def pose_findings(scene: DecodedScene) -> Iterator[Finding]:

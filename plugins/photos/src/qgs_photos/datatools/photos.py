@@ -5,7 +5,7 @@ import io
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from PIL import Image
@@ -23,7 +23,6 @@ _SMALLEST = (8, 8)
 _BLACK = 4
 # Size at which the edges of photos and masks are compared.
 _SQUARE = (64, 64)
-_flat = partial(np.zeros, _SQUARE)
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,8 @@ class Decoded:
 
     size: (H, W); None if it cannot be decoded. digest: hash of the file's bytes, by which equal
     photos are found. errors, warnings: pairs of reason and remedy. empty_mask: whether the mask
-    leaves out the whole photo; None without a mask. edges: strength of the photo's edges, at
-    _SQUARE. border: border of what the mask keeps, 0 or 1, at _SQUARE; all zeros without a mask.
+    leaves out the whole photo; None without a mask. edges: strengths of the edges of the photo and
+    of its mask, 2 arrays of _SQUARE; None without a mask.
     """
 
     size: Size | None = None
@@ -88,8 +87,7 @@ class Decoded:
     errors: Sequence[tuple[str, str]] = ()
     warnings: Sequence[tuple[str, str]] = ()
     empty_mask: bool | None = None
-    edges: np.ndarray = field(default_factory=_flat)
-    border: np.ndarray = field(default_factory=_flat)
+    edges: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -155,7 +153,6 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
             image.load()
             pixels = eight_bits(image)
             black = _is_black(pixels)
-            edges = _edges(pixels.convert("L"))
             # EXIF may stand behind the pixels
             by_exif = orientation(image) != 1 and not photo.listed.turns
     except Exception as error:
@@ -164,7 +161,7 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
         return Decoded(errors=[(reason, "replace it, or remove its frame")])
     errors = [("the image is black", "replace it, or remove its frame")] if black else []
     empty: bool | None = None
-    border = _flat()
+    edges: np.ndarray | None = None
     for kind, read in photo.maps.items():
         try:
             found = read()
@@ -174,17 +171,18 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
             reasons = [f"the {kind}: {problem.reason}" for problem in size_problems(own, size)]
             if kind == "mask":
                 empty = not found.any()
-                border = np.sign(_edges(Image.fromarray(found > found.max() / 2)))
+                kept = Image.fromarray(found > found.max() / 2)
+                edges = np.stack([_edges(pixels.convert("L")), _edges(kept)])
         except Exception as error:
             reasons = [error_text(error)]
         errors += [(reason, f"replace the {kind}") for reason in reasons]
     turns = [(f"photos {TURNED}", TURN)] if by_exif else []
-    return Decoded(size, digest, errors, turns, empty, edges, border)
+    return Decoded(size, digest, errors, turns, empty, edges)
 
 
 def _edges(image: Image.Image) -> np.ndarray:
     """Return the lengths of the image's gradients at _SQUARE."""
-    x, y = np.gradient(np.array(image.resize(_SQUARE), float))
+    x, y = np.gradient(np.array(image.resize(_SQUARE), np.float32))
     return np.hypot(x, y)
 
 
