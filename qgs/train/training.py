@@ -3,7 +3,7 @@
 import logging
 import math
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
@@ -155,7 +155,17 @@ class Trainer:
                 self.saver.restore(saved)
             self.resumed_at = self.counters.step if saved else None
             self._follow_schedules()
-            self._stream = self._open_data(samples)
+            processes = self.accelerator.num_processes
+            self._stream = training_batches(
+                samples,
+                self.config.scenes_per_batch(processes),
+                # From the first batch that the run has not used yet; a step that accumulates takes
+                # several batches.
+                start=self.counters.step * self.config.accumulate,
+                rank=self.accelerator.process_index,
+                processes=processes,
+                workers=self.config.workers,
+            )
             resources.callback(self._stream.close)
             self._no_batches: Exception | None = None
             self._fetch()
@@ -213,19 +223,6 @@ class Trainer:
         # Last: restoring something may draw random numbers.
         stateful["random"] = RandomStates()
         self.saver.stateful = stateful
-
-    def _open_data(self, samples: SampleStream) -> Generator[Batch, None, None]:
-        """Return an iterator of batches, from the first batch that the run has not used yet."""
-        processes = self.accelerator.num_processes
-        return training_batches(
-            samples,
-            self.config.scenes_per_batch(processes),
-            # A step that accumulates takes several batches.
-            start=self.counters.step * self.config.accumulate,
-            rank=self.accelerator.process_index,
-            processes=processes,
-            workers=self.config.workers,
-        )
 
     def _fetch(self) -> None:
         """Load the batches of the next step, or store the error for `_refuse_missing_batches`.
