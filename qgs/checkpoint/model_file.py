@@ -16,6 +16,7 @@ from qgs.checkpoint.tensors import (
     CheckpointError,
     TensorFile,
     Weights,
+    copied,
     differing_tensors,
     differing_types,
     nonfinite,
@@ -178,10 +179,7 @@ def save(
             "this model was built by hand and has no recipe to save; build it with qgs.compose"
         )
     # Copied, since safetensors refuses tensors that share memory or are strided.
-    tensors = {
-        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
-        for name, tensor in (weights or unique_tensors(model)).items()
-    }
+    tensors = copied(weights or unique_tensors(model))
     step = steps_followed(model.modules())
     followed = {} if step in (None, END) else {"step": str(step)}
     write_checkpoint(path, tensors, model.recipe, model.releases, followed | dict(extra or {}))

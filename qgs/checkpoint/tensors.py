@@ -158,6 +158,14 @@ def pickle_kind(path: AnyPath) -> str:
     return next((kind for magic, kind in _PICKLES.items() if start.startswith(magic)), "")
 
 
+def copied(tensors: Weights) -> dict[str, Tensor]:
+    """Return contiguous copies of `tensors` on the CPU, which share no memory."""
+    return {
+        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
+        for name, tensor in tensors.items()
+    }
+
+
 def shapes_of(tensors: Weights) -> dict[str, tuple[int, ...]]:
     """Return the shapes of tensors by name."""
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import torch
 from accelerate import PartialState
 from accelerate.utils import wait_for_everyone
 from filelock import FileLock, Timeout
 
 from qgs.checkpoint.model_file import load_weights, save, unique_tensors
 from qgs.checkpoint.models import CHECKPOINT
-from qgs.checkpoint.tensors import CheckpointError, TensorFile, Weights, write_tensors
+from qgs.checkpoint.tensors import CheckpointError, TensorFile, Weights, copied, write_tensors
 from qgs.containers import map_tensors, named_tensors
 from qgs.domain import KEY, Domain
 from qgs.files import is_leftover, naming_full_disk, read_records, write_text
@@ -224,10 +223,7 @@ class Saver:
 def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, State]) -> None:
     """Write `states` to `path`, completely or not at all. recipe: complete recipe of the run."""
     # safetensors refuses views and tensors that share memory.
-    tensors = {
-        place: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
-        for place, tensor in named_tensors(states)
-    }
+    tensors = copied(dict(named_tensors(states)))
     values = map_tensors(lambda _: _TENSOR, states)
     write_tensors(path, tensors, {_STATES: json.dumps(values), _RECIPE: json.dumps(recipe)})
 

@@ -13,7 +13,7 @@ from accelerate.utils import gather_object
 from torch import nn
 
 from qgs.checkpoint.model_file import unique_tensors
-from qgs.checkpoint.tensors import Weights, nonfinite
+from qgs.checkpoint.tensors import Weights, copied, nonfinite
 from qgs.containers import named_tensors
 from qgs.contracts import TrainingConfig
 from qgs.data.samples import Batch
@@ -289,8 +289,7 @@ class GoodWeights:
         """Copy the present weights, reached after `step` steps; keep the two latest copies."""
         present = unique_tensors(self.model) if PartialState().is_main_process else {}
         # In host memory, because training needs the device's.
-        copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
-        self.copies = [*self.copies, (step, copy)][-2:]
+        self.copies = [*self.copies, (step, copied(present))][-2:]
 
     def state(self) -> dict[str, Any]:
         return {"psnr": self.psnr, "best": self.best, "copies": dict(self.copies)}
