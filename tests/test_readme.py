@@ -42,7 +42,7 @@ def test_pages_list_all_slots_with_their_defaults_and_all_commands():
     rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", table, re.MULTILINE)
     shown = {name.rpartition(".")[2]: re.findall(r"`([^`]+)`", types) for name, types in rows}
     defaults = {name: [slot.default] if slot.default else [] for name, slot in SLOTS.items()}
-    defaults |= {name: list(s.defaults.values()) for name, s in SECTIONS.items() if s.named}
+    defaults |= {name: list(s.defaults.values()) for name, s in SECTIONS.items() if s.defaults}
     assert shown == defaults
     commands = re.findall(r"^- `qgs ([\w-]+)", text_of("commands.md"), re.MULTILINE)
     assert set(commands) == {*COMMANDS, *entry_points(group=GROUP).names}

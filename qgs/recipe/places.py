@@ -61,7 +61,7 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
         paths += [layer_place(index, name) for name in LAYER_SLOTS]
     paths += [("model", name) for name in AFTER_LAYERS]
     for name, section in SECTIONS.items():
-        if section.named:
+        if section.defaults:
             paths += [(name, key) for key, node in tree.child(name).items() if node is not None]
         elif section.default or tree.get(name) is not None:
             paths.append((name,))

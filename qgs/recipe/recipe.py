@@ -206,7 +206,7 @@ def spell_out(draft: Draft, parts: Parts) -> _Spelled:
             if (name, key) not in parts:
                 yield (name, key), None, draft.tree.child(name).origin_of(key)
         # An empty section differs from a missing one, which gets the defaults.
-        if section.named and not staying and not any(path[0] == name for path in parts):
+        if section.defaults and not staying and not any(path[0] == name for path in parts):
             yield (name,), {}, draft.tree.origins.get(name, _DEFAULT)
 
 

@@ -87,7 +87,7 @@ def _parts(*slots: str) -> dict[str, Any]:
         about = summary_of(SLOTS[name].contract)
         part = Annotated[Any, WithJsonSchema({"slot": name})]
         fields[name] = part, Field(default=None, description=about)
-        if SLOTS[name].named:
+        if SLOTS[name].defaults:
             about = f"Components by name. {about}"
             fields[name] = dict[str, part], Field(default_factory=dict, description=about)
     return fields
@@ -202,6 +202,6 @@ def _with_defaults(tree: MapNode) -> MapNode:
     missing = {
         name: {key: {"type": kind} for key, kind in section.defaults.items()}
         for name, section in SECTIONS.items()
-        if section.named and (section.defaults_stay or name not in tree)
+        if section.defaults and (section.defaults_stay or name not in tree)
     }
     return merge(from_plain(missing, Origin("default")), tree)

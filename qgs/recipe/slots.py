@@ -15,15 +15,14 @@ class Slot:
 
     default: `type` of the component if the recipe names none; None if the recipe must name one.
     The remaining fields matter only for slots that are top-level sections.
-    named: True if the section maps names to components; False if the section is one component.
-    defaults: types of the components, by name, in a recipe without the section.
+    defaults: types of the components, by name, in a recipe without the section. Without
+        any, the section is one component.
     defaults_stay: True if a recipe's components are added to `defaults`, of which `NAME: null`
         drops one; False if they replace `defaults`.
     """
 
     contract: type[contracts.Component]
     default: str | None = None
-    named: bool = False
     defaults: Mapping[str, str] = field(default_factory=dict)
     defaults_stay: bool = False
 
@@ -50,13 +49,11 @@ SLOTS = {
         Slot(contracts.Renderer, "qgs/auto"),
         Slot(
             contracts.Loss,
-            named=True,
             defaults={"photometric": "qgs/photometric", "visibility": "qgs/visibility"},
         ),
         Slot(contracts.Objective, "qgs/one_pass"),
         Slot(
             contracts.Metric,
-            named=True,
             defaults={"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"},
             defaults_stay=True,
         ),

@@ -213,7 +213,7 @@ def resolved(case: Case, given: Fields) -> Recipe:
     of_encoder = case.writes if slot == "encoder" else MEMORY_FIELDS
     # The default layers read keys and values.
     depth = case.dims.depth if {"memory.keys", "memory.values"} <= of_encoder.keys() else 0
-    place = f"{slot}.case" if slot in SECTIONS and SECTIONS[slot].named else slot
+    place = f"{slot}.case" if slot in SECTIONS and SECTIONS[slot].defaults else slot
     place = f"model.{slot}" if slot in MODEL_SLOTS else place
     place = f"model.decoder.{slot}" if slot in LAYER_SLOTS else place
     changes = [
