@@ -22,6 +22,8 @@ NOTHING = (232, 233, 235)
 DEPTH_MAP = "viridis_r"
 # Pixels between pictures in a row.
 GAP = 4
+# Of a GIF.
+FRAMES_PER_SECOND = 16
 
 
 def rgb_picture(image: Tensor) -> Picture:
@@ -84,7 +86,7 @@ def write_png(picture: Picture, path: str | Path) -> None:
         temporary.write_bytes(png_bytes(picture))
 
 
-def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:
+def write_gif(frames: Sequence[Picture], path: str | Path) -> None:
     """Write pictures of equal size as a looping GIF. All frames share one palette."""
     # One palette for all: others would make still pixels flicker.
     sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
@@ -92,7 +94,7 @@ def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: fl
     images = [
         Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames
     ]
-    milliseconds = round(1000 / frames_per_second)
+    milliseconds = round(1000 / FRAMES_PER_SECOND)
     first, *rest = images
     with replacing(path) as temporary:
         first.save(

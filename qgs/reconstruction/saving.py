@@ -21,7 +21,6 @@ from qgs.wording import numbered
 
 ORBIT_FRAMES = 48
 ORBIT_SIDE = 320
-FRAMES_PER_SECOND = 16
 SWAY = 0.12
 """Sideways motion of an orbit, as a fraction of the depth of the scene."""
 OVERVIEW_COLUMNS = 8
@@ -77,7 +76,7 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
             images.write_png(pair, fresh / "views" / name)
             images.write_png(rows["depth"][i], fresh / "depth" / name)
         images.write_png(overview(result), fresh / "overview.png")
-        images.write_gif([rgb_picture(f) for f in frames], fresh / "orbit.gif", FRAMES_PER_SECOND)
+        images.write_gif([rgb_picture(f) for f in frames], fresh / "orbit.gif")
         write_text(fresh / "cameras.json", json.dumps(_camera_record(result, path), indent=1))
         names = sorted(entry.name for entry in fresh.iterdir())
     return [out / name for name in names]
