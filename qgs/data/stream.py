@@ -32,6 +32,7 @@ MEASURED = 512
 """Number of training samples whose cameras `trained_domain` measures."""
 MAX_REPLACED = 10
 """Number of replacements to try for a failing sample before training stops."""
+_SPAN = Span(Span.Config())
 
 
 class SampleError(ValueError):
@@ -110,13 +111,12 @@ class SampleStream(Dataset[Batch | Exception]):
     views: ViewsConfig
     seed: int
     skips: bool = False
-    sampler: ViewSampler | None = None
+    sampler: ViewSampler = _SPAN
     per_step: int = 1
     depths: bool = False
 
     def __post_init__(self, source: SceneSource) -> None:
         self._open = partial(type(source), source.config)
-        self._sampler = self.sampler or Span(Span.Config())
         self._scenes = source.scenes("train")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
@@ -194,7 +194,7 @@ class SampleStream(Dataset[Batch | Exception]):
     ) -> tuple[bool, Frames, Frames]:
         """Choose at random whether a sample is mirrored, its input frames and its target frames."""
         mirror = bool(rng.random() < self.views.mirror)
-        return mirror, *self._sampler.draw(scene, self.views, rng, step)
+        return mirror, *self.sampler.draw(scene, self.views, rng, step)
 
     def _sample_after(self, number: int, attempt: int) -> Sample:
         """Make sample `number`; or its replacement, if `attempt` earlier attempts failed."""
