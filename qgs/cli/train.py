@@ -16,7 +16,6 @@ from qgs.cli.options import Device, Overrides, Threads, use_threads
 
 if TYPE_CHECKING:
     from qgs.recipe import Recipe
-    from qgs.train.training import TrainingResult
 
 
 def train(
@@ -61,26 +60,21 @@ def train(
         raise typer.Exit(1) from None
     # Only one of several processes prints and evaluates.
     if result.main:
-        _report(result, console)
         finished = result.resumed_at == result.steps
+        before = "already finished: " if finished else ""
+        made = f"{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}"
+        console.print(f"{before}{made}")
         folder = result.folder.evaluation
+        if result.stopped_by:
+            console.print(f"stopped early by {result.stopped_by}; not evaluated")
+            console.print("continue with the same command and --resume", highlight=False)
         # The protocol is written last, so the evaluation is complete.
-        if finished and (folder / "protocol.json").exists():
+        elif finished and (folder / "protocol.json").exists():
             console.print(f"already evaluated, see {folder}")
-        elif not result.stopped_by:
+        else:
             evaluate_into(result.model, resolved, result.steps, folder, console)
     if result.stopped_by:
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
-
-
-def _report(result: TrainingResult, console: Console) -> None:
-    """Print the result of training and, if it was stopped, how to continue."""
-    before = "already finished: " if result.resumed_at == result.steps else ""
-    made = f"{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}"
-    console.print(f"{before}{made}")
-    if result.stopped_by:
-        console.print(f"stopped early by {result.stopped_by}; not evaluated")
-        console.print("continue with the same command and --resume", highlight=False)
 
 
 def with_absolute_path(recipe: Recipe) -> Recipe:
