@@ -19,7 +19,6 @@ from qgs.cli.options import (
     Tune,
     ViewsSettings,
 )
-from qgs.wording import numbered
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -124,8 +123,7 @@ def show(result: Reconstruction, console: Console) -> None:
         scores = [score for score in result.scores if score.kind == kind]
         rows = [[score.psnr, *score.baselines.values()] for score in scores]
         for score, row in zip(scores, rows, strict=True):
-            file = Path(result.sample.names.get(score.frame, "")).name
-            table.append([kind, numbered(score.frame, file), *map(shown, row)])
+            table.append([kind, result.sample.short_label(score.frame), *map(shown, row)])
         if rows:
             means = [shown(sum(values) / len(rows)) for values in zip(*rows, strict=True)]
             table.append([f"mean of {kind}", str(len(rows)), *means])

@@ -8,6 +8,7 @@ copies images on one thread, because threads of torch would wait for cores that 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,10 @@ class Sample:
     def label(self, frame: int) -> str:
         """Return the number of a frame, with its name if it has one, for messages."""
         return numbered(frame, self.names.get(frame, ""))
+
+    def short_label(self, frame: int) -> str:
+        """Return the number of a frame, with its name without folders if it has one."""
+        return numbered(frame, Path(self.names.get(frame, "")).name)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from qgs.metrics.images import Psnr
 from qgs.reconstruction.result import Reconstruction, sample_cameras
 from qgs.reconstruction.scene_formats import save_gaussians, save_ply, scene_writers
 from qgs.types import Cameras
-from qgs.wording import numbered
 
 ORBIT_FRAMES = 48
 ORBIT_SIDE = 320
@@ -103,9 +102,10 @@ def overview(result: Reconstruction) -> Picture:
     titles = []
     for index in shown:
         score = scores[index]
-        file = Path(result.sample.names.get(score.frame, "")).name
         quality = f"{Psnr.column.shown(score.psnr)} {Psnr.column.unit}"
-        titles.append(f"frame {numbered(score.frame, file)}\n{score.kind.split()[0]}, {quality}")
+        titles.append(
+            f"frame {result.sample.short_label(score.frame)}\n{score.kind.split()[0]}, {quality}"
+        )
     rows = {}
     for kind, pictures in _pictures(result).items():
         rows[kind] = [pictures[index] for index in shown]
