@@ -105,15 +105,15 @@ class Domain:
             domain.values[name] = ends
         return domain
 
-    def differences(self, found: Domain) -> dict[str, str]:
-        """Describe, by name, each measurement whose range in `found` exceeds the one in `self`."""
-        phrases: dict[str, str] = {}
+    def differences(self, found: Domain) -> list[str]:
+        """Describe each measurement whose range in `found` exceeds the one in `self`."""
+        phrases: list[str] = []
         seen = found.ranges
         for name, trained in self.ranges.items():
             low, high = seen.get(name, trained)
             if low * TOLERANCE < trained[0] or high > trained[1] * TOLERANCE:
                 words = WORDS[name].format(_shown((low, high)))
-                phrases[name] = f"{words} (trained: {_shown(trained)})"
+                phrases.append(f"{words} (trained: {_shown(trained)})")
         return phrases
 
 
@@ -127,7 +127,7 @@ def verdict(trained: Domain, found: Domain) -> str:
         return "the checkpoint does not record the views on which this model was trained"
     if outside := trained.differences(found):
         return (
-            f"the views lie outside the range of the training: {', '.join(outside.values())}. "
+            f"the views lie outside the range of the training: {', '.join(outside)}. "
             f"Expect a worse result; {REMEDY}"
         )
     return (

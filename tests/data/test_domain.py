@@ -70,7 +70,7 @@ def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_train
     for few, largest in ((10, math.inf), (3, 2.062)):
         mixed = domain(*[PAIR] * (100 - few), *[PARALLEL] * few)
         assert mixed.ranges["depth"] == pytest.approx((2.062, largest))
-    assert "infinitely far" in mixed.differences(domain(PARALLEL))["depth"]
+    assert "look at is infinitely far" in str(mixed.differences(domain(PARALLEL)))
 
 
 def test_a_damaged_domain_is_one_error_with_the_file(tmp_path):
@@ -93,8 +93,8 @@ def test_the_sentence():
     assert not trained.differences(within)
     wide = domain(around(1.5, (-1.5, 1.5, 0), focal=4.0))
     outside = trained.differences(wide)
-    assert [float(re.findall(r"[\d.]+", text)[0]) for text in outside.values()] == [3, 3, 90, 152]
-    assert all(text in verdict(trained, wide) for text in outside.values())
+    assert [float(re.findall(r"[\d.]+", text)[0]) for text in outside] == [3, 3, 90, 152]
+    assert all(text in verdict(trained, wide) for text in outside)
     assert "checkpoint does not record" in verdict(Domain(), within)
 
 
