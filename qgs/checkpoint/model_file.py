@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from qgs.checkpoint.models import checkpoint_path
 from qgs.checkpoint.tensors import (
+    RECIPE,
     SEAL,
     CheckpointError,
     TensorFile,
@@ -35,7 +36,6 @@ from qgs.wording import listed
 FORMAT_VERSION = 3
 """Version of the file format. It rises when the metadata of checkpoints change."""
 
-_RECIPE = "qgs.recipe"
 _FORMAT = "qgs.format_version"
 _EXTRA = "qgs.extra."
 _PLUGINS = "qgs.plugins"
@@ -58,7 +58,7 @@ class CheckpointFile(TensorFile):
     def __init__(self, name: AnyPath) -> None:
         super().__init__(checkpoint_path(name))
         self.name = os.fspath(name)
-        if _RECIPE not in self.metadata:
+        if RECIPE not in self.metadata:
             raise CheckpointError(
                 f"{self.path} is a safetensors file without a qgs recipe; only files written by "
                 "qgs.save or `qgs train` can be loaded. Published weights become a checkpoint by "
@@ -87,7 +87,7 @@ class CheckpointFile(TensorFile):
         message names the releases of the packages that wrote the file.
         """
         try:
-            return self.stored_recipe(_RECIPE)
+            return self.stored_recipe()
         except RecipeError as error:
             names = {**self.mapping(_DISTRIBUTIONS), "qgs": "query-gaussians"}
             versions = self.mapping(_PLUGINS).items()
@@ -199,7 +199,7 @@ def write_checkpoint(
     of the plugin. extra: additional metadata.
     """
     metadata = {
-        _RECIPE: json.dumps(tree),
+        RECIPE: json.dumps(tree),
         _PLUGINS: json.dumps({name: version for name, (_, version) in releases.items()}),
         _DISTRIBUTIONS: json.dumps({name: origin for name, (origin, _) in releases.items()}),
         _FORMAT: str(FORMAT_VERSION),

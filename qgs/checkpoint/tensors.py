@@ -22,6 +22,8 @@ Weights: TypeAlias = Mapping[str, Tensor]
 """Parameters and buffers of a model, by name."""
 Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
 """Shapes of tensors by name."""
+RECIPE = "qgs.recipe"
+"""Name of the metadata entry with the complete recipe."""
 SEAL = "qgs.seal"
 """Name of the metadata entry with the checksum of all other entries."""
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
@@ -114,16 +116,16 @@ class TensorFile:
                 raise TypeError(f"expected a mapping, got {type(found).__name__}")
             return found
 
-    def stored_recipe(self, key: str) -> Recipe:
-        """Return the complete recipe in the metadata entry `key`, without reading any other file.
+    def stored_recipe(self) -> Recipe:
+        """Return the complete recipe in the metadata entry RECIPE, without reading any other file.
 
         Raises CheckpointError for a damaged entry, and RecipeError if the installed components do
         not fit the recipe.
         """
-        tree = self.mapping(key)
+        tree = self.mapping(RECIPE)
         if unresolved := [name for name in ("extends", "swap") if name in tree]:
             raise self.damaged(f"its recipe has `{unresolved[0]}`, which qgs never stores")
-        with self.entry(key):
+        with self.entry(RECIPE):
             return resolve(tree)
 
 

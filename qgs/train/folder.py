@@ -13,7 +13,14 @@ from filelock import FileLock, Timeout
 
 from qgs.checkpoint.model_file import load_weights, save, unique_tensors
 from qgs.checkpoint.models import CHECKPOINT
-from qgs.checkpoint.tensors import CheckpointError, TensorFile, Weights, copied, write_tensors
+from qgs.checkpoint.tensors import (
+    RECIPE,
+    CheckpointError,
+    TensorFile,
+    Weights,
+    copied,
+    write_tensors,
+)
 from qgs.containers import map_tensors, named_tensors
 from qgs.domain import KEY, Domain
 from qgs.files import is_leftover, naming_full_disk, read_records, write_text
@@ -28,7 +35,6 @@ State: TypeAlias = Mapping[str, Any]
 HISTORY = "history.jsonl"
 EVALUATIONS = "evaluations.jsonl"
 _STATES = "qgs.state"
-_RECIPE = "qgs.recipe"
 _LOCK = ".lock"
 # Stands in JSON for a tensor, which the file holds by its dotted name.
 _TENSOR = "tensor"
@@ -225,7 +231,7 @@ def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, Stat
     # safetensors refuses views and tensors that share memory.
     tensors = copied(dict(named_tensors(states)))
     values = map_tensors(lambda _: _TENSOR, states)
-    write_tensors(path, tensors, {_STATES: json.dumps(values), _RECIPE: json.dumps(recipe)})
+    write_tensors(path, tensors, {_STATES: json.dumps(values), RECIPE: json.dumps(recipe)})
 
 
 def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
@@ -243,7 +249,7 @@ def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
 
         with file.entry(_STATES) as text:
             states = {name: filled(state, name) for name, state in json.loads(text).items()}
-        return file.stored_recipe(_RECIPE), states
+        return file.stored_recipe(), states
 
 
 def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
