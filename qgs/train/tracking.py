@@ -79,7 +79,7 @@ class Trackers:
                 )
         self._open: dict[str, Tracker] = {}
 
-    def open(self, run: Path, options: Mapping[str, Any], step: int = 0) -> None:
+    def open(self, run: Path, options: Mapping[str, Any], step: int) -> None:
         """Start all trackers for the run in the folder `run`.
 
         options: the recipe's options by dotted path. step: number of steps so far; 0 for a new run.

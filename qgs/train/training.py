@@ -67,7 +67,7 @@ class TrainingResult:
     seconds: float
     stopped_by: str | None
     main: bool
-    resumed_at: int | None = None
+    resumed_at: int | None
 
 
 def train(

@@ -84,7 +84,7 @@ def test_tensorboard_gets_what_the_history_gets_and_drops_what_was_lost(copied):
     module = pytest.importorskip(name, reason="the extra `tensorboard` is not installed")
     recipe = tiny("locus", *TRAINED, "training.trackers=[tensorboard]", "training.steps=4")
     lost = Trackers(("tensorboard",))
-    lost.open(copied, flat(recipe.tree))
+    lost.open(copied, flat(recipe.tree), 0)
     for step in range(1, 6):
         lost.tell(lambda tracker, step=step: tracker.log({"loss": float(step)}, step))
     lost.close()
