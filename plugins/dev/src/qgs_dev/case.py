@@ -189,7 +189,7 @@ class Case:
         return module
 
     def with_at_most(self, **sizes: int) -> "Case":
-        """Return a copy with options limited to `sizes`, or this case if the copy is invalid."""
+        """Return a copy with each option in `sizes` at most that value; this case if invalid."""
         given = dict(self.config)
         lower = {name: size for name, size in sizes.items() if (given.get(name) or 0) > size}
         smaller = self.with_config(self.config.model_copy(update=lower))

@@ -115,7 +115,7 @@ class Maker:
     def normal(self, axes: str, *more: int) -> Tensor:
         """Return normally distributed random numbers.
 
-        axes: leading dimensions, such as "BN"; see `shape`. more: sizes of further dimensions.
+        axes: letters of leading dimensions, such as "BN". more: sizes of further dimensions.
         """
         shape = [*self.shape(axes), *more]
         return torch.randn(shape, generator=self.generator).to(self.case.device)
@@ -123,7 +123,7 @@ class Maker:
     def uniform(self, low: float, high: float, axes: str) -> Tensor:
         """Return uniformly distributed random numbers between `low` and `high`.
 
-        axes: dimensions, such as "BV3HW"; see `shape`.
+        axes: letters or sizes of dimensions, such as "BV3HW".
         """
         numbers = torch.rand(self.shape(axes), generator=self.generator)
         return (low + (high - low) * numbers).to(self.case.device)
@@ -198,7 +198,7 @@ class Maker:
         )
 
     def gaussians(self) -> Gaussians:
-        """Return random Gaussians in front of the cameras, with parts for which `gives` is True."""
+        """Return random visible Gaussians, with the optional tensors for which `gives` is True."""
         return Gaussians(
             means=self.in_front(self.normal("BG3")),
             scales=self.uniform(0.05, 0.3, "BG3"),
@@ -210,9 +210,9 @@ class Maker:
         )
 
     def gives(self, name: str) -> bool:
-        """Return True if Gaussians should have the part `name`, such as "sh".
+        """Return True if Gaussians should have the optional tensor `name`, such as "sh".
 
-        Gaussians for renderers have all parts, others only the parts that the component requires.
+        Gaussians for renderers have all, others only those that the component requires.
         """
         return self.case.slot == "renderer" or f"gaussians.{name}" in self.case.reads
 

@@ -118,7 +118,8 @@ class CaseRun:
     """Run of all checks on one case. If `builds` or `runs` fails, the other checks are skipped.
 
     expected: reasons for expected failures, by name of the check. It counts as a failure if such a
-    check passes. variant: True if the component has had an earlier case; see `Check.variants`.
+    check passes. variant: True if the component has had an earlier case; then only checks with
+    `variants` run.
     """
 
     case: Case
@@ -253,7 +254,7 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
             run.check()
 
     The first case of a component runs all checks, later cases run only checks with `variants`.
-    Raises PluginError for a plugin that cannot be loaded, or with invalid examples or exemptions.
+    Raises PluginError if the plugin cannot be loaded, or has invalid examples or expected failures.
     """
     installed = load_plugin(plugin) if isinstance(plugin, str) else plugin
     runs: list[CaseRun] = []
@@ -278,7 +279,7 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
 def check_plugin(name: str, tiers: Iterable[Tier]) -> Iterator[CheckResult]:
     """Run all checks on each case of the plugin `name`, and yield the results case by case.
 
-    Raises PluginError for a plugin that cannot be loaded, or with invalid examples or exemptions.
+    Raises PluginError if the plugin cannot be loaded, or has invalid examples or expected failures.
     """
     runs = runs_of(name)
     return (result for run in runs for result in run.results(tiers))

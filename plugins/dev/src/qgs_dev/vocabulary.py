@@ -89,7 +89,7 @@ def gradients(total: Tensor, tree: Any) -> dict[str, Tensor]:
 
 
 def difference(one: Any, other: Any, rtol: float = 0.0, atol: float = 0.0) -> str:
-    """Describe the first tensor in which two trees differ; "" if they agree.
+    """Describe the first tensor in which two trees differ; return "" if they agree.
 
     Tensors may differ by the tolerances `rtol` and `atol`. If both are 0, dtypes must agree, too.
     """
@@ -153,7 +153,7 @@ class Trial:
         )
 
     def state_of(self, outputs: Any) -> Any:
-        """Return the query state in outputs of a layer or feedback; all outputs of other slots."""
+        """Return the query state in outputs of a layer or feedback; all outputs for other slots."""
         return outputs[0] if self.case.slot in WITH_MEMORY else outputs
 
 
@@ -170,7 +170,7 @@ def expect_none(names: Iterable[Any], fault: str) -> None:
 
 
 def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float = 0.0) -> None:
-    """Raise ContractError if two trees differ; see `difference`.
+    """Raise ContractError if two trees differ by more than the tolerances.
 
     where: start of the message.
     """
@@ -181,7 +181,7 @@ def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float
 def expect_finite(tree: Any, where: str) -> None:
     """Raise ContractError if a tensor of `tree` contains NaN or infinity.
 
-    where: end of the message.
+    where: end of the error message.
     """
     broken = [name for name, tensor in floating(tree).items() if not tensor.isfinite().all()]
     expect_none(broken, f"not finite {where}")

@@ -100,7 +100,7 @@ def test_what_makes_no_sense_is_refused_in_a_sentence(reconstruction, photos, tm
         (by_hand, photos, (), "a model that is not in a file"),
         (damaged, photos, (), "does not describe a reconstruction"),
         (reconstruction, moved, ("--scene", "moved"), "or their poses have changed"),
-        (reconstruction, photos, ("--seconds", 0), "--seconds must be a time above 0"),
+        (reconstruction, photos, ("--seconds", 0), "--seconds must be a finite time above 0"),
     ):
         result = run_qgs("refine", source, given, *options, "--out", out)
         assert isinstance(result.exception, ValueError | OSError), (options, result.output)

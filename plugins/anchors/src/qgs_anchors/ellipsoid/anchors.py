@@ -55,9 +55,9 @@ class EllipsoidQueries(LearnedQueries):
         return {**CENTER_FIELD, **shape_fields(config)}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return False for rotations; for other parameters, return what the base class returns.
+        """Return whether weight decay applies to a parameter; it never applies to rotations.
 
-        Weight decay would only change lengths of quaternions, which have no effect on results.
+        Decay would only change lengths of quaternions, which have no effect on results.
         """
         return name != "rotation" and super().decays(name, parameter)
 

@@ -19,7 +19,7 @@ from qgs.geometry.transforms import unit
 from qgs.precision import full_precision
 
 UPWARD = (0.0, 0.0, 1.0)
-"""Direction that replaces the direction of a ray if that is 0."""
+"""Direction that a ray gets if its direction vector is 0."""
 
 
 @full_precision

@@ -18,8 +18,8 @@ FOOTPRINT_FIELD: Fields = {
 }
 """Field of the shapes of footprints (B, N, 3): width, height and number of rows of cells.
 
-The unit of width and height is the side of a square with the same area. The number of rows is 0 if
-the footprint has no cells. All queries of a set of photos have the same shape."""
+The unit of width and height is the side of a square with the footprint's area. The number of rows
+is 0 if the footprint has no cells. All queries of a set of photos have the same shape."""
 
 
 def color_field(count: int) -> Fields:

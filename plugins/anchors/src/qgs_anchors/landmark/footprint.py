@@ -38,8 +38,8 @@ _OF_CHANNELS = ("linear.weight", "linear.bias")
 class FootprintCenters(RadiusScaledCenters):
     """Gaussian means at mu + r (u, v, 0) + r posact(offset), along the axes of the photo's camera.
 
-    mu and r are centre and radius of the anchor, which starts on a ray of a photo. The part of the
-    photo that the anchor's query stands for is the footprint, with a cell for each Gaussian. (u, v)
+    mu and r are centre and radius of the anchor, which starts on a ray of a photo. The footprint is
+    the part of the photo that the query represents, with a cell for each Gaussian. (u, v)
     is the centre of the cell relative to that of the footprint, in units of the square root of the
     footprint's area. If r is this square root, measured at the anchor's depth, an offset of 0 puts
     the Gaussian on the ray of its cell. posact(t) is sign(t) (exp|t| - 1).

@@ -14,7 +14,7 @@ from qgs.types import QueryState
 MAX_PAIRS = 1 << 22
 """Largest number of distances in memory at once (16 MiB in float32)."""
 PLACE = 5
-"""Numbers of a relative position: vector divided by the reach (3), its length, log of the reach."""
+"""Count of numbers in a relative position: vector / reach (3), its length, and log(reach)."""
 EPS = 1e-6
 
 
@@ -77,7 +77,7 @@ class NeighbourAttention(SelfAttention):
         return attention_weights(q_BhNd[:, :, queries], k_BhNd, hidden.scatter(-1, index, chosen))
 
     def _near(self, state: QueryState) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each query's neighbours (B, N, k), relative positions (B, N, k, 5) and a bias.
+        """Return indices of neighbours (B, N, k), relative positions (B, N, k, 5) and a bias.
 
         An MLP computes the bias of the attention logits (B, h, N, k) from the positions. The bias
         is -inf for masked neighbours.

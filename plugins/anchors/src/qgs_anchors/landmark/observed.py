@@ -55,7 +55,7 @@ from qgs_anchors.landmark.places import (
 from qgs_anchors.landmark.sweep import mismatch
 
 SHARPNESS = 300.0
-"""Initial factor of colour differences in a sweep's logits.
+"""Initial factor by which a sweep multiplies colour differences to get logits.
 
 A depth at which the difference is larger by 1/300 (of RGB in [0, 1]) is e times less likely."""
 UNSEEN = 0.2
@@ -207,7 +207,7 @@ class ObservedQueries(Queries):
         return x_BND, (share_BND * nearness_D).sum(-1, keepdim=True)
 
     def _joined(self, x_BXD: Tensor, nearness_BX1: Tensor) -> tuple[Tensor, Tensor]:
-        """Merge features and nearness of the S tokens of each query into those of one token."""
+        """Merge the S features of each query into one, and its S values of nearness into one."""
         tokens = self.config.tokens
         if tokens == 1:
             return x_BXD, nearness_BX1
@@ -273,6 +273,6 @@ class ObservedQueries(Queries):
 
 
 def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return K points around each of N points, (N * K, 2), and the indices of their photos."""
+    """Return K points around each of N points: photo indices (N * K,), points (N * K, 2)."""
     place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
     return view_N.repeat_interleave(len(step_K2)), place_X2

@@ -17,7 +17,7 @@ from qgs.types import Cameras
 EPS = 1e-4
 """Tolerance of comparisons, in pixels or in logarithms of aspect ratios."""
 MOST_OFF = 0.35
-"""Largest |log(aspect of a tile / wanted aspect)| at which tiles are used: a factor of 1.4.
+"""Largest |log(aspect / wanted aspect)| of tiles that are used: off by a factor of 1.4.
 
 With tiles that were off by a factor of 2, PSNR was worse than with rows: 20.1 against 20.3 dB, for
 untrained models with 512 points and 4 photos in 32 validation rooms."""
@@ -141,7 +141,7 @@ def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
 def sampled(
     maps_BMC: Tensor, grid: tuple[int, int, int], view_N: Tensor, place_BN2: Tensor
 ) -> Tensor:
-    """Sample values of patches at N points of photos, bilinearly between centres, as (B, N, C).
+    """Sample patch values at N points of photos, bilinearly between patch centres: (B, N, C).
 
     Points beyond the outermost centres get the values at the nearest edge. maps: values (B, M, C)
     of the patches of `grid` (V, rows, columns). view: index (N,) of the photo of each point.

@@ -25,7 +25,7 @@ from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 CHANNELS = 7
 """Channels of an error map: photo minus rendering (RGB), rendering (RGB), alpha."""
 ERROR_GAIN = 4.0
-"""Factor of the errors, which are a few tenths, while the other channels reach 1."""
+"""Factor by which errors are multiplied: they are a few tenths, but the other channels reach 1."""
 
 
 class RenderedFeedback(Feedback):

@@ -9,7 +9,7 @@ from qgs.types import Cameras, Views
 from qgs_anchors.landmark.places import bilinear, cells, rays_at
 
 LEAST_SEEN = 0.5
-"""Least share of a window that a photo must see to be compared with it."""
+"""Least fraction of a window that another photo must see to be compared with the window."""
 LEAST_DEPTH = 1e-3
 """Least depth at which a camera sees a point, world units."""
 

@@ -76,7 +76,7 @@ def check_reads_are_declared(case: Case) -> None:
                     other = trial(poisoned)
                 # It fails with the declared parts alone, and works with all parts.
                 except Exception as error:
-                    raise ContractError(f"{where}: add it to `reads`") from error
+                    raise ContractError(f"{where}: add these fields to `reads`") from error
             # A layer may pass on a memory that it does not read.
             expect_same(trial.state_of(output), trial.state_of(other), where)
 
@@ -252,7 +252,7 @@ def _given(base: type, provides: Fields, **methods: Any) -> Any:
 
 
 def _head_with(look: Fields) -> Any:
-    """Return a head class whose Gaussians have the parts `sh` and `features` listed in `look`."""
+    """Return a head class whose Gaussians have `sh` and `features` if `look` lists them."""
 
     def forward(self: GaussianHead, state: QueryState) -> Any:
         x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)

@@ -114,7 +114,7 @@ def check_gradients_match_differences(case: Case) -> None:
     """Require that float64 gradients agree with finite differences (torch.autograd.gradcheck).
 
     The check runs in evaluation and in training. If a component stops a gradient on purpose, list
-    this check as an expected failure; see `gradients_reach_inputs`.
+    this check and `gradients_reach_inputs` as expected failures.
     """
     small = case.with_dims(width=8, heads=2) if case.has_parameters else case
     small = case if small.problems(small.size) else small

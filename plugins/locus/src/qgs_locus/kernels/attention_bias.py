@@ -164,7 +164,7 @@ def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
 
 
 def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Return uninitialised memory for `size` numbers, which the next call may return again."""
+    """Return uninitialised memory for `size` numbers; the next call may return it again."""
     if device.type != "cpu":
         return torch.empty(size, device=device, dtype=dtype)
     # Memory is kept: touching new memory takes as long as computing the bias.

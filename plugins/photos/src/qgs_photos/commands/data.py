@@ -32,7 +32,7 @@ Quality: TypeAlias = Annotated[
     ),
 ]
 EveryNth: TypeAlias = Annotated[
-    int | None, typer.Option(help="Make every Nth scene a test scene.", min=2)
+    int | None, typer.Option(help="Make every Nth scene a test scene. Default: keep splits.", min=2)
 ]
 Geometry: TypeAlias = Annotated[
     int,

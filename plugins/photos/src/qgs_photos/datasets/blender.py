@@ -25,7 +25,7 @@ class Blender(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`. Training frames come first; those of val and test are held out.
+        """List the frames: first those for training, then held-out ones of val and test.
 
         Raises ValueError if `images` is given, since transforms files name the folders of photos.
         """

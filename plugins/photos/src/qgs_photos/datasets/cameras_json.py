@@ -66,7 +66,7 @@ class CamerasJson(PhotoReader):
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
-        """See `PhotoReader`. False for files of other programs with this name.
+        """Return whether `folder` has a `cameras.json` that is not another program's file.
 
         A file is recognised if it has both `c2w` and `K`, or if photos lie beside it. A file that
         `qgs reconstruct` wrote is not.
@@ -84,7 +84,10 @@ class CamerasJson(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`. Raises ValueError if no photo is named and their number differs."""
+        """Return the cameras and photos of `folder`.
+
+        Raises ValueError if no camera names a photo and there are not as many photos as cameras.
+        """
         file = folder / cls.listing
         cameras = _cameras(file, read_json(file, f"write {_FORM}"))
         names: list[str] = []
@@ -108,7 +111,9 @@ class CamerasJson(PhotoReader):
             find = dict
         read = [_Camera(*pair, find) for pair in zip(cameras, listed, strict=True)]
         if any(camera.in_parts for camera in read):
-            warn_once(f"intrinsics in {file} are read as fractions of width and height")
+            warn_once(
+                f"intrinsics in {file} are read as fractions of width and height: none is above 3"
+            )
         return Listing(file, [camera.frame(folder) for camera in read])
 
 
