@@ -172,7 +172,7 @@ def expect_none(names: Iterable[Any], fault: str) -> None:
 def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float = 0.0) -> None:
     """Raise ContractError if two trees differ by more than the tolerances.
 
-    where: start of the message.
+    where: start of the error message.
     """
     found = difference(one, other, rtol, atol)
     expect(not found, f"{where}, {found}")
@@ -198,7 +198,7 @@ def expect_right_gradient(
 ) -> None:
     """Raise ContractError if the gradient of `value` at `points` does not match finite differences.
 
-    value: function to check. where: start of the message. tolerances: options of gradcheck.
+    value: function to check. where: start of the error message. tolerances: options of gradcheck.
     """
     try:
         gradcheck(value, points, **tolerances)

@@ -64,7 +64,7 @@ class AnchorRefinement(Refinement):
 
     @classmethod
     def radius_field(cls, config: Config) -> Fields:
-        """Return the field of raw radii. A subclass may return a field with more channels."""
+        """Return the state field of raw radii. A subclass may return a field with more channels."""
         return radius_field(config)
 
     @classmethod

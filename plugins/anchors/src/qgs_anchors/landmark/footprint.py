@@ -30,7 +30,7 @@ from qgs_anchors.landmark.fields import (
 from qgs_anchors.landmark.places import cells, rows_in_square
 
 COLOR_MARGIN = 0.02
-"""Least distance of initial colours from 0 and from 1, where they would get no gradient."""
+"""Least distance of initial colours from 0 and 1, where tanh would give them no gradient."""
 
 _OF_CHANNELS = ("linear.weight", "linear.bias")
 

@@ -51,7 +51,7 @@ def chosen_kernel(
     if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
-    warn_once(f"attention uses {found}: a bias for each query and token needs too much memory")
+    warn_once(f"attention uses kernel={found}: a bias for all query-token pairs is too large")
     return found
 
 

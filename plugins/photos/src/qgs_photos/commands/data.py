@@ -58,7 +58,7 @@ ImageSize: TypeAlias = Annotated[
 ]
 TestScenes: TypeAlias = Annotated[
     str | None,
-    typer.Option(help="File that names the test scenes: an evaluation index or a list."),
+    typer.Option(help="File that lists test scenes, or an evaluation index. Default: keep splits."),
 ]
 LeaveOutBroken: TypeAlias = Annotated[
     bool,

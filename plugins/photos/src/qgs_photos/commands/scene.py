@@ -31,7 +31,7 @@ Model: TypeAlias = Annotated[
     str | None,
     typer.Option(
         help="Trained model that makes the Gaussians to start from; none: start from depth "
-        "measured in the photos. Default: a shipped model for fewer than four photos, else none."
+        "estimated from the photos. Default: a shipped model for fewer than four photos, else none."
     ),
 ]
 PhotoSize: TypeAlias = Annotated[
@@ -74,7 +74,7 @@ Adjust: TypeAlias = Annotated[
     list[Adjustment] | None,
     typer.Option(
         help="Optimise a property of each photo together with the Gaussians. poses: its camera. "
-        "exposure: an affine map of its colours. Repeatable."
+        "exposure: an affine map of its colours. Repeatable. Default: neither."
     ),
 ]
 Masks: TypeAlias = Annotated[
@@ -104,7 +104,7 @@ def scene(
     """Make the best 3D scene from photos in a given time.
 
     Writes a PLY, a .splat file, an HTML page, and scores on held-out photos. First Gaussians are
-    made from depth in the photos or by a model; then they are optimised on the photos. The settings
+    made from estimated depth or by a model; then they are optimised on the photos. The settings
     that were chosen are printed as a command that makes the scene again. Ctrl-C ends the
     optimisation early and writes its result.
     """
