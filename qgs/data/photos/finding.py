@@ -35,7 +35,7 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     where = found_files(folder, photos, maps, images, outside)
     for file in () if outside else (*photos, *maps):
         # A listing of a stranger must not name other files of this machine.
-        if not is_inside(folder, where.get(file, file)):
+        if not is_inside(folder, where.get(file, file)) and file.is_file():
             raise ValueError(
                 f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: move "
                 "it into the folder, or train with data.outside=true"
@@ -51,7 +51,7 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     moved = {
         file: real
         for file, real in where.items()
-        if real.name != file.name or not (real == file or images or "images_" in real.parent.name)
+        if real.name != file.name or not (real == file or images or real.parent.name.startswith("images_"))
     }
     for file in [*moved][:1]:
         warn_once(
@@ -72,7 +72,8 @@ def found_files(
 
     A file that is not where it is listed is searched for in `folder` and in its folder of images:
     under its whole listed path, then without the first folder of this path, then without the first
-    two, and so on. images, outside: see `located`. Raises ValueError if two files fit a name.
+    two, and so on. images, outside: see `located`. Raises ValueError if two files fit a name, or if
+    one file fits the names of two photos.
     """
     indexed = cache(_index)
     photo_folder = image_folder(folder, images)
@@ -84,7 +85,7 @@ def found_files(
         read_there = (outside or is_inside(folder, file)) and not (images and file in photos)
         if read_there and (0, file.name) in indexed(file.parent):
             where[file] = file
-    taken = {*where}
+    taken = {file: file for file in where}
     for file in files:
         if file in where:
             continue
@@ -94,11 +95,18 @@ def found_files(
         places = [photo_folder] if images and file in photos else [folder, photo_folder]
         for first, place in product(range(len(parts)), places):
             real = _resolved(place, parts[first:], indexed)
-            # A file that is found for one listed is not meant by another: a photo is no mask.
-            if real and real not in taken:
+            if real is None:
+                continue
+            other = taken.setdefault(real, file)
+            if other == file:
                 where[file] = real
-                taken.add(real)
                 break
+            # A file that exists as listed is meant by no other name; a photo is no mask.
+            if other != real and {file, other} <= photos.keys():
+                raise ValueError(
+                    f"{real} may be {name_shown(str(other))} or {name_shown(str(file))}: correct "
+                    "the names in the listing"
+                )
     return where
 
 
@@ -136,7 +144,7 @@ def _spellings(name: str) -> enumerate[str]:
     """Yield (0, name), (1, name in lower case and Unicode form NFC), (2, (1) without suffix)."""
     key = unicodedata.normalize("NFC", name).casefold()
     stem, dot, suffix = key.rpartition(".")
-    known = dot + suffix in (*Image.registered_extensions(), ".npy", ".heic")
+    known = dot + suffix in (*Image.registered_extensions(), ".heic")
     return enumerate((name, key, stem if known else key))
 
 
