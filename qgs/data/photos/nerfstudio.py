@@ -219,11 +219,16 @@ def _lens(values: _Values) -> Lens | None:
     return lens
 
 
+def _is_end(first: str, second: str) -> bool:
+    """Return whether one path is the other without its first folders."""
+    return f"/{first}".endswith(f"/{second}") or f"/{second}".endswith(f"/{first}")
+
+
 def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[PhotoFrame]:
     """Return `frames` with the splits that nerfstudio's lists of file names give.
 
     Frames in no list belong to the split that has no list; if both splits have lists, these frames
-    are unused.
+    are unused. A frame in both lists is a test frame. Names fit if one is the end of the other.
     """
     known = {frame.name for frame in frames}
 
@@ -232,16 +237,19 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
         given = data.get(key) or []
         if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
             raise ValueError(f"{key!r} must be a list of file names, got {given!r}")
-        names = set(map(image_name, given))
-        if unknown := sorted(names - known):
-            raise ValueError(
-                f"{key!r} names {unknown[0]}, but there is no such frame: remove the name"
-            )
+        names = set[str]()
+        for wanted in map(image_name, given):
+            fitting = {wanted} & known or {name for name in known if _is_end(name, wanted)}
+            if not fitting:
+                raise ValueError(
+                    f"{key!r} names {wanted}, but there is no such frame: remove the name"
+                )
+            names |= fitting
         return names
 
     train = named("train")
     test = named("test") | named("val")
-    splits = {**dict.fromkeys(test, "test"), **dict.fromkeys(train, "train")}
+    splits = {**dict.fromkeys(train, "train"), **dict.fromkeys(test, "test")}
     rest = "train" if test else None
     if train:
         rest = "unused" if test else "test"

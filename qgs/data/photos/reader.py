@@ -241,7 +241,9 @@ def mended(found: Listing) -> Listing:
     if scaled.any():
         warn_once(f"{found.file}: a scale is divided out of the rotations of {scaled.sum()} frames")
     distances = (poses[:, :3, 3] - poses[:, :3, 3].nanmedian(0).values).norm(dim=-1)
-    far = distances > _STRAY * distances.nanquantile(0.75)
+    # The lower of two: of three or four cameras, the far one is no measure.
+    usual = distances.nanquantile(0.75, interpolation="lower")
+    far = (distances > _STRAY * usual) & (usual > 0)
     stray = FrameProblem(
         f"the camera stands more than {_STRAY} times as far away as most other cameras",
         "correct its pose, or remove the frame",
