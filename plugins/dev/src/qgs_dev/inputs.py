@@ -64,7 +64,7 @@ def many(case: Case) -> Sizes:
 
 
 def inputs_of(case: Case, sizes: Sizes = USUAL, seed: int = 0) -> Inputs:
-    """Return random arguments for the component of `case`, by name."""
+    """Return random arguments for the component of `case`, by argument name."""
     maker = Maker(case, sizes, seed)
     return {name: getattr(maker, name)() for name in FACTS[case.slot]["arguments"]}
 
@@ -81,7 +81,7 @@ def required_places(case: Case) -> set[str]:
 
 
 def memory_width(case: Case) -> int:
-    """Return the width of memory features that the component requires, or the model's width."""
+    """Return the width of memory features: as the component requires, or else the model's width."""
     features = "memory.features"
     return sizes_of(case.reads.get(features, MEMORY_FIELDS[features]), case.dims)[0]
 
@@ -129,7 +129,7 @@ class Maker:
         return (low + (high - low) * numbers).to(self.case.device)
 
     def in_front(self, points: Tensor) -> Tensor:
-        """Scale and move normally distributed points (..., 3) to the front of the cameras."""
+        """Scale and shift normally distributed points (..., 3) to lie in front of the cameras."""
         return 0.4 * points + torch.tensor([0.0, 0.0, 1.5]).to(points)
 
     def field(self, spec: FieldSpec) -> Tensor:
@@ -198,7 +198,7 @@ class Maker:
         )
 
     def gaussians(self) -> Gaussians:
-        """Return random visible Gaussians, with the optional tensors for which `gives` is True."""
+        """Return random Gaussians in front of the cameras, with the optional tensors needed."""
         return Gaussians(
             means=self.in_front(self.normal("BG3")),
             scales=self.uniform(0.05, 0.3, "BG3"),
@@ -212,7 +212,7 @@ class Maker:
     def gives(self, name: str) -> bool:
         """Return True if Gaussians should have the optional tensor `name`, such as "sh".
 
-        Gaussians for renderers have all, others only those that the component requires.
+        Renderers get all optional tensors; other components get only those that they require.
         """
         return self.case.slot == "renderer" or f"gaussians.{name}" in self.case.reads
 
@@ -221,7 +221,7 @@ class Maker:
         return LayerPrediction(self.gaussians(), self.state())
 
     def rendering(self) -> Rendering:
-        """Return random renderings of all views; of no view if a loss needs no renderings."""
+        """Return random renderings of all views, or of no view if the loss needs no renderings."""
         rendering = self.all_views()
         unseen = getattr(self.case.component, "renderings", "") == "none"
         return map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering
@@ -249,8 +249,8 @@ class Maker:
 def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
     """Return the shape of a field without the axes of scenes and of queries or tokens.
 
-    dims: sizes of the model. A size "4*D" is four times the model's width. Unknown names of sizes
-    stand for 4.
+    dims: sizes of the model. A size "4*D" is four times the model's width. A name that is
+    unknown, such as T, counts as 4.
     """
     named = {"D": dims.width, "h": dims.heads, "D/h": dims.width // dims.heads}
     sizes = []

@@ -38,8 +38,8 @@ def tensors_of(module: nn.Module) -> dict[str, Tensor]:
 def attributes(module: nn.Module) -> dict[str, Any]:
     """Return a module's attributes, as copies that can be compared with later ones.
 
-    Attributes of submodules, and of the classes of all these modules, are included. Left out are
-    parameters, buffers, submodules, and values of a `cached_property`, computed from the module.
+    The result includes attributes of submodules, and of the classes of all these modules. It leaves
+    out parameters, buffers, submodules and values of a `cached_property`.
     """
     found = {}
     for name, part in module.named_modules():

@@ -54,7 +54,7 @@ def check_name(name: str) -> None:
     # The new package must neither hide an installed one nor be hidden by it.
     other = f"choose another name, such as `{name}-things`"
     if module in sys.stdlib_module_names or module in packages_distributions():
-        raise ValueError(f"`{name}` is the name of an installed package; {other}")
+        raise ValueError(f"the name `{name}` is taken by an installed package; {other}")
     for entry in entry_points(group="qgs.plugins", name=name):
         owner = entry.dist.name if entry.dist else "a plugin"
         raise ValueError(f"the plugin name `{name}` is taken by {owner}; {other}")

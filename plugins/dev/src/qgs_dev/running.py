@@ -117,9 +117,9 @@ class CheckResult:
 class CaseRun:
     """Run of all checks on one case. If `builds` or `runs` fails, the other checks are skipped.
 
-    expected: reasons for expected failures, by name of the check. It counts as a failure if such a
-    check passes. variant: True if the component has had an earlier case; then only checks with
-    `variants` run.
+    expected: reason for each expected failure, by name of the check. If a check with a reason
+    passes, it counts as failed. variant: True if the component has had an earlier case; then only
+    checks with `variants` run.
     """
 
     case: Case
@@ -184,27 +184,28 @@ def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
 
 
 def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) -> None:
-    """Raise ValueError for an expected failure without a reason, or of a check that does not run.
+    """Raise ValueError for an expected failure that has no reason or is not allowed.
 
-    expected: reasons by name of the check.
+    A check may be expected to fail only if it runs in `runs` and is neither `builds` nor `runs`.
+    expected: reason for each expected failure, by name of the check.
     """
     made = {check.name for run in runs for check in checks_for(run.case, variant=run.variant)}
     for name, why in expected.items():
         if name not in made.difference(BASICS):
-            fix = did_you_mean(str(name), made, "checks made of it")
+            fix = did_you_mean(str(name), made, "checks that run on it")
             raise ValueError(
                 f"the check `{name}` cannot be an expected failure, because it does not run on "
                 f"this component with these options, or because other checks need it; {fix}"
             )
         if not (isinstance(why, str) and why.strip()):
-            raise ValueError(f"the expected failure of `{name}` needs a text that gives the reason")
+            raise ValueError(f"the expected failure of `{name}` has no reason: give it as text")
 
 
 def with_place(error: BaseException, component: type) -> str:
     """Return type and message of `error`, and FILE:LINE in the component's package if known.
 
-    FILE:LINE is the innermost call in the package before the error. It is left out for a
-    ContractError, and for an error from outside the package.
+    FILE:LINE is the innermost line of the traceback in the package. It is left out for a
+    ContractError, and if no line of the traceback is in the package.
     """
     # Notes say at which point of a check the error happened.
     noted = "".join(f"{note}, " for note in getattr(error, "__notes__", ()))
@@ -225,7 +226,7 @@ DEPTHS = (2, 12)
 
 
 def cases_of(installed: InstalledPlugin) -> list[Case]:
-    """Return a case for each component with its default options, and for each of the `examples`.
+    """Return a case for the default options of each component, and for each example of the plugin.
 
     Raises PluginError for an example that is not a Config of a component of the plugin.
     """
@@ -270,7 +271,7 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
         try:
             refuse_unexpectable(exempted, concerned)
         except (ValueError, AttributeError) as error:
-            raise _unsound(installed, "exemptions", f"those of {owner!r}: {error}") from error
+            raise _unsound(installed, "exemptions", f"entry {owner!r}: {error}") from error
         for run in concerned:
             run.expected = {**run.expected, **exempted}
     return runs

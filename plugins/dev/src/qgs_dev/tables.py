@@ -124,8 +124,8 @@ def recipe_path(slot: str) -> str:
 def option_rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:
     """Yield a table row for each option: name, type, default and meaning.
 
-    properties: JSON schema of each option, by name. The options of a mapping follow it, with names
-    such as `option.inner`. above: prefix of all names.
+    properties: JSON schema of each option, by name. If an option is a mapping, its inner options
+    follow, with names such as `option.inner`. above: prefix of all names.
     """
     for name, option in properties.items():
         default = inline(option["default"]) if "default" in option else "required"

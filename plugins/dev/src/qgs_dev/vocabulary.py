@@ -69,7 +69,7 @@ def masked(tree: Any, mask_BN: Tensor, other: Any) -> Any:
 
 
 def scalar(tree: Any) -> Tensor:
-    """Return the sum of all floating-point numbers in `tree` with random weights, in float64."""
+    """Return a randomly weighted sum of all floating-point numbers in `tree`, in float64."""
     total = torch.zeros(()).double()
     for index, tensor in enumerate(floating(tree).values()):
         # Equal weights would let errors of opposite signs cancel.
@@ -80,7 +80,7 @@ def scalar(tree: Any) -> Tensor:
 
 
 def gradients(total: Tensor, tree: Any) -> dict[str, Tensor]:
-    """Return the gradients of `total` by name, for the tensors of `tree` that it depends on."""
+    """Return the gradients of `total` for all tensors of `tree` that influence it, by name."""
     if not total.requires_grad:
         return {}
     given = {name: tensor for name, tensor in floating(tree).items() if tensor.requires_grad}
@@ -141,7 +141,7 @@ class Trial:
     def tracked(self, inputs: Inputs | None = None) -> Inputs:
         """Return copies of `inputs`, by default of `self.inputs`, whose tensors require gradients.
 
-        Of a renderer's cameras, only the tensors in `camera_gradients` require gradients.
+        Exception: camera tensors that a renderer does not list in `camera_gradients` require none.
         """
         component = self.case.component
         fixed: set[str] = set()
@@ -153,7 +153,7 @@ class Trial:
         )
 
     def state_of(self, outputs: Any) -> Any:
-        """Return the query state in outputs of a layer or feedback; all outputs for other slots."""
+        """Return the query state in `outputs` of a layer or feedback; else `outputs` unchanged."""
         return outputs[0] if self.case.slot in WITH_MEMORY else outputs
 
 
@@ -170,9 +170,9 @@ def expect_none(names: Iterable[Any], fault: str) -> None:
 
 
 def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float = 0.0) -> None:
-    """Raise ContractError if two trees differ by more than the tolerances.
+    """Raise ContractError if two trees differ by more than the tolerances `rtol` and `atol`.
 
-    where: start of the error message.
+    If both are 0, dtypes must agree, too. where: start of the message.
     """
     found = difference(one, other, rtol, atol)
     expect(not found, f"{where}, {found}")

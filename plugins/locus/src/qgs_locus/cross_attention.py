@@ -50,15 +50,16 @@ class RayBiasedCrossAttention(CrossAttention):
         """Bandwidth sigma of the bias: `sigma0` times the anchor's radius ("radius"), or `sigma0`
         for all anchors ("fixed")."""
         sigma0: float = Field(default=0.1, gt=0)
-        """Bandwidth sigma in radii of the anchor. With `bandwidth: fixed`, in world units."""
+        """Bandwidth sigma as a multiple of the anchor's radius. With `bandwidth: fixed`, sigma
+        itself, world units."""
         sigma_sq_min: float = Field(default=1e-3, gt=0)
-        """Lower bound of sigma^2 = (sigma0 r)^2, with r the anchor's radius, world units
-        squared."""
+        """Lower bound of sigma^2 = (sigma0 r)^2, world units squared. r is the anchor's
+        radius."""
         bias_min: float = Field(default=-20.0, lt=0)
         """Lower bound of the bias b, before it is multiplied by gamma."""
         direction_eps: float = Field(default=1e-6, gt=0)
-        """Least number by which the mean ray direction of a patch is divided to normalise it, even
-        if the direction is shorter."""
+        """Lower bound of the length by which a patch's mean ray direction is divided to normalise
+        it."""
         gamma_init: float = -2.25
         """Initial value of the learned g of each layer. The bias is multiplied by
         gamma = softplus(g)."""

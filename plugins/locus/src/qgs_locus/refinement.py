@@ -40,7 +40,7 @@ class AnchorRefinement(Refinement):
         Null means no limit."""
         zero_init: bool = False
         """Initialise the last layer of each MLP with zeros, so that anchors do not move at first.
-        With false, as in the LocusGS release, it is random."""
+        With false, as in the LocusGS release, this layer is initialised randomly."""
 
     config: Config
 

@@ -31,9 +31,9 @@ Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]
 """Block: index of the scene, slice of its queries, and buffers (n, M) for these n queries."""
 
 BLOCK = {"cpu": 2**22, "cuda": 2**25}
-"""Most numbers in all buffers (n, M) of a block together, by type of device.
+"""Largest total number of elements in the buffers (n, M) of a block, by device type.
 
-They fit into the caches of a CPU, and are enough to keep a GPU busy.
+Buffers of this size fit into the caches of a CPU, and are large enough to keep a GPU busy.
 """
 
 _kept = threading.local()
@@ -120,7 +120,7 @@ class AttentionBias(ABC):
     def dense(self, chosen: Tensor | None = None) -> Tensor:
         """Return the bias (B, N, M) of all queries, or (B, Q, M) of the Q queries `chosen`.
 
-        chosen: indices (Q,).
+        chosen: indices (Q,) of queries.
         """
         bias = self
         if chosen is not None:
@@ -144,7 +144,7 @@ class AttentionBias(ABC):
 
 
 def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...], ...]:
-    """Split queries (n, F) and values (n, M) by queries, into parts of about `_PART` values."""
+    """Split queries (n, F) and values (n, M) along axis n, into parts of about `_PART` values."""
     rows = max(_PART // max(of_pairs_nM.shape[1], 1), 1)
     return queries_nF.split(rows), of_pairs_nM.split(rows)
 

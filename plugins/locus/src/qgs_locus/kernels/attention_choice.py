@@ -1,9 +1,9 @@
 """Choice of the code that computes attention with a bias that depends on query and token.
 
-On a CPU, attention is computed block by block. On a GPU, torch's attention is used if one layer
-needs at most 1 / SHARE of the GPU's memory for the bias of all pairs of query and token, which
-every layer keeps for the backward pass. For larger sizes, Triton kernels are used, or blocks if
-Triton cannot be used. The speeds of these ways have not been compared on a GPU. The choice depends
+On a CPU, attention is computed block by block. On a GPU, torch's attention is used if the bias of
+all pairs of query and token needs at most 1 / SHARE of the GPU's memory in one layer. Every layer
+keeps this bias for the backward pass. For larger sizes, Triton kernels are used, or blocks if
+Triton cannot be used. The speeds of these three have not been compared on a GPU. The choice depends
 on sizes only, so all layers, steps and processes make the same choice.
 """
 
@@ -51,7 +51,7 @@ def chosen_kernel(
     if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
-    warn_once(f"attention uses kernel={found}: a bias for all query-token pairs is too large")
+    warn_once(f"attention uses {found} kernels: a bias for each query and token is too large")
     return found
 
 

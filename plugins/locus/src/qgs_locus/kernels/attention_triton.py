@@ -8,9 +8,9 @@ float32. Each sum is added in a fixed order, so a repeated run gives the same bi
 A query has five numbers: its anchor's centre mu = (x, y, z), factor = gamma / (2 sigma^2) and
 lower = gamma * bias_min. A token has six: moment and direction of its ray. `RayBias` in
 `qgs_locus.ray_bias` explains them. The functions of the bias get pointers (n, 1) and (1, m) to the
-first numbers of n queries and m tokens. `step` is the distance in memory of a token's numbers.
+first numbers of n queries and m tokens. `step` is the stride between two numbers of a token.
 
-Axes: as in `qgs_locus.kernels.attention_bias`. W is the head width d, rounded up to 2^i.
+Axes: as in `qgs_locus.kernels.attention_bias`. W is the head width d, rounded up to a power of two.
 """
 
 from typing import Any

@@ -26,7 +26,7 @@ _ROWS = 40
 Quality: TypeAlias = Annotated[
     int | None,
     typer.Option(
-        help="JPEG quality of images that must be encoded again. Default: encode them as PNG.",
+        help="JPEG quality of photos that cannot be copied unchanged. Default: write them as PNG.",
         min=1,
         max=100,
     ),
@@ -36,7 +36,9 @@ EveryNth: TypeAlias = Annotated[
 ]
 Geometry: TypeAlias = Annotated[
     int,
-    typer.Option(help="Number of scenes whose poses are checked by matching photos.", min=0),
+    typer.Option(
+        help="Number of scenes whose poses are checked by matching photos. 0: check none.", min=0
+    ),
 ]
 Format: TypeAlias = Annotated[
     str,
@@ -58,7 +60,9 @@ ImageSize: TypeAlias = Annotated[
 ]
 TestScenes: TypeAlias = Annotated[
     str | None,
-    typer.Option(help="File that lists test scenes, or an evaluation index. Default: keep splits."),
+    typer.Option(
+        help="File that names the test scenes: index or list. Default: splits of the data set."
+    ),
 ]
 LeaveOutBroken: TypeAlias = Annotated[
     bool,
@@ -209,7 +213,7 @@ def pack(
 def _opened(
     path: str, options: list[str], image_size: tuple[int, int] | None
 ) -> tuple[SceneSource, dict[str, Any]]:
-    """Return the source of the scenes at `path`, and its options for `packing.json`.
+    """Return the source of the scenes at `path`, and its options, to record them in `packing.json`.
 
     path: data set or recipe. options: settings of the source, as KEY=VALUE.
     """

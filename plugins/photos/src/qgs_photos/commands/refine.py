@@ -59,9 +59,9 @@ def refine(
 ) -> None:
     """Optimise the Gaussians of a reconstruction on the photos of its scene.
 
-    Photos with which the reconstruction was compared, and photos held out of training, are not
-    used. The result has the same files as a reconstruction. Two tables show the scores before and
-    after. Ctrl-C ends the optimisation early and writes its result.
+    The optimisation leaves out photos held out of training, and photos that served only to score
+    the reconstruction. The result has the same files as a reconstruction. Two tables show the
+    scores before and after. Ctrl-C ends the optimisation early and writes its result.
     """
     # a result is never overwritten: minutes of work are in it
     target = out or reconstruction / "refined"

@@ -25,7 +25,7 @@ class Blender(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """List the frames: first those for training, then held-out ones of val and test.
+        """Read the frames of all splits: first train, then val and test, which are held out.
 
         Raises ValueError if `images` is given, since transforms files name the folders of photos.
         """

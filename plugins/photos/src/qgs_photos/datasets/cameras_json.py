@@ -66,10 +66,10 @@ class CamerasJson(PhotoReader):
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
-        """Return whether `folder` has a `cameras.json` that is not another program's file.
+        """Return whether `folder` holds a `cameras.json` in this format, not of another program.
 
-        A file is recognised if it has both `c2w` and `K`, or if photos lie beside it. A file that
-        `qgs reconstruct` wrote is not.
+        The file must contain both `c2w` and `K`, or photos must lie beside it or in images/. A file
+        that `qgs reconstruct` wrote is not in this format.
         """
         file = folder / cls.listing
         if not file.is_file():
@@ -84,9 +84,11 @@ class CamerasJson(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """Return the cameras and photos of `folder`.
+        """Read the photos and cameras that the file in `folder` lists.
 
-        Raises ValueError if no camera names a photo and there are not as many photos as cameras.
+        images: folder with copies of the photos to read; None reads the listed photos. Raises
+        ValueError if the file lists no cameras, or names no photos and the folder has more or fewer
+        photos than the file has cameras.
         """
         file = folder / cls.listing
         cameras = _cameras(file, read_json(file, f"write {_FORM}"))
@@ -111,9 +113,7 @@ class CamerasJson(PhotoReader):
             find = dict
         read = [_Camera(*pair, find) for pair in zip(cameras, listed, strict=True)]
         if any(camera.in_parts for camera in read):
-            warn_once(
-                f"intrinsics in {file} are read as fractions of width and height: none is above 3"
-            )
+            warn_once(f"intrinsics up to 3 in {file} are read as fractions of width and height")
         return Listing(file, [camera.frame(folder) for camera in read])
 
 
@@ -150,7 +150,7 @@ def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
 
 
 def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
-    """Return the first of `keys` that has a value in `values`; "" if none has."""
+    """Return the first of `keys` that has a value in `values`; "" if no key has one."""
     return next((key for key in keys if values.get(key) is not None), "")
 
 
