@@ -1,4 +1,4 @@
-"""Helpers of the checks: trees of tensors, trial runs of a component, and expectations.
+"""Helpers of the checks: trees of tensors, trial runs of a component, and assertions.
 
 A tree is a nested structure of tensors, such as the inputs of a component. A tensor in a tree has a
 dotted name, such as `state.features`.

@@ -37,7 +37,7 @@ class RadiusOptions(ComponentConfig):
 def radius_field(options: RadiusOptions) -> Fields:
     """Return the state field of raw radii rho (B, N, 1).
 
-    The field's `encoding` tells the values of `radius_bound` and `radius_min`, so a recipe is
+    The field's `encoding` holds the values of `radius_bound` and `radius_min`, so a recipe is
     refused if two of its components have different values.
     """
     reading = {

@@ -48,7 +48,7 @@ def dense_bias(
 
 @full_precision
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
-    """Normalise rays (B, M, 6), and return moments and directions as rows (B, 6, M).
+    """Normalise rays (B, M, 6), and return them as columns (B, 6, M), moments before directions.
 
     Each ray is divided by the length of its direction, or by `direction_eps` if the length is less.
     """

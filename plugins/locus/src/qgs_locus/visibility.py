@@ -14,9 +14,9 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 class AnchorVisibility(Loss):
     """Mean distance of anchor centres to the image of the nearest target view.
 
-    The distance is |u| - 1 plus |v| - 1, each at least 0, with the centre's pixel u, v scaled to
-    [-1, 1] over the image. An anchor centre inside an image has distance 0. This is equation (8) of
-    the plugin's README, computed by `qgs.losses.view_visibility`.
+    The distance is relu(|u| - 1) + relu(|v| - 1), at most `clamp`, with the centre's pixel u, v
+    scaled to [-1, 1] over the image. A centre inside an image has distance 0. This is equation (8)
+    of the plugin's README, computed by `qgs.losses.view_visibility`.
     """
 
     name = "anchor_visibility"

@@ -15,7 +15,7 @@ _TWO = np.float32(2)
 
 @kernel
 def write(queries, tokens, out):
-    """Write the bias max(-factor D^2, lower) of queries, with numbers factor and lower, to `out`.
+    """Write the bias max(-factor D^2, lower) of each query and token to `out`, (n, M).
 
     D = |mu x d - m| is the distance of the anchor's centre mu from the ray (moment m, direction d).
     """

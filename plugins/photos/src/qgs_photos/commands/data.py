@@ -32,7 +32,10 @@ Quality: TypeAlias = Annotated[
     ),
 ]
 EveryNth: TypeAlias = Annotated[
-    int | None, typer.Option(help="Make every Nth scene a test scene. Default: keep splits.", min=2)
+    int | None,
+    typer.Option(
+        help="Make every Nth scene a test scene. Default: keep the splits of the data set.", min=2
+    ),
 ]
 Geometry: TypeAlias = Annotated[
     int,
@@ -67,8 +70,7 @@ TestScenes: TypeAlias = Annotated[
 LeaveOutBroken: TypeAlias = Annotated[
     bool,
     typer.Option(
-        help="Leave out scenes that cannot be read, and list them at the end. Default: stop at "
-        "the first."
+        help="Leave out unreadable scenes, and list them at the end. Default: stop at the first."
     ),
 ]
 Quick: TypeAlias = Annotated[
