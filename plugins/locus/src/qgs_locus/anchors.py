@@ -66,7 +66,7 @@ class FrustumCenters(ComponentConfig):
 
 
 class AnchoredQueries(LearnedQueries):
-    """N learned queries: features, anchor centres mu and raw radii rho.
+    """N learned queries: features, anchor centres mu and raw radii rho (before softplus).
 
     Every scene starts with the same N queries.
     """

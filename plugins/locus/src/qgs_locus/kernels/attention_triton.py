@@ -9,6 +9,7 @@ A query has five numbers: its anchor's centre mu = (x, y, z), factor = gamma / (
 lower = gamma * bias_min. A token has six: moment and direction of its ray. `RayBias` in
 `qgs_locus.ray_bias` explains them. The functions of the bias get pointers (n, 1) and (1, m) to the
 first numbers of n queries and m tokens. `step` is the stride between two numbers of a token.
+The kernels take these numbers as read_q (B, N, 5) and read_k (B, 6, M).
 
 Axes: as in `qgs_locus.kernels.attention_bias`. W is the head width d, rounded up to a power of two.
 """
@@ -157,7 +158,8 @@ def _backward_queries(
     """Write the gradient of q to `dq`, and the gradient of the bias to `of_bias` (B, h, N, F).
 
     `of_bias` holds the gradient with respect to the F numbers of each query, for each head. If
-    `dq` or `of_bias` is None, its gradient is not computed.
+    `dq` or `of_bias` is None, its gradient is not computed. g: gradient of the attention result.
+    rowsum: sum of g times the result over the head's channels, (B, h, N).
     """
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
@@ -196,7 +198,8 @@ def _backward_tokens(
 ):  # fmt: skip
     """Write the gradient of k to `dk` and that of v to `dv`, unless `dk` or `dv` is None.
 
-    Rows beyond the last query get log-sum-exp inf, so their attention weights are 0.
+    Rows beyond the last query get log-sum-exp inf, so their attention weights are 0. g: gradient
+    of the attention result. rowsum: sum of g times the result over the head's channels, (B, h, N).
     """
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
@@ -264,7 +267,7 @@ class TritonAttention(torch.autograd.Function):
 
 
 def _launch(kernel: Any, *tensors: Any) -> None:
-    """Run a kernel for each head and block. Tensors with four axes come with their strides."""
+    """Run a kernel for each head and block; pass tensors with four axes with their strides."""
     q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)

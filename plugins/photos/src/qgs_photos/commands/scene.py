@@ -103,8 +103,8 @@ def scene(
 ) -> None:
     """Make the best 3D scene from photos in a given time.
 
-    Writes a PLY, a .splat file, an HTML page, and scores on held-out photos. First Gaussians are
-    made from estimated depth or by a model; then they are optimised on the photos. The settings
+    Writes a PLY, a .splat file, an HTML page, and scores on held-out photos. First, Gaussians are
+    made from depth in the photos or by a model; then they are optimised on the photos. The settings
     that were chosen are printed as a command that makes the scene again. Ctrl-C ends the
     optimisation early and writes its result.
     """
