@@ -249,8 +249,8 @@ class Maker:
 def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
     """Return the shape of a field without the axes of scenes and of queries or tokens.
 
-    dims: sizes of the model. A size "4*D" is four times the model's width. A name that is
-    unknown, such as T, counts as 4.
+    dims: sizes of the model. A size "4*D" is four times the model's width. A name other
+    than D, h and D/h counts as 4.
     """
     named = {"D": dims.width, "h": dims.heads, "D/h": dims.width // dims.heads}
     sizes = []

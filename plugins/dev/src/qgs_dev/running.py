@@ -186,8 +186,8 @@ def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
 def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) -> None:
     """Raise ValueError for an expected failure that has no reason or is not allowed.
 
-    A check may be expected to fail only if it runs in `runs` and is neither `builds` nor `runs`.
-    expected: reason for each expected failure, by name of the check.
+    An expected failure is allowed for checks that `runs` include, except for the two checks
+    "builds" and "runs", which all others need. expected: reason for each failure, by check name.
     """
     made = {check.name for run in runs for check in checks_for(run.case, variant=run.variant)}
     for name, why in expected.items():
@@ -198,7 +198,7 @@ def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) ->
                 f"this component with these options, or because other checks need it; {fix}"
             )
         if not (isinstance(why, str) and why.strip()):
-            raise ValueError(f"the expected failure of `{name}` has no reason: give it as text")
+            raise ValueError(f"the expected failure of `{name}` has no reason: give one as text")
 
 
 def with_place(error: BaseException, component: type) -> str:

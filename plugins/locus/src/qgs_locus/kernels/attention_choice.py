@@ -51,7 +51,7 @@ def chosen_kernel(
     if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
-    warn_once(f"attention uses {found} kernels: a bias for each query and token is too large")
+    warn_once(f"attention uses {found}: the bias of all queries and tokens needs too much memory")
     return found
 
 

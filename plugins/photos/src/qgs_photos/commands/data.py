@@ -64,7 +64,7 @@ ImageSize: TypeAlias = Annotated[
 TestScenes: TypeAlias = Annotated[
     str | None,
     typer.Option(
-        help="File that names the test scenes: index or list. Default: splits of the data set."
+        help="File of test scenes: an evaluation index or a list. Default: keep the splits."
     ),
 ]
 LeaveOutBroken: TypeAlias = Annotated[

@@ -86,9 +86,9 @@ class CamerasJson(PhotoReader):
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """Read the photos and cameras that the file in `folder` lists.
 
-        images: folder with copies of the photos to read; None reads the listed photos. Raises
-        ValueError if the file lists no cameras, or names no photos and the folder has more or fewer
-        photos than the file has cameras.
+        images: folder of the photos or of scaled copies, such as images_4; None: the listed photos,
+        or those of the default folder. Raises ValueError if the file lists no cameras, or if it
+        names no photos and the numbers of cameras and photos differ.
         """
         file = folder / cls.listing
         cameras = _cameras(file, read_json(file, f"write {_FORM}"))
