@@ -140,8 +140,8 @@ def load_ply(path: str | Path) -> Gaussians:
     # Readers raise anything of a damaged file.
     except Exception as error:
         raise ValueError(
-            f"{path} cannot be read as Gaussians ({one_line(error)}): copy it again if it is a PLY, "
-            ".spz or .splat; .sog and others become a PLY by `npx @playcanvas/splat-transform IN "
+            f"{path} cannot be read as Gaussians ({one_line(error)}): copy it again if it is PLY, "
+            ".spz or .splat; .sog and others become PLY by `npx @playcanvas/splat-transform IN "
             "OUT.ply`"
         ) from error
     # In float64 norms are finite; a quaternion of 0 becomes NaN, which is left out.

@@ -51,7 +51,8 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
     moved = {
         file: real
         for file, real in where.items()
-        if real.name != file.name or not (real == file or images or real.parent.name.startswith("images_"))
+        if real.name != file.name
+        or not (real == file or images or real.parent.name.startswith("images_"))
     }
     for file in [*moved][:1]:
         warn_once(
