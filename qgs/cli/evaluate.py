@@ -32,8 +32,8 @@ def evaluate(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the results. Default: RUN/evaluation; RUN/evaluation-N if settings "
-            "differ from those of the run; ./evaluation_NAME for the model of a plug-in or a URL."
+            help="Folder for the results. Default: RUN/evaluation or, with changed settings, "
+            "RUN/evaluation-N; ./evaluation_NAME for the model of a plug-in or a URL."
         ),
     ] = None,
     strict: Annotated[
@@ -42,10 +42,7 @@ def evaluate(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Score a checkpoint on held-out views.
-
-    Two baselines are scored as well: the nearest input view and the mean input colour.
-    """
+    """Score a checkpoint, the nearest input view and the mean input colour on held-out views."""
     console = Console()
     settings = list(overrides or ())
     if index is not None:

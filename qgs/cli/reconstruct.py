@@ -57,12 +57,10 @@ def reconstruct(
 ) -> None:
     """Reconstruct a scene from photos.
 
-    Writes Gaussians (PLY), renderings beside the photos, depth maps, renderings of an
-    orbit, and the cameras. Held-out photos are rendered and scored. For your own photos,
-    qgs searches for the best scale of the camera positions.
+    Writes Gaussians (PLY), renderings, depth maps, an orbit and cameras. Scores held-out
+    photos. Searches for the best scale of the camera positions of your own photos.
 
-    Afterwards, `qgs refine OUT PHOTOS` fits the Gaussians to all photos, and
-    `qgs video OUT` makes a video of them.
+    `qgs refine OUT PHOTOS` then fits the Gaussians to all photos; `qgs video OUT` films.
     """
     _refuse_unusable(out, overwrite)
 

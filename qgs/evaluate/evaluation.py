@@ -39,10 +39,9 @@ def evaluate(
     """Score `model` with the metrics of `recipe` on the recipe's test views.
 
     The model keeps its device and its mode. For a scene that fails, the result has the reason.
-    step: number of optimiser steps after which the weights were saved. observe: called after each
-    scene with the numbers of finished and of all scenes. views_of: function that returns the view
-    settings of a sample, by default the recipe's. sampler: view sampler, by default the recipe's.
-    show: called with each sample and its rendered targets.
+    step: optimiser steps after which the weights were saved. observe: called after each scene with
+    the numbers of finished and of all scenes. views_of: returns the view settings of a sample;
+    None: the recipe's. sampler: None: the recipe's. show: called with a sample and its renderings.
 
     Raises the errors of the data source, of `read_index` and of `Measures`, and ValueError if no
     scene could be scored.

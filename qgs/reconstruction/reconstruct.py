@@ -37,20 +37,18 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct one scene from photos, as the command `qgs reconstruct` does.
 
-    Cameras are moved to the frame and scale of the model's recipe. If the recipe's scale is
-    constant and the photos are not training data, `find_scale` searches for the scale.
+    Cameras are moved to the frame and scale of the model's recipe. If its scale is constant and the
+    photos are not training data, `find_scale` searches for the scale.
 
-    photos: a folder of photos and cameras, or its URL. Or Views (1, V) with OpenCV cameras in any
-        world; all of them are inputs unless `inputs` or `frames` is given.
+    photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras in any world. Views are
+        all inputs unless `inputs` or `frames` is given.
     inputs: number of input photos; None uses the recipe's number.
-    frames: input photos, by number or file name; None chooses photos that overlap and are about as
-        far apart as in the model's training.
+    frames: input photos, by number or file name; None chooses photos that overlap.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
-    size: (H, W) to which a folder's images are cropped and resized; None uses the recipe's size for
-        training data, and keeps the aspect ratio of other photos.
-    scene: name of a scene in the folder; None stands for the only scene.
-    overrides: changes of the recipe's `views`, such as "views.scale=auto".
-    tune: what to fit to the inputs first, such as "queries:50"; None fits nothing.
+    size: (H, W) to crop and resize photos to; None: that of training, in the photos' aspect ratio.
+    scene: name of a scene in the folder; None: the only scene.
+    overrides: changes of the recipe's `views`, such as "views.scale=auto". tune: what to fit to the
+        inputs first, such as "queries:50"; None fits nothing.
 
     Raises ValueError if the model has no recipe, for several scenes, for images outside of [0, 1].
     """

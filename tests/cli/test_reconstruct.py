@@ -138,7 +138,7 @@ def test_photos_that_are_not_there_are_refused(photos):
     must_refuse(r"--frames: '0-8' is no photo", frame_list, "0-8", "--frames", found)
     found.frame_name = ["a/1.png", "b/1.png", "11.png", *"defg"].__getitem__
     assert frame_list("b/1.png", "--frames", found) == [1]
-    reason = r"'1\.png' fits 0 \(a/1\.png\), 1 \(b/1\.png\)\."
+    reason = r"'1\.png' matches 0 \(a/1\.png\), 1 \(b/1\.png\)\."
     must_refuse(reason, frame_list, "1.png", "--frames", found)
 
 

@@ -33,7 +33,7 @@ def test_held_out_times_are_compared_with_and_never_inputs(photos):
     inputs, compared = chosen(photos, 4, held_out=(3, 8))
     assert compared == (3,)
     assert not {3, 8} & {*inputs}
-    must_refuse("7 moments, too few", chosen, photos, 8, held_out=(3, 8))
+    must_refuse("7 different times, too few", chosen, photos, 8, held_out=(3, 8))
 
 
 def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):

@@ -173,7 +173,7 @@ def tags(page, name=r"\w+"):
 def test_trained_models_are_shown_on_rooms_they_never_saw(page):
     text = html.unescape(page)
     assert "test/000001" in text
-    assert f"{RUN}: step 7000; more: step 7000" in text
+    assert f"{RUN}: 7000; more: 7000" in text
     assert "<h2>Training</h2>" in page
 
 

@@ -1,21 +1,19 @@
 """Read and check chunk files in RealEstate10K's format, and list the scenes of a folder.
 
-pixelSplat published RealEstate10K and ACID in this format, DepthSplat published DL3DV in it. In
-the folder of a data set, train/index.json and test/index.json map the key of a scene to a chunk
-file such as 000000.torch. A chunk file is a list with a mapping for each scene of V frames:
+pixelSplat published RealEstate10K and ACID so, DepthSplat DL3DV. In the folder of a data set,
+train/index.json and test/index.json map the key of a scene to a chunk file such as 000000.torch.
+A chunk file is a list with a mapping for each scene of V frames:
 
 - `key`: name of the scene. `url`: address of its video. `timestamps`: the frames' times in the
   video, (V,).
-- `cameras`: (V, 18) float32. A row is fx, fy, cx, cy divided by the image's width and height, two
-  unused numbers, and the rows of the 3 x 4 OpenCV world-to-camera matrix.
+- `cameras`: (V, 18) float32: fx, fy, cx, cy divided by the image's width and height, two unused
+  numbers, the rows of the 3 x 4 OpenCV world-to-camera matrix.
 - `images`: a list of V uint8 tensors with the bytes of JPEG or PNG files.
 
 `qgs data pack` adds keys that other readers ignore:
-
 - `names`: V names of the frames. `sizes`: (V, 2), height and width of every image.
 - `masks`: a list of V uint8 tensors with the bytes of PNG files, empty for frames without a mask.
-- `held_out`: indices of frames that training must not use.
-- `times`: (V,) float64, times of the frames; missing for a static scene.
+- `held_out`: indices of frames that training must not use. `times`: (V,) float64, if times exist.
 """
 
 import io

@@ -41,8 +41,7 @@ def bench(
 ) -> None:
     """Measure size, latency and memory of the models of one or more recipes.
 
-    Weights, photos and poses are random. Latency and FLOPs are those of the model, from photos to
-    Gaussians, without rendering.
+    Weights and photos are random. Latency and FLOPs are from photos to Gaussians.
     """
     from rich.console import Console
 
