@@ -40,17 +40,16 @@ def reconstruct(
     Cameras are moved to the frame and scale of the model's recipe. If its scale is constant and the
     photos are not training data, `find_scale` searches for the scale.
 
-    photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras in any world. Views are
-        all inputs unless `inputs` or `frames` is given.
-    inputs: number of input photos; None uses the recipe's number.
-    frames: input photos, by number or file name; None chooses photos that overlap.
+    photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras, which are all inputs
+        unless `inputs` or `frames` is given.
+    inputs: number of input photos; None: the recipe's. frames: input photos, by number or file
+        name; None chooses photos that overlap.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
     size: (H, W) to crop and resize photos to; None: that of training, in the photos' aspect ratio.
-    scene: name of a scene in the folder; None: the only scene.
-    overrides: changes of the recipe's `views`, such as "views.scale=auto". tune: what to fit to the
-        inputs first, such as "queries:50"; None fits nothing.
+    scene: name of a scene in the folder; None: the only one. overrides: changes of the recipe's
+        `views`. tune: what to fit to the inputs first, such as "queries:50"; None: nothing.
 
-    Raises ValueError if the model has no recipe, for several scenes, for images outside of [0, 1].
+    Raises ValueError without a recipe, for several scenes, and for images outside of [0, 1].
     """
     recipe = _recipe(model, overrides, tune)
     seen: Sequence[int] | None = None
