@@ -189,7 +189,10 @@ class Case:
         return module
 
     def with_at_most(self, **sizes: int) -> "Case":
-        """Return a copy with each option in `sizes` at most that value; this case if invalid."""
+        """Return a copy in which options named in `sizes` are at most the values given there.
+
+        Return this case unchanged if the component reports problems with the new options.
+        """
         given = dict(self.config)
         lower = {name: size for name, size in sizes.items() if (given.get(name) or 0) > size}
         smaller = self.with_config(self.config.model_copy(update=lower))

@@ -55,9 +55,10 @@ class EllipsoidQueries(LearnedQueries):
         return {**CENTER_FIELD, **shape_fields(config)}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return whether weight decay applies to a parameter; it never applies to rotations.
+        """Return whether weight decay applies to `parameter`: never to rotations.
 
-        Decay would only change lengths of quaternions, which have no effect on results.
+        Other parameters decay as in the base class. Weight decay of rotations would only change
+        lengths of quaternions, which have no effect on results.
         """
         return name != "rotation" and super().decays(name, parameter)
 
@@ -79,12 +80,13 @@ class EllipsoidQueries(LearnedQueries):
 
 
 def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Convert weights of a LocusGS recipe to weights of this recipe with ellipsoidal anchors.
+    """Convert weights of a LocusGS model to weights of a model with ellipsoidal anchors.
 
-    The recipe must keep LocusGS's head. Each radius becomes three equal radii, which the refinement
-    changes by equal steps. Rotations are the identity. If the refinement has `rotation: false`, the
-    model then computes the same as LocusGS. Weights of the MLP that refines rotations are missing,
-    so load the result with `strict=False`. Raises KeyError if the weights have no radii.
+    The new model must have LocusGS's head. Each radius becomes three equal radii, and the converted
+    refinement changes all three by equal steps. Rotations are the identity. If the refinement has
+    `rotation: false`, the new model computes the same as LocusGS. Weights of the MLP that refines
+    rotations are missing, so load the result with `strict=False`. Raises KeyError if the weights
+    have no radii.
     """
     converted = {name: _tripled(name, values) for name, values in weights.items()}
     converted["queries.raw_radii"] = converted.pop("queries.raw_radius")

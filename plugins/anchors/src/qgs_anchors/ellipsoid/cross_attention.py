@@ -14,10 +14,10 @@ from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 class EllipsoidCrossAttention(RayBiasedCrossAttention):
     """Attention `locus/ray_biased` with an ellipsoid instead of a ball around the anchor's centre.
 
-    The distance from the centre to a ray is measured in radii of the ellipsoid: along each axis, in
-    the radius of that axis. Options mean the same as in `locus/ray_biased`; `sigma_sq_min` is the
-    lower bound of (sigma0 r)^2 for the radius r of each axis. With `bandwidth: fixed` the ellipsoid
-    has no effect.
+    Before the distance from the centre to a ray is computed, the coordinate along each axis of the
+    ellipsoid is divided by the radius along this axis. Options mean the same as in
+    `locus/ray_biased`; `sigma_sq_min` is the lower bound of (sigma0 r)^2 for the radius r of each
+    axis. With `bandwidth: fixed` the ellipsoid has no effect.
     """
 
     name = "ray_biased"

@@ -19,15 +19,14 @@ from qgs.geometry.transforms import unit
 from qgs.precision import full_precision
 
 UPWARD = (0.0, 0.0, 1.0)
-"""Direction that a ray gets if its direction vector is 0."""
+"""Unit direction that `ray_tokens` returns for a ray whose direction is the zero vector."""
 
 
 @full_precision
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
-    """Return moments, directions and unit directions of rays (B, M, 6) as rows (B, 9, M).
+    """Return moment, direction and unit direction of each ray (B, M, 6) as a column (B, 9, M).
 
-    Moment and direction of a ray are first divided by the length of its direction, or by
-    `direction_eps` if the length is less.
+    Moment and direction of a ray are first divided by max(|direction|, `direction_eps`).
     """
     m_BM3, d_BM3 = normalised_rays(rays_BM6, direction_eps)
     return torch.cat([m_BM3, d_BM3, unit(d_BM3, UPWARD)], -1).mT.contiguous()
@@ -69,7 +68,10 @@ class EllipsoidBias(AttentionBias):
         return cls(torch.cat(parts, -1), tokens_B9M)
 
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
-        """Return the bias (n, M) of n queries and the M tokens of a scene."""
+        """Return the bias (n, M) of n queries and the M tokens of a scene.
+
+        queries: 23 numbers of each query (n, 23). tokens: nine numbers of each token (9, M).
+        """
         center_n3, *matrices, factor_n1, lower_n1 = queries_nF.split([3, 9, 9, 1, 1], -1)
         cofactors_n33, ball_n33 = (matrix.unflatten(-1, (3, 3)) for matrix in matrices)
         m_M3, d_M3, unit_M3 = (tokens_GM[rows : rows + 3].mT for rows in (0, 3, 6))

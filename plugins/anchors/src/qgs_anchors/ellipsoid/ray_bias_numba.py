@@ -79,7 +79,10 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Write gradients for the 23 numbers of each query to `out`, from the bias's `gradient`."""
+    """Write the loss's gradients with respect to the 23 numbers of each query to `out`.
+
+    gradient: the loss's gradients with respect to the bias, a row for each query.
+    """
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]

@@ -38,11 +38,12 @@ _OF_CHANNELS = ("linear.weight", "linear.bias")
 class FootprintCenters(RadiusScaledCenters):
     """Gaussian means at mu + r (u, v, 0) + r posact(offset), along the axes of the photo's camera.
 
-    mu and r are centre and radius of the anchor, which starts on a ray of a photo. The footprint is
-    the part of the photo that the query represents, with a cell for each Gaussian. (u, v)
-    is the centre of the cell relative to that of the footprint, in units of the square root of the
-    footprint's area. If r is this square root, measured at the anchor's depth, an offset of 0 puts
-    the Gaussian on the ray of its cell. posact(t) is sign(t) (exp|t| - 1).
+    mu and r are centre and radius of the anchor, which starts on a ray of a photo. The part of the
+    photo that the anchor's query represents is its footprint, with a cell for each Gaussian. (u, v)
+    is the vector from the centre of the footprint to the centre of the cell, in units of the square
+    root of the footprint's area. If r is this square root, projected to the anchor's depth, an
+    offset of 0 puts the Gaussian on the ray through the cell's centre. posact(t) is
+    sign(t) (exp|t| - 1).
     """
 
     name = "footprint"
@@ -91,8 +92,9 @@ class ColoredHead(GaussianHead):
         """Adapt the weights `learned` of a head with a different number of Gaussians per query.
 
         Each Gaussian stands for a cell of a footprint. It takes the weights that the other head has
-        for the nearest cell. Distances between cells are those in a square footprint, which
-        queries have with `count: null`. In other footprints, cells may be in different rows.
+        for the nearest cell. Distances between cells are computed for a square footprint, the kind
+        that queries have with `count: null`. In other footprints the rows of cells may differ, so
+        another cell may be nearer.
         """
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values
@@ -100,10 +102,10 @@ class ColoredHead(GaussianHead):
         }
 
     def _of_cells(self, rows: Tensor) -> Tensor:
-        """Turn weights (K' * 14, ...) for K' cells into (K * 14, ...) for the K cells of this head.
+        """Convert weights `rows` (K' * 14, ...) for K' cells to (K * 14, ...) for this head's K.
 
-        Each cell has one Gaussian with 14 output channels. If the number of `rows` is not a
-        multiple of 14, the weights are those of another kind of head, and returned unchanged.
+        Each cell has one Gaussian with 14 output channels. Weights with a first dimension that is
+        not a multiple of 14 belong to another kind of head; they are returned unchanged.
         """
         if len(rows) % sum(CHANNELS):
             return rows

@@ -14,7 +14,7 @@ from qgs.types import QueryState
 MAX_PAIRS = 1 << 22
 """Largest number of distances in memory at once (16 MiB in float32)."""
 PLACE = 5
-"""Count of numbers in a relative position: vector / reach (3), its length, and log(reach)."""
+"""Number of values in a relative position, which `NeighbourAttention` defines."""
 EPS = 1e-6
 
 

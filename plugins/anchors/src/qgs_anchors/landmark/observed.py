@@ -65,20 +65,21 @@ SAMPLES = 4
 
 
 class ObservedQueries(Queries):
-    """Queries for points of photos: each starts on the ray and with the image token of its point.
+    """Queries made from points of photos; each anchor starts on the ray through its point.
 
-    The depth of the anchor along the camera's axis is z = near^w far^(1 - w), with w the sigmoid of
+    The initial features of a query are computed from the image token at its point. The depth of
+    the anchor along the camera's axis is z = near^w far^(1 - w), with w the sigmoid of
     an MLP of the token. With a sweep over D depths, w is the mean of D values from 0 to 1 with
     weights softmax(MLP(token) - c / t). The cost c of a depth is the difference in colour between
     this photo and the other photos at that depth; t is learned.
 
-    A query's footprint is the part of its photo that it stands for, a tile or a square. The side of
+    A query's footprint is the part of its photo that it represents, a tile or a square. The side of
     a footprint is the square root of its area. The initial radius of the anchor is `radius` times
-    this side, measured at the anchor's depth.
+    this side, projected to the anchor's depth.
 
-    A query may take S tokens from its footprint. It starts with their mean, plus a learned matrix
-    times the differences of all tokens but the first from the mean. Its w is the mean of the w of
-    all S tokens.
+    A query may sample S tokens at points of its footprint. Its features start as the mean of the
+    tokens, plus a learned matrix times the differences between each token but the first and the
+    mean. Its w is the mean of the w of all S tokens.
     """
 
     name = "observed"
@@ -86,10 +87,10 @@ class ObservedQueries(Queries):
 
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
-        """N, the number of queries, which are spread evenly over the input photos. If N equal tiles
-        with nearly square cells fill the photos, they are the footprints of the queries; otherwise
-        queries are in rows, and footprints are squares. Null puts `per_token` queries at the centre
-        of each token's patch."""
+        """N, the number of queries, which are spread evenly over the input photos. The
+        footprint of a query is the part of a photo that it represents: one of N equal tiles if such
+        tiles, with nearly square cells, fill the photos; otherwise a square around the query's
+        point. Null puts `per_token` queries at the centre of each token's patch."""
         tokens: int = Field(default=1, ge=1)
         """S, the number of points in the footprint of a query at which the query samples tokens
         and depths. It has an effect only if `count` is a number."""
@@ -107,10 +108,10 @@ class ObservedQueries(Queries):
         """Side of the squares of photos that a sweep compares. The unit is sqrt(A / S), with A the
         area of the query's footprint and S the option `tokens`."""
         radius: float = Field(default=1.0, gt=0)
-        """Initial radius of an anchor. The unit is the side of the query's footprint, measured at
-        the anchor's depth."""
+        """Initial radius of an anchor. The unit is the square root of the area of the query's
+        footprint, projected to the anchor's depth."""
         std: float = Field(default=0.3, ge=0)
-        """Initial standard deviation of the learned vectors, which are added to tokens."""
+        """Standard deviation of the initial learned vectors, which are added to the tokens."""
         cells: int | None = Field(default=None, ge=1)
         """K, the number of cells into which a footprint is divided. Queries store the mean colour
         of each cell for the head `landmark/colored`. Null stores no colours. For example, 8 cells
@@ -186,9 +187,10 @@ class ObservedQueries(Queries):
     def _swept(
         self, x_BND: Tensor, views: Views, view_N: Tensor, place_N2: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return features (B, N, D) and nearness (B, N, 1): 0 at depth `far`, 1 at `near`.
+        """Return features (B, N, D) and nearness (B, N, 1) of N points of photos.
 
-        With the option `sweep`, both depend on how well the photos agree at each depth.
+        Nearness is log depth, scaled to 0 at depth `far` and 1 at `near`. With the option `sweep`,
+        features and nearness depend on how well the photos agree at each depth.
         """
         if self.config.sweep is None:
             return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
@@ -273,6 +275,6 @@ class ObservedQueries(Queries):
 
 
 def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return K points around each of N points: photo indices (N * K,), points (N * K, 2)."""
+    """Return the points `place` + `step` (N * K, 2), and the indices of their photos (N * K,)."""
     place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
     return view_N.repeat_interleave(len(step_K2)), place_X2

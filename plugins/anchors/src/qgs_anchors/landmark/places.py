@@ -17,10 +17,11 @@ from qgs.types import Cameras
 EPS = 1e-4
 """Tolerance of comparisons, in pixels or in logarithms of aspect ratios."""
 MOST_OFF = 0.35
-"""Largest |log(aspect / wanted aspect)| of tiles that are used: off by a factor of 1.4.
+"""Largest |log(aspect of a tile / wanted aspect)| at which `spread` uses tiles, not rows.
 
-With tiles that were off by a factor of 2, PSNR was worse than with rows: 20.1 against 20.3 dB, for
-untrained models with 512 points and 4 photos in 32 validation rooms."""
+The value corresponds to a factor of 1.4. With tiles that were off by a factor of 2, PSNR was worse
+than with rows: 20.1 against 20.3 dB, for untrained models with 512 points and 4 photos in 32
+validation rooms."""
 
 
 def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
@@ -83,7 +84,7 @@ def spread(
 
 
 def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tensor:
-    """Return the sides (2,) of a square from `side_of`, as shares of a photo's width and height."""
+    """Return the length `side_of` as shares (2,) of a photo's width and of its height."""
     return side_of(count, views, size) / constant([size[1], size[0]], like)
 
 

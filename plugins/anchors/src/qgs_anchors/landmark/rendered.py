@@ -25,7 +25,7 @@ from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 CHANNELS = 7
 """Channels of an error map: photo minus rendering (RGB), rendering (RGB), alpha."""
 ERROR_GAIN = 4.0
-"""Factor by which errors are multiplied: they are a few tenths, but the other channels reach 1."""
+"""Factor that multiplies the errors, which are a few tenths; the other channels reach 1."""
 
 
 class RenderedFeedback(Feedback):
@@ -74,7 +74,7 @@ class RenderedFeedback(Feedback):
             reason = f"a round repeats {config.layers} layers of a decoder of depth {depth}"
             yield Problem("layers", reason, f"write at most {depth}, or raise model.decoder.depth")
         if config.least > config.rounds:
-            reason = f"{config.least} rounds are more than the {config.rounds} of `rounds`"
+            reason = f"`least` is {config.least}, more than `rounds`, which is {config.rounds}"
             yield Problem("least", reason, f"write at most {config.rounds}, or raise `rounds`")
         if size and any(side % config.shrink for side in size):
             reason = f"images of {size[0]} x {size[1]} (H x W) cannot shrink by {config.shrink}"

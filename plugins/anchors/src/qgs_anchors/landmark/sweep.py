@@ -9,7 +9,7 @@ from qgs.types import Cameras, Views
 from qgs_anchors.landmark.places import bilinear, cells, rays_at
 
 LEAST_SEEN = 0.5
-"""Least fraction of a window that another photo must see to be compared with the window."""
+"""Smallest share of a window's samples that another photo must see to count in `mismatch`."""
 LEAST_DEPTH = 1e-3
 """Least depth at which a camera sees a point, world units."""
 

@@ -1,1 +1,1 @@
-"""Checks of the contract suite, one module for each subject; checks.toml lists them."""
+"""Checks of the contract suite, one module for each subject; checks.toml lists all checks."""

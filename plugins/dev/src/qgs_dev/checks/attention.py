@@ -172,7 +172,8 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
     """Require that a change of one patch changes the token at the same place in `grid` most.
 
     The changes are averaged over patches. A token may be centred half a patch off, as in strided
-    convolutions. Keys may depend on rays only. A memory without a grid is not checked.
+    convolutions. Keys may depend on rays alone, and not on the images. A memory without a grid is
+    not checked.
     """
     # Initial parameters without noise: in a random network every token depends on all patches.
     module = case.build().eval()
@@ -296,7 +297,7 @@ def check_unread_cameras_make_no_difference(case: Case) -> None:
     """Require the same results without cameras from a component with `reads_cameras` False."""
     component = case.component
     if not issubclass(component, Encoder | Queries) or component.reads_cameras:
-        raise CannotCheck("the component reads cameras")
+        raise CannotCheck("the component reads cameras, so it needs them")
     trial = Trial(case)
     views = trial.inputs["views"]
     bare = Photos(views.images, views.times, views.target_time)

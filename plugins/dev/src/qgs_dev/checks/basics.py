@@ -265,8 +265,8 @@ def _configs_in(annotation: Any) -> set[type[BaseModel]]:
 def _decoded(case: Case, options: dict[str, Any]) -> tuple[ComponentConfig | None, str]:
     """Write options as YAML and read them again as a recipe does.
 
-    Returns the options that were read, and the error's message if they are refused, otherwise "".
-    Refused options may be None.
+    Returns the options that were read and "". If a recipe would refuse the options, returns the
+    error message instead of ""; the first result may then be None.
     """
     problems = Problems()
     node = load_mapping(dump(options), "case", problems)

@@ -76,13 +76,13 @@ def check_reads_are_declared(case: Case) -> None:
                     other = trial(poisoned)
                 # It fails with the declared parts alone, and works with all parts.
                 except Exception as error:
-                    raise ContractError(f"{where}: add these fields to `reads`") from error
+                    raise ContractError(f"{where}: add those it reads to `reads`") from error
             # A layer may pass on a memory that it does not read.
             expect_same(trial.state_of(output), trial.state_of(other), where)
 
 
 class AskedFields(dict[str, Tensor]):
-    """Dict of state fields that adds the name of every field that is read to the set `asked`."""
+    """Dict of state fields that records in the set `asked` the names of the fields read."""
 
     def __init__(self, fields: Mapping[str, Tensor], asked: set[str]) -> None:
         super().__init__(fields)
@@ -240,7 +240,7 @@ def resolved(case: Case, given: Fields) -> Recipe:
 
 
 def _given(base: type, provides: Fields, **methods: Any) -> Any:
-    """Return a subclass of the component class `base` that declares that it writes `provides`.
+    """Return a subclass of the component class `base` with `provides` as its written fields.
 
     methods: further methods of the subclass, by name.
     """
@@ -252,7 +252,10 @@ def _given(base: type, provides: Fields, **methods: Any) -> Any:
 
 
 def _head_with(look: Fields) -> Any:
-    """Return a head class whose Gaussians have `sh` and `features` if `look` lists them."""
+    """Return a head class whose Gaussians have `sh` or `features` only if `look` lists them.
+
+    look: fields `gaussians.sh` or `gaussians.features`, which the head provides.
+    """
 
     def forward(self: GaussianHead, state: QueryState) -> Any:
         x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)

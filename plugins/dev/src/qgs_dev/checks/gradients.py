@@ -295,7 +295,7 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
                 seen.pop(f"fields.{name}", None)
         found = difference({name: exact[name] for name in seen}, seen, RTOL, ATOL)
         if found and replayed.differs:
-            raise CannotCheck("the component calls other layers in float32 than under autocast")
+            raise CannotCheck("the component calls different layers in float32 and under autocast")
         expect(not found, f"{where}, compared with float32, {found}")
         if case.slot in ATTENTION:
             expect_none(layers.halved, f"converts float32 geometry to bfloat16 {where}")
