@@ -79,10 +79,7 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Write the loss's gradients with respect to the 23 numbers of each query to `out`.
-
-    gradient: the loss's gradients with respect to the bias, a row for each query.
-    """
+    """Convert gradients of the bias, (query, token), to those of each query's 23 numbers in `out`."""
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]
