@@ -94,9 +94,10 @@ def _parts(*slots: str) -> dict[str, Any]:
 
 
 def _section(settings: type[ComponentConfig], **places: Any) -> Any:
-    """Return a pydantic field for a section with the options of `settings` and with `places`.
+    """Return a pydantic field for a section of a recipe.
 
-    places: fields of the section for components, by name.
+    The section has the options of `settings`. places: its further fields, by name; each holds a
+    component.
     """
     kind: Any = settings
     if places:

@@ -136,10 +136,10 @@ class Guard:
         )
 
     def watch(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Record the numbers of `step`, which are finite; copy the weights if they are good.
+        """Record the finite loss and gradient norm of `step`; copy the weights if training works.
 
-        Raises CollapseError if the last `training.collapse_window` steps were dead, or if weights
-        to copy are not finite.
+        A dead step has empty renderings or no gradient. Raises CollapseError if the last
+        `training.collapse_window` steps were dead, or if weights to copy are not finite.
         """
         self.skipped = 0
         self.signs.observe(numbers)

@@ -297,7 +297,7 @@ def check_unread_cameras_make_no_difference(case: Case) -> None:
     """Require the same results without cameras from a component with `reads_cameras` False."""
     component = case.component
     if not issubclass(component, Encoder | Queries) or component.reads_cameras:
-        raise CannotCheck("the component reads cameras, so it needs them")
+        raise CannotCheck("this check is only for encoders and queries that read no cameras")
     trial = Trial(case)
     views = trial.inputs["views"]
     bare = Photos(views.images, views.times, views.target_time)

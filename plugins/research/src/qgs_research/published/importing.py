@@ -103,7 +103,7 @@ def import_weights(
 
 
 def _without_prefix(file: WeightFile) -> WeightFile:
-    """Remove a prefix of all names if a known layout has the remaining names; add a note on it.
+    """Remove the prefix of all names of tensors if a known layout has the names without it.
 
     Training frameworks prepend the attribute that holds the model, such as `model.` or `module.`.
     """
