@@ -52,7 +52,7 @@ class Optimizer(Component):
     scheduled: ClassVar[frozenset[str]] = frozenset({"learning_rate"})
 
     class Config(OptimizerConfig):
-        """Options of this optimiser; by default those of every optimiser."""
+        """Options of the optimiser. A subclass may add options to those of every optimiser."""
 
     def __init__(self, config: OptimizerConfig, training: TrainingConfig | None = None) -> None:
         """Store the options, and `training` with the budget of steps and seconds."""

@@ -27,7 +27,8 @@ BASELINE = (0.06, 0.25)
 TURN = 20.0
 """Largest angle in degrees between input cameras, if that of training is unknown."""
 VARIED = 20.0
-"""Largest ratio of largest to least baseline in training; above it, BASELINE replaces both."""
+"""Largest ratio of the largest to the smallest baseline in training. If the ratio is larger,
+BASELINE and TURN are used in place of the limits of training."""
 
 # Most frames to consider, because time grows with the square of their number.
 _MOST = 300

@@ -88,10 +88,10 @@ def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
 
 
 def narrowed(gaussians: Gaussians) -> Gaussians:
-    """Return `gaussians` with means in the dtype of the scales, unless this moves them much.
+    """Return `gaussians` with means in the dtype of the scales, unless rounding moves them too far.
 
-    If more than half of the means move by more than MOVED of their Gaussian's size, as in map
-    coordinates, the Gaussians are returned unchanged.
+    If more than half of the means move by more than MOVED times the size of their Gaussian, as in
+    map coordinates, the Gaussians are returned unchanged.
     """
     means = gaussians.means.to(gaussians.scales.dtype)
     off = (means - gaussians.means).norm(dim=-1) > MOVED * gaussians.scales.norm(dim=-1)

@@ -223,8 +223,8 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
 
     The module explains the symbols. Block 2 gets the sum of w_j v_j over all splats j, blocks 3 to
     6 the gradients `slopes` of the first four sums, block 7 the gradient of the sum of w, block 8
-    the pixel's depth. In v, z is replaced by z minus the pixel's depth; this keeps the digits of
-    gradients at nearly transparent pixels, where large terms would otherwise cancel in float32.
+    the pixel's depth. In v, z is replaced by z minus the pixel's depth. Otherwise large
+    terms would cancel at nearly transparent pixels, and float32 gradients would be inaccurate.
     """
     for row in range(rows):
         for lane in range(columns):

@@ -31,7 +31,7 @@ class VisibilityOptions(Loss.Config):
     """Upper bound of a point's loss. The unit is half an image side (TokenGS and LocusGS releases:
     1). null: no bound."""
     near: float = Field(default=0.025, gt=0)
-    """Camera-frame z, in world units, at or below which points are behind the camera."""
+    """Camera-frame z, in world units, at or below which a point counts as behind the camera."""
     behind_camera: Literal["published", "invisible"] = "published"
     """Rule for points behind a camera. "published" projects them like other points, mirrored, so
     they may count as visible, as in the TokenGS and LocusGS releases. "invisible" gives such a

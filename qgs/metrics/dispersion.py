@@ -30,7 +30,10 @@ class Dispersion(Metric):
         return {key: Column(h, "lower", unit="world units") for key, h in headings.items()}
 
     def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
-        """Return "mean", the distances (1, G) to average, and "median", their median (1,)."""
+        """Return "mean", the distances (1, G), and "median", their median (1,).
+
+        The mean of the distances is taken later, as for the values of every metric.
+        """
         assert given.gaussians is not None
         distances = token_dispersion(given.gaussians.means, given.gaussians_per_query)
         return {"mean": distances, "median": torch.quantile(distances, 0.5, dim=-1)}

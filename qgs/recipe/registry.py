@@ -1,4 +1,4 @@
-"""Components of installed plugins, which are imported when a recipe or command needs them."""
+"""Registry of components. A plugin is imported when a recipe or a command needs it."""
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence

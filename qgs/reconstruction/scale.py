@@ -33,15 +33,15 @@ BASELINES = (0.06, 0.25)
 """Smallest and largest baseline to assume if the model does not record those of its training. A
 baseline is the largest distance between the inputs of a sample."""
 BELOW = 2.0
-"""Factor by which the search goes below the smallest baseline of the training."""
+"""Ratio of the smallest baseline in training to the smallest that the search tries."""
 ABOVE = 4.0
-"""Factor by which the search goes above the largest baseline of the training."""
+"""Ratio of the largest baseline that the search tries to the largest in training."""
 NEAREST = 0.8
 """Smallest depth of the point that cameras look at, to assume if the model does not record that of
 its training."""
 REACH = 6.0
-"""Factor by which the search goes above the smallest depth, in training, of the point that cameras
-look at."""
+"""Ratio between two depths of the point that cameras look at: the largest depth that the search
+tries, and the smallest depth in training."""
 PENALTY = 5.0
 """Penalty on a score, in dB per factor e by which depths are smaller than in training. It applies
 only if no photos but the inputs are scored."""
@@ -198,8 +198,9 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
 
 @dataclass
 class _Trial:
-    """Scores of factors of camera positions. A place p stands for the factor low * step ** p.
+    """Mean PSNR of renderings for several factors of the camera positions.
 
+    A place p is an exponent: it stands for the factor low * step ** p.
     views: (1, V), whose cameras have the factor 1; the first `inputs` of them are given to the
         model. weights: weights of the views in the mean PSNR. nearest: factor below which PENALTY
         lowers the score. tried: mean PSNR in dB by place.

@@ -39,8 +39,10 @@ _MEANS = ["x", "y", "z"]
 _COLORS = ["f_dc_0", "f_dc_1", "f_dc_2"]
 _OTHERS = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 REST = [f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1])]
-"""Spherical harmonics of degrees 1 to 3, all of red first, then green, then blue; always written,
-as zeros too: the viewer of the 3DGS release and plugins of game engines need all of them."""
+"""Properties for spherical harmonics of degrees 1 to 3: all of red first, then green, then blue.
+
+All are written even if they are 0, because the viewer of the 3DGS release and plugins of game
+engines need them."""
 PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, *_OTHERS)
 
 # Bytes of a header, at most: that of the 3DGS release has 1,500.

@@ -62,11 +62,11 @@ def chosen_scene(
 
     The frames are None if `path` is not part of the model's training data.
     name: name of the scene; None stands for the only scene.
-    size: (H, W) of images; None uses the recipe's size for training data, and the result of
+    size: (H, W) of images. None uses the recipe's size for training data, and the result of
         `whole_size` for other photos.
     holdout: whether to hold out every HOLDOUT-th photo. Training data, and scenes that already hold
         out photos, are not changed.
-    Raises ValueError if neither `size` nor the recipe gives a size.
+    Raises ValueError if `size` is None and the recipe has no data.
     """
     if recipe.data_config is None and size is None:
         raise ValueError(

@@ -136,10 +136,10 @@ class Guard:
         )
 
     def watch(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Record the finite loss and gradient norm of `step`; copy the weights if training works.
+        """Record the numbers of `step`, all finite. If the model is healthy, copy weights when due.
 
-        A dead step has empty renderings or no gradient. Raises CollapseError if the last
-        `training.collapse_window` steps were dead, or if weights to copy are not finite.
+        Raises CollapseError if the model was dead in each of the last `training.collapse_window`
+        steps, or if weights to copy are not finite.
         """
         self.skipped = 0
         self.signs.observe(numbers)

@@ -23,9 +23,9 @@ def make_optimizer(
 ) -> torch.optim.Optimizer:
     """Build torch's optimiser, with parameters grouped by weight decay and learning-rate factor.
 
-    The innermost component that has a parameter decides whether weight decay applies to it
-    (`ModelComponent.decays`). Outside of components, weight decay applies to all but 1-d
-    parameters. A parameter that modules share is named by its first name.
+    `ModelComponent.decays` of the innermost component around a parameter decides whether weight
+    decay applies to it. Outside of components, weight decay applies to all but 1-d parameters.
+    A parameter that modules share counts once, under its first name.
     factors: learning-rate factors by parameter name, from `Recipe.rate_factors`; 0 freezes a
         parameter.
     Raises ValueError if all parameters are frozen.

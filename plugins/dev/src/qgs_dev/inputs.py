@@ -198,7 +198,7 @@ class Maker:
         )
 
     def gaussians(self) -> Gaussians:
-        """Return random Gaussians in front of the cameras, with the optional tensors needed."""
+        """Return random Gaussians in front of the cameras; `gives` chooses optional tensors."""
         return Gaussians(
             means=self.in_front(self.normal("BG3")),
             scales=self.uniform(0.05, 0.3, "BG3"),

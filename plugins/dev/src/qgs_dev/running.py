@@ -71,8 +71,8 @@ CHECKS = {check.name: check for check in _listed()}
 def checks_for(case: Case, tiers: Iterable[Tier] = TIERS, variant: bool = False) -> list[Check]:
     """Return the checks for the slot of `case`. Checks whose failure makes others fail come first.
 
-    variant: True if the component has had an earlier case; then only checks with `variants` are
-    returned.
+    variant: True if an earlier case had the same component; then a check is returned only if
+    its `variants` is True.
     """
     wanted = {*tiers}
     # Otherwise a run without checks would pass.
@@ -118,8 +118,8 @@ class CaseRun:
     """Run of all checks on one case. If `builds` or `runs` fails, the other checks are skipped.
 
     expected: reason for each expected failure, by name of the check. If a check with a reason
-    passes, it counts as failed. variant: True if the component has had an earlier case; then only
-    checks with `variants` run.
+    passes, it counts as failed. variant: True if an earlier case had the same component; then a
+    check runs only if its `variants` is True.
     """
 
     case: Case

@@ -73,7 +73,7 @@ class ReadsMemoryUndeclared(ContentCrossAttention):
         return super().forward(state, memory) + memory.features.mean(1, keepdim=True)
 
 
-@mutant(CHECK, "which it does not declare: add those it reads to `reads`")
+@mutant(CHECK, "which it does not declare: add what it reads to `reads`")
 class ReadsTheGridUndeclared(ContentCrossAttention):
     def forward(self, state, memory):
         return super().forward(state, memory) * memory.grid[0]

@@ -100,7 +100,7 @@ def grid(section: Section) -> Figure:
 
 
 def write_figure(figure: Figure, folder: Path, name: str) -> None:
-    """Write a figure to NAME.pdf, which stores text as text, and to NAME.png.
+    """Write a figure to NAME.png, and to NAME.pdf with text as characters, not as outlines.
 
     Equal figures give files of equal bytes.
     """

@@ -47,7 +47,7 @@ def _moment(mu, t, j):
 
 @kernel
 def write(queries, tokens, out):
-    """Write the bias max(-factor s, lower) of queries, with numbers factor and lower, to `out`.
+    """Write the bias max(-factor s, lower) to `out`, with factor and lower of each query.
 
     s = |cof(W) (m - mu x d)|^2 / |W u|^2 is the squared distance of the anchor's centre mu from the
     ray (moment m, direction d, u = d / |d|). W maps an ellipsoid around mu to a unit ball.

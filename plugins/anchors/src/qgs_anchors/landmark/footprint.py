@@ -38,10 +38,10 @@ _OF_CHANNELS = ("linear.weight", "linear.bias")
 class FootprintCenters(RadiusScaledCenters):
     """Gaussian means at mu + r (u, v, 0) + r posact(offset), along the axes of the photo's camera.
 
-    mu and r are centre and radius of the anchor, which starts on a ray of a photo. The part of the
-    photo that the anchor's query represents is its footprint, with a cell for each Gaussian. (u, v)
-    is the vector from the centre of the footprint to the centre of the cell, in units of the square
-    root of the footprint's area. If r is this square root, projected to the anchor's depth, an
+    mu and r are centre and radius of the anchor, which starts on a ray of a photo. A query's
+    footprint is the region of the photo that the query represents; each Gaussian has a cell of it.
+    (u, v) is the vector from the centre of the footprint to the centre of the cell. Its unit is a,
+    the square root of the footprint's area. If r is a, projected to the anchor's depth, then an
     offset of 0 puts the Gaussian on the ray through the cell's centre. posact(t) is
     sign(t) (exp|t| - 1).
     """

@@ -1,7 +1,7 @@
 """Points of photos: their coordinates, the colours there, and the rays through them.
 
-A point (`place`) is x and y as shares of a photo's width and height. `view_N` has the index of the
-photo of each point.
+A point (`place`) is x and y as fractions of a photo's width and height. `view_N` has the index
+of the photo of each point.
 """
 
 import math
@@ -27,7 +27,7 @@ validation rooms."""
 def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
     """Return the centres (rows * columns, 2) of a photo's patches, row by row.
 
-    Centres are x and y, as shares of the photo's width and height.
+    Centres are x and y, as fractions of the photo's width and height.
     """
     y, x = ((torch.arange(n, device=device) + 0.5) / n for n in (rows, columns))
     return torch.cartesian_prod(y, x).flip(-1)
@@ -39,7 +39,7 @@ def patches(
     """Put `each` points at the centre of every patch of a grid (V, rows, columns).
 
     The three results mean the same as those of `spread`: the photo of each point, the points, and
-    the size of the part of a photo that belongs to a point.
+    the size of the region of a photo that a point represents.
     """
     photos, rows, columns = grid
     place_N2 = patch_centres(rows, columns, device).repeat(photos, 1).repeat_interleave(each, 0)
@@ -53,13 +53,13 @@ def spread(
     """Spread N = `count` points evenly over photos of size (H, W).
 
     Returns the index of each point's photo (N,), which goes through all photos in turn; the points
-    (N, 2); and width and height (2,) of the part of a photo that belongs to a point. Points, width
-    and height are shares of the photo's width and height.
+    (N, 2); and width and height (2,) of the region of a photo that a point represents. Points,
+    width and height are fractions of the photo's width and height.
 
-    The parts are equal tiles if tiles of about `aspect` (height over width in pixels) fill every
-    photo. The points are then the centres of the tiles. Otherwise the points are in rows, some of
-    which have one point more than others, and each part counts as a square. Both ways are as even
-    as a low-discrepancy sequence. With fewer points than photos, some photos have no point.
+    The regions are equal tiles if tiles of about `aspect` (height over width in pixels) fill every
+    photo; the points are their centres. Otherwise the points are in rows, some of which have one
+    point more than others, and the region is a square. Tiles and rows spread points as evenly as a
+    low-discrepancy sequence. With fewer points than photos, some photos have no point.
     """
     index_N = torch.arange(count, device=device)
     of_photo = size[0] / size[1]
@@ -84,7 +84,7 @@ def spread(
 
 
 def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tensor:
-    """Return the length `side_of` as shares (2,) of a photo's width and of its height."""
+    """Return the side `side_of` of a square as fractions (2,) of a photo's width and height."""
     return side_of(count, views, size) / constant([size[1], size[0]], like)
 
 

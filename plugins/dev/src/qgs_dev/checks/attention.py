@@ -253,9 +253,9 @@ def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
 def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int, int, int]) -> str:
     """Return how tokens are misplaced in `grid`, and how to fix that; "" if they are not misplaced.
 
-    change: (T, M), how much each of T changed patches changes each of M tokens. changed: (T,),
-    indices of the tokens that belong to the changed patches. places: view, row and column of the
-    changed patches.
+    T patches of the photos were changed, one at a time. change: (T, M), the change that each patch
+    caused in each of M tokens. changed: (T,), index of each patch's own token. places: view, row
+    and column of each patch.
     """
     # Use shares of a token's total change: near borders and after norms, some tokens change more.
     share = change / change.sum(0).clamp_min(1e-30)

@@ -76,7 +76,7 @@ def check_reads_are_declared(case: Case) -> None:
                     other = trial(poisoned)
                 # It fails with the declared parts alone, and works with all parts.
                 except Exception as error:
-                    raise ContractError(f"{where}: add those it reads to `reads`") from error
+                    raise ContractError(f"{where}: add what it reads to `reads`") from error
             # A layer may pass on a memory that it does not read.
             expect_same(trial.state_of(output), trial.state_of(other), where)
 

@@ -95,7 +95,7 @@ def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
 
 @jit
 def _store(x, scene, head, rows, count, width, values, WIDTH: tl.constexpr):
-    """Write `values` to the rows that `_load` reads, unless x is None."""
+    """Write `values` to `rows` of a scene and head of the tensor in x; do nothing if x is None."""
     if x is not None:
         at, inside = _at(x, scene, head, rows, count, width, WIDTH)
         tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)

@@ -85,7 +85,7 @@ class ChunkScene(Scene):
 
     @cached_property
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
-        """Held-out frames: every Nth for the option `holdout` N, or for 0 as the chunk lists."""
+        """Held-out frames: every Nth if the option `holdout` is N > 0, else those in the chunk."""
         every = self._config.holdout
         return held_out_frames(len(self), every) if every else self._record.held_out
 

@@ -120,9 +120,9 @@ class Bounded(ViewSampler):
     def seen(
         self, scene: Scene, span: Sequence[Frames], rng: np.random.Generator, step: int
     ) -> list[int]:
-        """Return the frames from which targets are sampled: those in `span` without its margins.
+        """Return the frames to sample targets from: `span` without `margin` times at each end.
 
-        In a scene that moves, all returned frames are of one time, chosen at random.
+        In a scene that moves, returns only the frames of one of these times, chosen at random.
         """
         margin = self.options(step).margin
         inside = span[margin : len(span) - margin]
@@ -230,8 +230,8 @@ class Overlapping(ViewSampler):
 
     class Config(ComponentConfig):
         apart: Ascending = (0.5, 2.0)
-        """[least, largest] factor by which training multiplies distances and angles between
-        inputs. [1, 1] takes inputs as `qgs demo` does."""
+        """[least, largest] factor of the distances and angles between inputs in training, relative
+        to the inputs that `qgs demo` chooses. [1, 1] chooses as `qgs demo` does."""
 
     config: Config
 

@@ -78,8 +78,8 @@ class Decoded:
 
     size: (H, W); None if it cannot be decoded. digest: hash of the file's bytes, by which equal
     photos are found. errors, warnings: pairs of reason and remedy. empty_mask: whether the mask
-    leaves out the whole photo; None without a mask. edges: strengths of the edges of the photo and
-    of its mask, 2 arrays of _SQUARE; None without a mask.
+    leaves out the whole photo; None without a mask. edges: strength of edges in the photo and in
+    its mask, two maps of size _SQUARE; None without a mask.
     """
 
     size: Size | None = None

@@ -66,9 +66,9 @@ def kind_of(path: UPath) -> str:
 
 
 def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candidate]:
-    """Yield the scenes of a plugin's data source to check.
+    """Yield the scenes at `path` that are to be checked, opened by a plugin's data source.
 
-    The images to check are those that the source returns. kind: PLUGIN/NAME. images: value of the
+    Images are checked as the source returns them. kind: PLUGIN/NAME. images: value of the
     source's option `images`; None keeps its default. Raises ValueError if the source has no such
     option, and the errors of the source.
     """

@@ -44,8 +44,8 @@ def extract(
     remarks on a damaged video.
 
     count: number of intervals, all of the same duration. None makes intervals shorter in fast
-    motion, and keeps at most MOST frames (`thinned`). progress: called with the stage, the seconds
-    done, and the video's length. Raises PosesError without a video of at least LEAST frames.
+    motion, and keeps at most MOST frames. progress: called with the stage, the seconds done, and
+    the video's length. Raises PosesError if fewer than LEAST frames can be read.
     """
     times, aspect, damaged = _times(video)
     if len(times) < LEAST:

@@ -82,9 +82,9 @@ class FreeGaussians:
     def grow(self, count: int, generator: torch.Generator) -> None:
         """Turn dead Gaussians into copies of opaque ones, and add further copies up to `count`.
 
-        Parents are sampled with probabilities proportional to opacity. Parent and copies become
-        smaller and more transparent, so that together they render like the parent before. The Adam
-        moments of parent and copies restart at 0. A Gaussian is dead if its opacity is below DEAD.
+        The Gaussians to copy (parents) are sampled in proportion to opacity. A parent and its
+        copies become smaller and more transparent, so that together they render as the parent did.
+        Their Adam moments restart at 0. A Gaussian is dead if its opacity is below DEAD.
         If all opacities are below DEAD, no Gaussian counts as dead.
         """
         opacities = self.values["opacity_logits"].sigmoid()

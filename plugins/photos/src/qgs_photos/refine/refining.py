@@ -140,8 +140,8 @@ def seconds_of_step(
 ) -> tuple[float, float]:
     """Measure the seconds of a step of `refine` on these Gaussians and photos (1, V).
 
-    Returns the least time of three steps with all spherical harmonics, and the additional time of
-    the step before them, in which kernels compile.
+    Runs four steps with all spherical harmonics. Returns the least time of the last three steps,
+    and the additional time of the first step, in which kernels compile.
     """
     run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras)
     run.levels = run.levels[-1:]

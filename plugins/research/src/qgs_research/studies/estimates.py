@@ -137,11 +137,11 @@ def interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float,
 def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the standard error of the means of `values` (..., S, C), and its degrees of freedom.
 
-    Both results have the shape (...). S is the number of trainings, C of scenes. The variance is a
+    Both results are (...). S is the number of trainings, C the number of scenes. The variance is a
     sum of mean squares, as in two-way analysis of variance. Its degrees of freedom follow
-    Satterthwaite 1946 (doi.org/10.2307/3002019), but are at least min(S, C) - 1. Without the
-    scenes' own variance (Hillis 2007, doi.org/10.1002/sim.2532) the interval is too narrow for few
-    trainings.
+    Satterthwaite 1946 (doi.org/10.2307/3002019), but are at least min(S, C) - 1. Degrees of
+    freedom without the variance of the scenes (Hillis 2007, doi.org/10.1002/sim.2532) give
+    intervals that are too narrow for few trainings.
     """
     *_, trainings, scenes = values.shape
     of_training = values.mean(-1, keepdims=True)

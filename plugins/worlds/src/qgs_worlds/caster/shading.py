@@ -169,9 +169,9 @@ def _sky(air, lights, view):
 def _light(light, shadows, own, place, normal, view, open_, shine):
     """Return two factors by which a point reflects one light: diffuse light and highlight.
 
-    own: index of the shape, or -1 if the shape can cast a shadow on itself. view: direction from
-    the camera. open_: share of ambient light at the point, which replaces the shadow of a light
-    without shadow map. shine: exponent of the highlight; 0 for none.
+    own: index of the shape; -1 lets the shape cast shadows on itself. view: direction from the
+    camera. open_: fraction of ambient light that reaches the point; it also dims a light that has
+    no shadow map. shine: exponent of the highlight; 0 for none.
     """
     toward = minus(light.place, times(light.lamp, place))
     square = dot(toward, toward)

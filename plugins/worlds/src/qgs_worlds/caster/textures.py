@@ -137,7 +137,7 @@ def _glyphs(x, y, seed):
 
 @inner
 def _mean(kind, width):
-    """Return the fraction of the surface that the colour of a pattern of this kind covers."""
+    """Return the fraction of a surface in a pattern's colour. width: of stripes, dots, joints."""
     if kind == s.CHECKER:
         return 0.5
     if kind == s.TILES:

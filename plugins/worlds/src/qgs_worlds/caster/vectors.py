@@ -20,7 +20,7 @@ inner = partial(
 """Decorator like `kernel`, for functions that only kernels call and that allocate no arrays."""
 
 reducing = partial(inner, fastmath={"contract", "reassoc", "arcp", "nsz", "nnan"})
-"""Decorator like `inner`, for functions that take a minimum in a loop over values without NaN."""
+"""Decorator `inner` with fast arithmetic, for loops that take a minimum of values without NaN."""
 
 
 @inner

@@ -37,7 +37,7 @@ _THUMB = (10, 10)
 
 
 class Drawn(NamedTuple):
-    """A random abstract scene: place, world, cameras and camera effects.
+    """A random abstract scene: its layout (`place`), world, cameras (`rig`) and camera effects.
 
     scale: factor of all lengths, which brings the median visible depth into the range
     `WorldsConfig.depth`; 1 without such a range.

@@ -58,8 +58,8 @@ class Palette:
 def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
     """Return a table of TEXTURE with COUNT random rows.
 
-    varied: True for noise, False for uniform surfaces and simple patterns. highlights: True lets
-    some varied textures be shiny; nothing else changes.
+    varied: True for noise, False for uniform surfaces and simple patterns. highlights: True makes
+    some varied textures shiny, without other changes.
     """
     palette = Palette(rng)
     table = np.zeros(COUNT, s.TEXTURE)

@@ -137,7 +137,7 @@ class TwoPasses(Objective):
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Report fewer than three input views, because both passes would read the same views."""
+        """Report fewer than three input views, because both passes would read all of them."""
         if context.inputs is not None and context.inputs < LEAST_VIEWS:
             reason = (
                 f"it needs at least {LEAST_VIEWS} input views, got {context.inputs}: both passes "

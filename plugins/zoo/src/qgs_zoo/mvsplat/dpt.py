@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from qgs_zoo.mvsplat.unet import resized, two_convolutions, zeroed
 
 LEVELS = 3
-"""Number of resolutions at which features of other networks join the ViT's: 1/2, 1/4, 1/8."""
+"""Number of resolutions (1/2, 1/4, 1/8) at which other networks' maps are appended to ViT maps."""
 
 
 class ResidualUnit(nn.Module):

@@ -90,9 +90,9 @@ class PixelQueries(Queries):
 
 @full_precision
 def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
-    """Return features of pixels with harmonics rotated from the cameras' frames to the world's.
+    """Rotate the harmonics in the features of pixels from the cameras' frames to the world frame.
 
-    features: features of pixels in the cameras' frames, view by view. rotation: camera to world.
+    features: features of the pixels, view by view. rotation: camera to world.
     """
     numbers_BMC = numbers_of(features_BMD)
     degree = degree_of(features_BMD.shape[-1])
