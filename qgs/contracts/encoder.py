@@ -28,7 +28,7 @@ MEMORY_FIELDS: Fields = {
 
 
 def memory_fields(*names: str) -> Fields:
-    """Return fields of ImageMemory by full name: for the name "keys", the key is "memory.keys"."""
+    """Return the named fields of ImageMemory by full name, such as "memory.keys" for "keys"."""
     return {f"memory.{name}": MEMORY_FIELDS[f"memory.{name}"] for name in names}
 
 

@@ -49,8 +49,8 @@ def protocol_of(
     """Return the protocol of evaluating `recipe` on the views that `index` lists.
 
     Without an index (None), the protocol tells how views are chosen. scenes: names of the scenes,
-    used only without an index. step: number of optimiser steps after which scheduled options of the
-    renderer are read.
+    used only without an index. step: number of optimiser steps. The protocol has the values of the
+    renderer's scheduled options after this step.
     """
     evaluation = recipe.evaluation
     data, views = _data_and_views(recipe, index, scenes)

@@ -162,8 +162,8 @@ def _blend_row(state, base, dx0, power_of, look, options):
 def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
     """Repeat `_blend_row` and add the splat's gradients to `totals`, 10 blocks of 16 pixels.
 
-    The blocks are h, h dx, h dy, h dx dx, h dx dy, h dy dy, where h is the gradient of the power to
-    base e; then the gradients of depth, r, g, b. dx, dy: distance of the pixel from the splat.
+    The blocks are h, h dx, h dy, h dx dx, h dx dy, h dy dy, then the gradients of depth, r, g, b.
+    h is dL/ds with alpha = opacity * e^s. dx, dy: distance of the pixel from the splat.
     """
     opacity, r, g, b, z = look
     for lane in range(_LANES):

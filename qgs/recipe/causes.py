@@ -1,8 +1,8 @@
 """Search for the line that caused a problem of a recipe.
 
 A file or an override may replace a component or an option on which other lines of the recipe rely.
-The problem is then reported at the line that replaces it, since the other lines were correct
-before.
+The problem is then reported at the line of the replacement, not at these other lines, which were
+correct without it.
 """
 
 from collections.abc import Iterator, Sequence

@@ -44,10 +44,10 @@ def layer_place(index: int, slot: str) -> KeyPath:
 
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
-    """Return the places of all components, by path, in the order of a recipe's sections.
+    """Return a Place for each component, by its path, in the order of a recipe's sections.
 
     tree: the merged recipe. depth: number of decoder layers. Adds a problem for each layer in
-        `tree` whose number is not below `depth`.
+        `tree` that has the number `depth` or a higher one.
     """
     # A layer with an index beyond the depth often comes from a deeper base recipe.
     layers = tree.child(*DECODER, "layers").without(*map(str, range(depth)))
@@ -69,9 +69,9 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
 
 
 def _place(tree: MapNode, path: KeyPath) -> Place:
-    """Return the place at `path`.
+    """Return the Place of the component at `path`.
 
-    The node of a single decoder layer is merged over the node that the recipe sets for all layers.
+    Options for a single decoder layer are merged over the options for all layers.
     """
     *above, name = path
     parent = tree.child(*above)

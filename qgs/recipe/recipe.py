@@ -74,7 +74,7 @@ class Recipe:
             sizes = {name: x.nbytes for name, x in state.items()}
             largest = max(sizes, key=sizes.__getitem__)
             fix = f"Lower the model option that sets the size of {largest}."
-            refuse_more_than_memory("the model with its weights", sum(sizes.values()), fix)
+            refuse_more_than_memory("the recipe's model", sum(sizes.values()), fix)
         model = build_model(self, device)
         model.releases = self.releases
         if pretrained:

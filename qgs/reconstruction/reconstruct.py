@@ -111,8 +111,8 @@ def choose_frames(
     inputs: number of inputs; None uses `views.inputs`.
     frames: input frames that the user chose; None spreads them over time if the scene has times,
         and otherwise takes them from the best window of `ranked_windows`.
-    compare: frames to compare with that the user chose; None chooses frames between the inputs that
-        share one time if the scene has times, and otherwise frames that the inputs see.
+    compare: the user's choice of frames to compare with. None chooses frames that the inputs see;
+        if the scene has times, frames of a single time between the inputs.
     trained_on: distances and angles of cameras in the model's training; None allows any.
     Raises ValueError for frames that do not exist or repeat, and for too few frames.
     """

@@ -224,7 +224,7 @@ class _Trial:
         return -math.inf if math.isnan(found) else found
 
     def best(self, places: Iterable[float]) -> float:
-        """Score factor(p) for each p in `places`; return the p with the best score so far."""
+        """Score the factors at `places`; return the best of all places scored so far."""
         for place in places:
             if place in self.tried:
                 continue

@@ -95,7 +95,7 @@ class OneCycleAdamW(Optimizer):
         return _cosine(self.peak, self.last, min(part, 1.0))
 
     def state(self) -> Mapping[str, float | None]:
-        """Return `descent_starts`: used fraction of the budget when the fall began, None before."""
+        """Return `descent_starts`: budget fraction at which the rate began to fall; None before."""
         return {"descent_starts": self._descent_starts}
 
     def load_state(self, state: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Checks that stop a training run: dead model, NaN or infinity in a step, and too little memory."""
+"""Checks that stop a training run: collapse, NaN or infinity in a step, and too little memory."""
 
 import logging
 import math
@@ -115,8 +115,8 @@ class Guard:
         The gradients of the step are computed again to find the first tensor that is not finite.
         With on_nonfinite "skip", up to MAX_SKIPPED steps in a row are skipped with a warning.
         Otherwise raises NonFiniteError after saving the run as it was before the step, or
-        CollapseError if the model was already dead. symptom: text that names the numbers that are
-        not finite.
+        CollapseError if the model did not render or learn in the latest finite step. symptom: text
+        that names the numbers that are not finite.
         """
         self.skipped += 1
         # All processes repeat the step: its collective operations need everyone.
@@ -198,7 +198,7 @@ class Guard:
     def _collapse(self, step: int, problem: str = "") -> NoReturn:
         """Save the last good weights and raise CollapseError.
 
-        problem: what is not finite, for the message; "" if steps were dead.
+        problem: what is not finite, for the message; "" if the model does not render or learn.
         """
         causes = NONFINITE_CAUSES if problem else COLLAPSE_CAUSES
         problem = problem or f"for the last {self.signs.dead} steps {self.signs.symptom}"
@@ -226,7 +226,7 @@ class SignsOfLife:
     has_drawn: bool = False
 
     def observe(self, numbers: Mapping[str, float]) -> None:
-        """Update the counter by a step's numbers: "alpha", "deviation" and "gradient" (norm)."""
+        """Update all fields by a step's numbers: "alpha", "deviation" and "gradient" (norm)."""
         self.symptom = ""
         if numbers["alpha"] < EMPTY_ALPHA:
             self.symptom = f"the renderings are empty (mean alpha {numbers['alpha']:.1e})"
@@ -274,8 +274,8 @@ class GoodWeights:
     def due(self, step: int, window: int) -> bool:
         """Return whether to copy the weights after `step` steps.
 
-        They are copied if the last copy is old enough and the PSNR is good. window:
-        `training.collapse_window`, in steps. All processes get the same result.
+        True if the last copy is an interval old, and the mean PSNR is at most LOSS_OF_QUALITY below
+        `best`. window: `training.collapse_window`, in steps. All processes get the same result.
         """
         # Rarer in long runs: each copy moves the whole model to the host.
         interval = max(window // 5, min(window, step // 10))

@@ -241,7 +241,7 @@ class Trainer:
         follow(scheduled, self.counters.step)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
-        """Train until the budget is used up, a stop is requested, or the model dies."""
+        """Train until the budget is used up, a stop is requested, or training collapses."""
         counters = self.counters
         stopped_by = None
         while counters.used < 1 and not stopped_by:

@@ -36,7 +36,7 @@ class TrainingPass(nn.Module):
     """
 
     def __init__(self, recipe: Recipe, model: QueryGaussianModel) -> None:
-        """Build the objective and the losses of `recipe`, which `model` was built from."""
+        """Build the objective and the losses of `recipe`; `model` must be the recipe's model."""
         super().__init__()
         self.model = model
         self.objective = recipe.build_objective()

@@ -73,9 +73,9 @@ class Lens(ABC):
     def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
         """Return the least zoom at which a centre crop of the undistorted photo has no black edges.
 
-        The zoom, at least 1, is the factor by which the crop is smaller than the largest crop of
-        its aspect ratio, that of the size `target` (H, W). intrinsics: fx, fy, cx, cy in pixels of
-        the photo. size: (H, W) of the photo.
+        The sides of the crop are those of the largest crop with the aspect ratio of `target` (H,
+        W), divided by the zoom, which is at least 1. intrinsics: fx, fy, cx, cy in pixels of the
+        photo. size: (H, W) of the photo.
         """
 
     @abstractmethod

@@ -66,7 +66,7 @@ def _is_code(value: Any) -> bool:
 def _comparable(value: Any, inside: tuple[int, ...] = ()) -> Any:
     """Return a copy of `value` that can be compared with a later copy.
 
-    inside: ids of containers that hold `value`; None replaces a container that holds itself.
+    inside: ids of the containers around `value`. A container inside itself becomes None.
     """
     # A module may hold an object that holds the module.
     if id(value) in inside:

@@ -122,9 +122,9 @@ class ScaleSearch:
         self.found: dict[tuple[str, Frames, Frames], FoundScale] = {}
 
     def __call__(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
-        """Return the settings of views for a window, with a constant scale instead of a search.
+        """Return the view settings with the scale found for a window in place of `scale: search`.
 
-        Settings with another scale than `search` are returned unchanged.
+        If their scale is not `search`, the view settings are returned unchanged.
         """
         if self.views.scale != "search":
             return self.views
@@ -328,7 +328,7 @@ def _on_photos(
     """Return the options of `recipe` as a nested dict, with photos as its data.
 
     photos: folder of the photos, or video. data: recipe section `data` that reads the photos.
-    first: section `views` of the first recipe, whose `gap` and `targets` hold for all recipes.
+    first: section `views` of the first recipe; all recipes get its `gap` and `targets`.
     """
     plugin = data["type"].split("/")[0]
     own = is_training_data(photos, recipe.data_config)

@@ -120,7 +120,7 @@ def painted(scene: QueryScene, choice: Choice) -> Splats:
 
 
 class Drawing:
-    """Draw a scene with viser. A part that is drawn again replaces the old part.
+    """Drawing of a scene with viser. Each method replaces what it has drawn before.
 
     photo_depth: distance from a camera at which its photo is drawn. anchor_radius: radius of the
     dots that show anchors. Both are in units of the viewer's world.

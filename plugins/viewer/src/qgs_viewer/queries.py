@@ -162,7 +162,7 @@ class DrawnQuery:
 
 
 def colored_queries(gaussians: Gaussians, count: int, chosen: Sequence[int]) -> list[DrawnQuery]:
-    """Return the queries `chosen` with colours in the order of `chosen`, and with dispersions.
+    """Return a DrawnQuery for each index in `chosen`; the nth index gets the nth colour.
 
     gaussians: (B, G); only the first scene is used. count: number of all queries of a scene.
     """

@@ -77,10 +77,10 @@ class NeighbourAttention(SelfAttention):
         return attention_weights(q_BhNd[:, :, queries], k_BhNd, hidden.scatter(-1, index, chosen))
 
     def _near(self, state: QueryState) -> tuple[Tensor, Tensor, Tensor]:
-        """Return indices of neighbours (B, N, k), relative positions (B, N, k, 5) and a bias.
+        """Return neighbours' indices (B, N, k), relative positions (B, N, k, 5) and a bias.
 
-        An MLP computes the bias of the attention logits (B, h, N, k) from the positions. The bias
-        is -inf for masked neighbours.
+        An MLP computes the bias (B, h, N, k) of the attention logits from the relative positions.
+        The bias is -inf for masked neighbours.
         """
         index_BNk, seen_BNk = nearest(state[CENTER], self.config.count, state.mask)
         place_BNkP = relative_places(state[CENTER], index_BNk, seen_BNk)

@@ -235,7 +235,8 @@ class ObservedQueries(Queries):
     ) -> dict[str, Tensor]:
         """Return the fields of queries at points `place_N2` of the photos `view_N`.
 
-        share_2: width and height of footprints, as shares of the photo's width and height.
+        nearness: log depth, scaled to 0 at depth `far` and 1 at `near`. share_2: width and height
+        of footprints, divided by the photo's width and height.
         """
         config = self.config
         cameras = views.cameras

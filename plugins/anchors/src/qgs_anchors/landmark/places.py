@@ -39,7 +39,7 @@ def patches(
     """Put `each` points at the centre of every patch of a grid (V, rows, columns).
 
     The three results mean the same as those of `spread`: the photo of each point, the points, and
-    the size of the region of a photo that a point represents.
+    the width and height of the square around each point.
     """
     photos, rows, columns = grid
     place_N2 = patch_centres(rows, columns, device).repeat(photos, 1).repeat_interleave(each, 0)

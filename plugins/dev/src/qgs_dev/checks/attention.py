@@ -161,7 +161,7 @@ def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
     for where, views in _wide_and_tall(case, case.size):
         memory = module(views)
         if memory.patch_rays is None:
-            raise CannotCheck("its image memory has no patch rays")
+            raise CannotCheck("the encoder's image memory has no patch rays")
         patch = _patch_size(where, views, memory)
         rays = patch_rays(plucker_rays(views.cameras), patch)
         where = f"{where}, compared with the mean rays of patches of {patch} pixels"
@@ -297,7 +297,7 @@ def check_unread_cameras_make_no_difference(case: Case) -> None:
     """Require the same results without cameras from a component with `reads_cameras` False."""
     component = case.component
     if not issubclass(component, Encoder | Queries) or component.reads_cameras:
-        raise CannotCheck("this check is only for encoders and queries that read no cameras")
+        raise CannotCheck("this check is only for components with reads_cameras False")
     trial = Trial(case)
     views = trial.inputs["views"]
     bare = Photos(views.images, views.times, views.target_time)

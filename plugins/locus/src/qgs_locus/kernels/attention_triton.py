@@ -267,7 +267,7 @@ class TritonAttention(torch.autograd.Function):
 
 
 def _launch(kernel: Any, *tensors: Any) -> None:
-    """Run a kernel for each head and block; pass tensors with four axes with their strides."""
+    """Run a kernel for each head and block; a 4-d tensor is passed as (tensor, strides)."""
     q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)

@@ -40,8 +40,8 @@ class Bounded(ViewSampler):
 
     The gap is the number of frames from the first to the last input; it widens over
     `warm_up_steps`. For two inputs this is pixelSplat's sampler `bounded`; further inputs are
-    sampled between the ends. On camera paths that are no closed loop, pixelSplat replaces the
-    largest gap by the least gap; here only the number of frames limits the gap. Targets may repeat.
+    sampled between the ends. If the camera path is no closed loop, pixelSplat uses the least gap
+    as the largest gap; here only the number of frames limits the gap. Targets may repeat.
     `views.gap` is used only for evaluation windows around held-out frames.
     """
 
@@ -81,8 +81,8 @@ class Bounded(ViewSampler):
     ) -> tuple[Frames, Frames]:
         """Return random input frames, in ascending order, and target frames from the gap.
 
-        step: number of optimiser steps before the sample is used, on which the gap depends; END in
-        evaluation. Raises ValueError for a scene with too few frames.
+        step: number of optimiser steps before the sample is used, or END in evaluation. The bounds
+        of the gap depend on `step`. Raises ValueError for a scene with too few frames.
         """
         span = self.span(scene, views, rng, step)
         between = rng.choice(range(1, len(span) - 1), views.inputs - 2, replace=False)

@@ -155,7 +155,7 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
 
 
 def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
-    """Return `frames` as one run, or a few evenly spread runs if there are more than `most`."""
+    """Return [frames], or a few evenly spread slices of it if there are more than `most` frames."""
     if len(frames) <= most:
         return [frames]
     length = max(most // _RUNS, 2)

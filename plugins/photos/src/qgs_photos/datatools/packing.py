@@ -23,7 +23,7 @@ SETTINGS = "packing.json"
 """File in the output folder with the settings of the packing; deleted when it is finished."""
 
 Places: TypeAlias = Mapping[str, tuple[Split, int]]
-"""Scenes by name: the split of the source that holds the scene, and the scene's index in it."""
+"""Scenes by name: the scene's split in the source, and the scene's index in this split."""
 
 # What is packed into which split.
 Splits: TypeAlias = Mapping[Split, Places]

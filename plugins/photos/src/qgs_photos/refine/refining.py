@@ -279,7 +279,7 @@ def partly_swept(
 def joined(gaussians: Gaussians, others: Gaussians) -> Gaussians:
     """Join two sets of Gaussians (1, G).
 
-    If `gaussians` have spherical harmonics or features, those of `others` become 0.
+    If `gaussians` have spherical harmonics or features, `others` get zeros for them.
     """
     for name in ("sh", "features"):
         given = getattr(gaussians, name)

@@ -30,7 +30,7 @@ from qgs_photos.refine.sweeping import swept
 END = 4.0
 """Seconds reserved for scores and files at the end."""
 PART_OF_END = 0.03
-"""Fraction of the whole time that is reserved for scores and files in addition to END."""
+"""Fraction of the total time that is reserved for scores and files, on top of END seconds."""
 # Of the time for the optimisation, however long all else took.
 _LEAST_PART = 0.1
 # Photos that given poses are judged by, a second each.

@@ -95,7 +95,7 @@ def _last_and_first(x, y, z):
 
 @inner
 def box(o, d):
-    """Return the interval of a ray in the cube [-1, 1]^3. Faces are numbers of axes, 0 to 2."""
+    """Return the interval of a ray in the cube [-1, 1]^3; a face is its axis number, 0 to 2."""
     x = slab(o[0], reciprocal(d[0]), ONE)
     y = slab(o[1], reciprocal(d[1]), ONE)
     z = slab(o[2], reciprocal(d[2]), ONE)
@@ -104,7 +104,7 @@ def box(o, d):
 
 @inner
 def block(o, d, h):
-    """Return the interval of a ray in a box of half sizes h. Faces are numbers of axes, 0 to 2."""
+    """Return the interval of a ray in a box of half sizes h; a face is its axis number, 0 to 2."""
     x = slab(o[0], reciprocal(d[0]), h[0])
     y = slab(o[1], reciprocal(d[1]), h[1])
     z = slab(o[2], reciprocal(d[2]), h[2])

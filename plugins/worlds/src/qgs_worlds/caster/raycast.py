@@ -260,7 +260,7 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
 
 @inner
 def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch):
-    """Update the hits of rays in an area where a shape is nearer than all earlier shapes.
+    """Update the hit of each ray for which this shape is nearer than all earlier shapes.
 
     t, code: depths and face codes of the hits. top: first pixel row of the band. samples: rays per
     pixel along each axis. own: code of the shape. o: start of the rays. rays: the ray basis. steps:

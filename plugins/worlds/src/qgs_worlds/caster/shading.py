@@ -196,10 +196,10 @@ def _light(light, shadows, own, place, normal, view, open_, shine):
 def _shade(world, around, code, place, view, footprint, distance):
     """Return the RGB, in linear light, of a surface seen from the camera.
 
-    around: cache from `surroundings`, with boxes near an earlier point. code: face code of the
-    surface. place: point on the surface. view: direction from the camera. footprint: distance
-    between neighbouring pixels at the point. distance: from the camera to the point. All lengths
-    are in metres.
+    around: cache from `surroundings`, which `visible` updates. code: face code of the surface.
+    place: point on the surface. view: direction from the camera. footprint: distance between
+    neighbouring pixels at the point. distance: from the camera to the point. All lengths are in
+    metres.
     """
     i = code >> 3
     shape = world.shapes[i]

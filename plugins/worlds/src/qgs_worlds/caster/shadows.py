@@ -174,7 +174,7 @@ def _find(shapes, around, p, reach, slack):
 def visible(shapes, around, own, point, normal, strength, reach, footprint):
     """Return the share of ambient light that reaches a point; 1 without occlusion.
 
-    Distances from two heights above the point to other shapes are compared with the heights, after
+    At two heights above the point, light is lost if another shape is nearer than the height, after
     Evans 2006, "Fast approximations for global illumination on dynamic scenes". around: cache
     from `surroundings`. own: index of the shape on which the point lies. strength: amount of
     darkening; 0 for none. reach: distance at which shapes darken points. footprint: distance

@@ -179,7 +179,7 @@ def _pattern(kind, x, y, width, seed, blur):
 def _marked(texture, rgb, u, v, warped, footprint):
     """Return the colour `rgb` with the pattern of a texture blended over it, at (u, v).
 
-    warped: u in periods of the texture's noise, plus the shift that warps noise and pattern.
+    warped: u / texture.period, plus the shift at (u, v) that warps noise and pattern.
     """
     period = texture.pattern_period
     blur = footprint / period * max(texture.aspect, 1.0)

@@ -122,7 +122,7 @@ class Round(DecoderLayer):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Return the fields that the layer reads: features of the encoder, texture of tokens."""
+        """Return the fields that the layer reads: the encoder's features, the tokens' texture."""
         return {"memory.features": FieldSpec((config.memory_width or "D",)), **TEXTURE_FIELD}
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:

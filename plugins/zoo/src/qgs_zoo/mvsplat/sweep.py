@@ -98,9 +98,9 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
 
 
 def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
-    """Sample features of N other views at the positions `grid`: (N, C, D, h, w).
+    """Sample the features of N views at the positions `grid`: (N, C, D, h, w).
 
-    The result is 0 outside of the other view.
+    The result is 0 at positions outside of the view's image.
     """
     flat = grid_NDhw2.flatten(1, 2).to(features_NCHW)
     sampled = F.grid_sample(features_NCHW, flat, "bilinear", "zeros", align_corners=True)
@@ -142,10 +142,10 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlate features of N views with samples of other views at D depths: (N, D, h, w).
+    """Correlate features of N views with samples of N other views at D depths: (N, D, h, w).
 
-    own, other: features (N, C, h, w) of the N views, and of the other view that is compared with
-    each of them. depth, lens, pose: as in `warp_grid`.
+    own, other: features (N, C, h, w). View n of `own` is compared with view n of `other`. depth,
+    lens, pose: as in `warp_grid`.
     """
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
