@@ -101,7 +101,9 @@ class Domain:
             ends = [math.inf if end is None else float(end) for end in (low, high)]
             # NaN is not above 0 either.
             if name not in WORDS or not all(end >= 0 for end in (domain.samples, *ends)):
-                raise ValueError(f"the ranges of trained views are damaged: {str(plain)[:100]}")
+                raise ValueError(
+                    f"a range has an unknown name, or a number is < 0 or NaN: {str(plain)[:100]}"
+                )
             domain.values[name] = ends
         return domain
 

@@ -104,8 +104,8 @@ def replacing_entries(folder: AnyPath, mark: str) -> Iterator[Path]:
         there = [name for name in names if (target / name).exists()]
         if there and mark not in there:
             raise FileExistsError(
-                f"{target} holds {listed(there)}, which are no earlier result: choose another "
-                "folder"
+                f"{target} holds {listed(there)}, but no earlier result to replace: choose "
+                "another folder"
             )
         try:
             for name in names:

@@ -147,7 +147,7 @@ class Component(metaclass=ABCMeta):
     `fields_written`."""
     scheduled: ClassVar[frozenset[str]] = frozenset()
     """Numeric options that a schedule in the recipe may change from step to step. The component
-    must read them from `self.config` in every call, because copies do not change."""
+    must read them from `self.config` in every call; a value stored elsewhere would not change."""
 
     schedules: Mapping[str, Any] = MappingProxyType({})
     """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name of the option. In

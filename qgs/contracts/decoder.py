@@ -160,7 +160,8 @@ class Feedback(ModelComponent):
 
     A round renders the last layer's Gaussians from the cameras of the input photos, without
     gradients. Then it runs the last `layers` decoder layers again, which update the state once
-    more. Their image memory is the one that the first of them read before any feedback.
+    more. In each round, `forward` gets the image memory that the first of these layers read before
+    any feedback.
 
     layers: number of decoder layers that run again in each round.
     rounds: number of rounds in an evaluation; it may be changed on a built model.

@@ -34,8 +34,8 @@ class VisibilityOptions(Loss.Config):
     """Camera-frame z, in world units, at or below which a point counts as behind the camera."""
     behind_camera: Literal["published", "invisible"] = "published"
     """Rule for points behind a camera. "published" projects them like other points, mirrored, so
-    they may count as visible, as in the TokenGS and LocusGS releases. "invisible" gives such a
-    point the loss `clamp` in the camera's view."""
+    they may count as visible, as in the TokenGS and LocusGS releases. "invisible" sets the
+    loss of such a point in this camera's view to the upper bound, the option `clamp`."""
 
     @property
     def behind(self) -> float | None:

@@ -32,8 +32,8 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
 
     If `over` has another `type`, `kind` or `schedule` than `base`, it replaces `base` as a whole.
     Items of the list `plugins` are added to those of `base`; any other list is replaced. The value
-    `null` is kept for an option. For a component or section it restores the default; for a swap it
-    removes the swap.
+    `null` is kept for an option. It restores the default of a component or section, and removes an
+    entry of the section `swap`.
     """
     # Options of another component would be refused, or worse, mean something else.
     if _replaces(base, over, path):

@@ -94,10 +94,9 @@ def _parts(*slots: str) -> dict[str, Any]:
 
 
 def _section(settings: type[ComponentConfig], **places: Any) -> Any:
-    """Return a pydantic field for a section of a recipe.
+    """Return a pydantic field for a section that has the options of `settings`.
 
-    The section has the options of `settings`. places: its further fields, by name; each holds a
-    component.
+    places: further fields of the section, by name, for components and for sections inside it.
     """
     kind: Any = settings
     if places:
@@ -162,11 +161,11 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
 
 @dataclass(frozen=True)
 class Draft:
-    """Recipe whose components are chosen, before the check that they fit each other.
+    """Recipe with its components chosen, but not yet checked to fit each other.
 
     tree: all files and overrides merged, with the default losses and metrics.
     settings: a `Layout` with all settings.
-    parts: chosen components by path in the recipe; each decoder layer has separate paths.
+    parts: chosen components, by path in the recipe. Every decoder layer has paths of its own.
     """
 
     tree: MapNode

@@ -33,15 +33,15 @@ BASELINES = (0.06, 0.25)
 """Smallest and largest baseline to assume if the model does not record those of its training. A
 baseline is the largest distance between the inputs of a sample."""
 BELOW = 2.0
-"""Ratio of the smallest baseline in training to the smallest that the search tries."""
+"""Divisor of the smallest baseline in training. Baselines are tried down to the quotient."""
 ABOVE = 4.0
-"""Ratio of the largest baseline that the search tries to the largest in training."""
+"""Multiplier of the largest baseline in training. Baselines are tried up to the product."""
 NEAREST = 0.8
 """Smallest depth of the point that cameras look at, to assume if the model does not record that of
 its training."""
 REACH = 6.0
-"""Ratio between two depths of the point that cameras look at: the largest depth that the search
-tries, and the smallest depth in training."""
+"""Multiplier of the smallest depth, in training, of the point that cameras look at. Depths of this
+point are tried up to the product."""
 PENALTY = 5.0
 """Penalty on a score, in dB per factor e by which depths are smaller than in training. It applies
 only if no photos but the inputs are scored."""
@@ -172,10 +172,11 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
 
 
 def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
-    """Return the least and largest factor to try, and the factor below which scores are lowered.
+    """Return the least factor and the largest factor to try, and a limit for PENALTY.
 
-    At factors below the third number, depths are smaller than in training. The third number is 0 if
-    the depth at which the cameras look is unknown.
+    PENALTY may lower the scores of factors below this limit. At the limit, the point that the
+    cameras look at is TOLERANCE times as far as the nearest such point in training. The limit is 0
+    if the depth of the point is unknown.
     trained: baselines and depths of cameras in the model's training. frames: the inputs.
     """
     depth = float(look_at_depth(scene.cameras.c2w))
@@ -235,7 +236,10 @@ class _Trial:
         return max(self.tried, key=self.score)
 
     def past(self, place: float) -> Sequence[float]:
-        """Return two places beyond `place` if it is the least or largest tried, else none."""
+        """Return two places to try beyond `place` if it is the least or largest tried; else [].
+
+        A place p stands for the factor low * step ** p.
+        """
         if place == min(self.tried):
             return [place - 6, place - 3]
         return [place + 3, place + 6] if place == max(self.tried) else []

@@ -36,7 +36,7 @@ class LayerSupervision(Supervision):
             ascending = sorted({max(number, 1) for number in layers})
             if layers != (0,) and list(layers) != ascending:
                 raise OptionError(
-                    f"layers must be ascending numbers from 1, no repeats, got {list(layers)}",
+                    f"layers must be distinct, ascending and at least 1, got {list(layers)}",
                     f"write {ascending}",
                 )
             return layers

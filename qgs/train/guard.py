@@ -152,9 +152,9 @@ class Guard:
             self.good.refresh(step)
 
     def save(self, step: int, ends: bool = False) -> None:
-        """Save the run; for a dead model the checkpoint keeps the last good weights.
+        """Save the run; if the model has collapsed, the checkpoint gets the last healthy weights.
 
-        ends: whether the training budget is used up; a dead model then raises CollapseError.
+        ends: whether the training budget is used up; a collapsed model then raises CollapseError.
         """
         # A run shorter than a window is dead when all of its steps were.
         if self.signs.dead < min(self.config.collapse_window, step):
@@ -246,10 +246,11 @@ class GoodWeights:
 
     A collapse is noticed late, so the newer copy may already be damaged, and only the older copy is
     trusted. The interval between copies is a fifth of `training.collapse_window` at first, and
-    grows to the whole window in long runs. No copy is made while the images are worse than before.
+    grows to the whole window in long runs. A copy that is due is not made while `psnr` is more than
+    LOSS_OF_QUALITY below `best`.
 
     Only the main process holds copies. psnr: running mean of the steps' PSNR in dB. best: largest
-    `psnr` so far, of the steps after which a copy was due.
+    `psnr` at the steps at which a copy was due.
     """
 
     model: nn.Module

@@ -298,7 +298,7 @@ class Trainer:
             self._evaluate(stop)
 
     def _compute(self, batches: Sequence[Batch], stop: StopRequest) -> dict[str, float]:
-        """Compute gradients of `batches`, fetch the next batches; return the step's numbers."""
+        """Compute gradients of `batches`, fetch the next batches; return numbers such as "lr"."""
         step = self.counters.step
         rate = self.optimizer.learning_rate(step, self.counters.seconds)
         for group in self.torch_optimizer.param_groups:

@@ -225,9 +225,9 @@ class DetachedLayer:
 def signs_of(rendering: Rendering, target: Views, background: Tensor) -> dict[str, Tensor]:
     """Return the 0-d numbers "psnr", "alpha" and "deviation" of a rendering.
 
-    psnr, alpha: means over all views. deviation: |rgb - background|, averaged over the pixels of a
-        view; the largest average of all views. Because of the average, a single stray Gaussian does
-        not hide that the model is dead.
+    psnr, alpha: means over all views. deviation: mean of |rgb - background| over the pixels of a
+        view, for the view where this mean is largest. In a mean over pixels, a single stray
+        Gaussian does not hide that the rendering is otherwise empty.
     """
     deviation = (rendering.rgb - background[:, None, None]).abs().mean((-3, -2, -1))
     return {

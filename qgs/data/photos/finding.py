@@ -23,8 +23,8 @@ _Index: TypeAlias = Mapping[object, list[UPath]]
 def located(found: Listing, folder: UPath, images: str | None, outside: bool) -> Listing:
     """Return `found` with the paths at which its photos, masks and depth maps exist.
 
-    Files in another folder or spelling than listed are counted in a warning. Files that are not
-    found keep their listed paths.
+    A warning counts the files that exist only in another folder, or under another spelling of their
+    names, than listed. Files that are not found keep their listed paths.
 
     images: subfolder of `folder` from which photos are read. outside: allow files outside of
         `folder`. Raises ValueError if two files fit a name, and for a file outside of `folder` that

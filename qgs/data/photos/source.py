@@ -112,8 +112,8 @@ class PhotoScene(Scene):
     def cameras(self) -> Cameras:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Cameras of all frames, in float64, for the photos after crop and resize.
 
-        If several photos of one folder are listed with one size, only one of them is opened. Raises
-        ValueError if the opened photo has another aspect ratio than listed.
+        Of all photos in a folder with the same listed size, only one is opened. Raises ValueError
+        if the aspect ratio of this photo is not that of the listed size.
         """
         sizes: dict[object, Size] = {}
         intrinsics: list[Tensor] = []

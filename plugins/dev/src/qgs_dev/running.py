@@ -71,8 +71,8 @@ CHECKS = {check.name: check for check in _listed()}
 def checks_for(case: Case, tiers: Iterable[Tier] = TIERS, variant: bool = False) -> list[Check]:
     """Return the checks for the slot of `case`. Checks whose failure makes others fail come first.
 
-    variant: True if an earlier case had the same component; then a check is returned only if
-    its `variants` is True.
+    variant: True if the component has had an earlier case; checks that run on the first case only
+    are then left out.
     """
     wanted = {*tiers}
     # Otherwise a run without checks would pass.

@@ -46,10 +46,10 @@ OF_THE_METHOD = (
     "views.scale",
     "views.scale_factor",
 )
-"""Options that may differ between compared recipes.
+"""Options that may differ between compared recipes, because they belong to the method.
 
-They belong to the method: learning rates of parts of the model, a loss on input views, what tuning
-changes and how fast, and the scale of the model's world, which changes no score.
+They set learning rates of parts of the model, a loss on input views, what tuning changes and how
+fast, and the scale of the model's world. No score depends on the unit of that world.
 """
 
 

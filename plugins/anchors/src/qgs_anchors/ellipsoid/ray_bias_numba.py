@@ -79,7 +79,7 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Convert gradients of the bias (query, token) to those of each query's 23 numbers in `out`."""
+    """Compute gradients (N, 23) of the queries in `out` from gradients (N, M) of the bias."""
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]

@@ -108,14 +108,14 @@ class ObservedQueries(Queries):
         """Side of the squares of photos that a sweep compares. The unit is sqrt(A / S), with A the
         area of the query's footprint and S the option `tokens`."""
         radius: float = Field(default=1.0, gt=0)
-        """Initial radius of an anchor. The unit is the square root of the area of the query's
-        footprint, projected to the anchor's depth."""
+        """Initial radius of an anchor. The unit is sqrt(A) z / f, with A the area of the query's
+        footprint in pixels, z the anchor's depth and f the focal length in pixels."""
         std: float = Field(default=0.3, ge=0)
         """Standard deviation of the initial learned vectors, which are added to the tokens."""
         cells: int | None = Field(default=None, ge=1)
         """K, the number of cells into which a footprint is divided. Queries store the mean colour
-        of each cell for the head `landmark/colored`. Null stores no colours. For example, 8 cells
-        form rows of 2, 3 and 3 if `count` is null, and 2 rows of 4 if `count` is a number."""
+        of each cell for the head `landmark/colored`. Null stores no colours. The option `count`
+        decides the rows: null splits 8 cells into 2, 3 and 3, a number into 2 rows of 4."""
 
         @field_validator("far")
         @classmethod

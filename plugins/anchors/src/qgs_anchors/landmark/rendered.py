@@ -25,7 +25,7 @@ from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 CHANNELS = 7
 """Channels of an error map: photo minus rendering (RGB), rendering (RGB), alpha."""
 ERROR_GAIN = 4.0
-"""Factor that multiplies the errors, which are a few tenths; the other channels reach 1."""
+"""Factor for photo minus rendering, which is a few tenths. The other channels reach 1."""
 
 
 class RenderedFeedback(Feedback):
@@ -48,11 +48,11 @@ class RenderedFeedback(Feedback):
         """Smallest number of rounds in a training step. Each step takes a random number of rounds
         from `least` to `rounds`."""
         layers: int = Field(default=2, ge=1)
-        """Number of decoder layers, counted from the last, that a round repeats."""
+        """Number of decoder layers, counted from the last, that each feedback round runs again."""
         shrink: int = Field(default=2, ge=1)
         """Render the input photos at 1/`shrink` of their size."""
         cells: int = Field(default=2, ge=1)
-        """Number of cells along each side of a token's patch over which errors are averaged."""
+        """Number of cells along each side of a token's patch. Each cell stores mean errors."""
 
     config: Config
 

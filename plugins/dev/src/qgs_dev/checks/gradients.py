@@ -349,12 +349,12 @@ def check_float64_stays_float64(case: Case) -> None:
 class LearnedLayers(TorchFunctionMode):
     """Torch mode that records the outputs of learned layers, or replays recorded ones.
 
-    A product counts as a learned layer if all its factors require gradients, as parameters,
-    features and values computed from them do.
+    A product, such as `matmul`, counts as a learned layer if all its factors require gradients.
+    Parameters, features, and values computed from them require gradients.
     replayed: recorded outputs, which layers return in the order of their calls; None records.
     halved: names of products of float32 geometry that autocast computed in bfloat16.
-    differs: True if the layers that are called are not those in `replayed`; from the first such
-        layer on, layers return what they compute.
+    differs: True after a layer was called whose name or shapes are not the next in `replayed`.
+        From this call on, layers return what they compute.
     """
 
     def __init__(self, replayed: Iterable[tuple[str, Any]] | None = None) -> None:

@@ -194,7 +194,7 @@ def check_objective_repeats(case: Case) -> None:
 
 
 def rehearsed(case: Case, module: Any) -> dict[str, Tensor]:
-    """Return the total, terms and warning signs of an objective called with a small model."""
+    """Call an objective with a small model; return total, terms and signs of its `Outcome`."""
     outcome, _ = _outcome(case, module, 3)
     return cloned({"total": outcome.total, **outcome.terms, **outcome.signs})
 

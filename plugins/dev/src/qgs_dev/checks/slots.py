@@ -123,7 +123,7 @@ def check_supervision_weights(case: Case) -> None:
 def check_feedback_compares_the_photos(case: Case) -> None:
     """Require that `compared` returns views with the poses, rays and mean colours of the photos.
 
-    The numbers of rounds, `rounds` in evaluation and `drawn` in training, must not be negative. A
+    The number of feedback rounds must not be negative, neither in evaluation nor in training. A
     round must repeat at most as many layers as the decoder has.
     """
     trial = Trial(case)

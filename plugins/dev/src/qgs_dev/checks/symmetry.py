@@ -135,11 +135,11 @@ def _difference_after(
     outputs_too: bool,
     part: int,
 ) -> str:
-    """Compare outputs with the expected ones after a permutation of the inputs `names`.
+    """Permute the inputs `names`, and compare the outputs with those that the contract requires.
 
-    Returns a description of the first difference, or "" if there is none. If a component returns
-    state and memory, its output number `part` must be permuted: 0 for state, 1 for memory.
-    Otherwise outputs must be permuted if `outputs_too`, and must stay the same if not.
+    Returns a description of the first difference, or "" if there is none. A component with two
+    outputs must permute the state if `part` is 0, or the memory if `part` is 1, and no more. Any
+    other component must permute its outputs if `outputs_too`; else its outputs must not change.
     """
     trial = Trial(case, many(case))
     moved = {name: permute(x) if name in names else x for name, x in trial.inputs.items()}

@@ -118,10 +118,10 @@ class CamerasJson(PhotoReader):
 
 
 def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
-    """Return the values of each camera in the contents `data` of a file.
+    """Return the values of each camera in `data`, the parsed JSON of `file`.
 
-    Every camera gets the values at the top level too. Raises ValueError if the numbers of poses and
-    intrinsics differ.
+    Cameras without a value of their own get the value at the top level of `data`. Raises ValueError
+    if the numbers of poses and intrinsics differ.
     """
     top = data if isinstance(data, Mapping) else {}
     given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)

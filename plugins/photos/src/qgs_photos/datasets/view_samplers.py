@@ -267,7 +267,7 @@ class Overlapping(ViewSampler):
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
         """Return inputs and target of each evaluation window, one window for each target photo.
 
-        Returns [] for a scene that moves: its windows follow from `views.gap`.
+        Returns [] for a scene with times. Evaluation then chooses windows by `views.gap`.
         """
         if scene.times is not None:
             return []

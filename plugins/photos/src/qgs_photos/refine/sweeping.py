@@ -1,6 +1,6 @@
 """Place Gaussians at pixels of photos, at the depth on which photos agree best (plane sweep).
 
-Source: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996), with patches along rays.
+Source: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996), with 3 x 3 patches.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Comparison of stored results for `qgs compare`. The first result is the reference.
 
-Trainings of one recipe with several seeds count as one side of the comparison; intervals then cover
-trainings as well as scenes.
+Trainings of one recipe with several seeds are compared as one model. Intervals then account for the
+differences between trainings as well as between scenes.
 """
 
 from collections.abc import Collection, Iterator, Sequence

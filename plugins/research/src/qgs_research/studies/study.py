@@ -96,7 +96,7 @@ def _known_terms(hypothesis: Hypothesis, info: ValidationInfo) -> Hypothesis:
 class StudySettings(ComponentConfig):
     """Content of a study file, merged with the study files that it extends.
 
-    Checks of a field may use earlier fields only, so variants and evaluations come first.
+    Variants and evaluations come before the fields whose validators read them.
     """
 
     study: int = Field(ge=1, le=1)

@@ -131,9 +131,9 @@ def interior(o, d, h):
 
 @inner
 def _shaft(o, d, radius, half):
-    """Return the t at which a ray enters and leaves an upright cylinder around the z axis.
+    """Return the t at which a ray meets an upright cylinder around the z axis, and its cap planes.
 
-    Returns four t: entry, exit, first and second crossing of the planes of the caps.
+    Returns four t: entry and exit of the cylinder, first and second crossing of the cap planes.
     """
     low, high = slab(o[2], reciprocal(d[2]), half)
     inverse = reciprocal(d[0] * d[0] + d[1] * d[1])

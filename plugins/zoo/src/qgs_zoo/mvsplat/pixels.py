@@ -40,7 +40,7 @@ LOG_DEPTH = 20.0
 
 
 WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 3, 4)}
-"""Degree of harmonics for each model width that has exactly the channels that the degree needs."""
+"""Degrees of harmonics, by the model width that CHANNELS and all coefficients fill exactly."""
 
 
 def degree_of(width: int) -> int:

@@ -33,8 +33,8 @@ outside its image."""
 MAX_SAMPLES = 1 << 24
 """Largest number of sampled values in memory at once (64 MiB in float32)."""
 PAIRS = 40
-"""Largest number of pixels, divided by the number of depths, at which `cost_volume` correlates all
-pairs of pixels before it samples."""
+"""Largest ratio of pixels to depths at which `cost_volume` correlates all pairs of pixels and then
+samples the correlations. At higher ratios it samples the features first."""
 
 
 def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
@@ -117,9 +117,9 @@ def cost_volume(
     """Correlate the features of each pixel with those of neighbour views at D depths.
 
     Returns the mean over neighbours of <f, f'> / sqrt(C), (B, V, D, h, w). f is the feature of a
-    pixel, and f' the neighbour's feature where the pixel is projected to. f' is 0 outside of the
-    neighbour. inverse_depth: the D inverse depths of each pixel, in 1 / world units; h and w of
-    this tensor may be 1, which gives all pixels the same depths.
+    pixel, f' that at its projection into the neighbour view, or 0 outside of that view.
+    inverse_depth: the D inverse depths of each pixel, in 1 / world units; h and w of this tensor
+    may be 1, which gives all pixels the same depths.
     """
     scenes, views, channels, height, width = features_BVChw.shape
     depth_NDhw = (1 / inverse_depth_BVDhw.detach()).flatten(0, 1)

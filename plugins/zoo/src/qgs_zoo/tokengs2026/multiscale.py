@@ -94,7 +94,7 @@ class MultiscaleReadout(PatchViT):
         def _ascending(cls, blocks: tuple[int, ...]) -> tuple[int, ...]:
             if list(blocks) != sorted(set(blocks)) or blocks[0] < 1:
                 raise OptionError(
-                    f"blocks must be at least 1, ascending and without repeats, got {list(blocks)}",
+                    f"blocks must be distinct, ascending and at least 1, got {list(blocks)}",
                     f"write {sorted({max(number, 1) for number in blocks})}",
                 )
             return blocks
