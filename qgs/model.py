@@ -92,9 +92,10 @@ class QueryGaussianModel(nn.Module):
     ) -> Prediction:
         """Reconstruct every scene of `views`, whose cameras are in the model's frame.
 
-        layers: layers to decode besides the last, see `predict`. state: the initial query state;
-            None computes it by the model's `queries`. Raises ValueError for `Photos` if encoder,
-            queries or feedback read cameras.
+        layers: numbers of layers after which Gaussians are decoded, in addition to the last layer;
+            `predict` explains numbers and default. state: the initial query state; None computes it
+            by the model's `queries`. Raises ValueError for `Photos` if encoder, queries or feedback
+            read cameras.
         """
         # NumPy's cameras are float64, the weights hardly ever.
         views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))

@@ -151,7 +151,7 @@ class Component(metaclass=ABCMeta):
 
     schedules: Mapping[str, Any] = MappingProxyType({})
     """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name of the option. In
-    `config`, these options have their values after `followed` optimiser steps."""
+    `config`, these options have their values after n optimiser steps; `followed` is n."""
     followed: int = 0
 
     class Config(ComponentConfig):

@@ -18,7 +18,7 @@ from qgs.wording import numbered
 Split = Literal["train", "test"]
 Frames: TypeAlias = tuple[int, ...]
 Window: TypeAlias = tuple[Frames, Frames]
-"""Numbers of the input frames, and of the target frames with which renderings are compared."""
+"""Indices of the input frames, and of the target frames with which renderings are compared."""
 Side: TypeAlias = Annotated[int, Field(ge=1)]
 
 

@@ -85,7 +85,7 @@ def trained_domain(stream: "SampleStream", steps: int) -> Domain:
 
 
 def scenes_fingerprint(source: SceneSource) -> str:
-    """Return a hash of the training scenes: their indices and groups, see `SceneSource.groups`."""
+    """Return a hash of the training scenes: their indices, grouped as by `SceneSource.groups`."""
     digest = hashlib.sha256()
     for group in filter(len, source.groups("train")):
         digest.update(len(group).to_bytes(8, "little") + np.asarray(group, "<i8").tobytes())

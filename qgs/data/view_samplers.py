@@ -110,9 +110,9 @@ def evenly(items: Sequence[_T], count: int) -> list[_T]:
 
 
 def spread(span: Sequence[Frames], count: int) -> Frames:
-    """Return one frame from each of `count` evenly spaced groups of `span`.
+    """Return one frame from each of `count` groups of `span`, evenly spaced from first to last.
 
-    Each group holds the frames of one time, see `moments`.
+    span: a group of frames for each time; in a scene without times, each group is one frame.
     """
     return one_of_each(evenly(span, count), range(count))
 

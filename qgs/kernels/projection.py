@@ -76,7 +76,7 @@ def _four(row):
 
 @kernel
 def _rotation(quat):
-    """Return a quaternion's rotation matrix, the quaternion normalised, and its norm before."""
+    """Return the rotation matrix, the normalised quaternion, and the norm of `quat`."""
     w, x, y, z = _four(quat)
     norm = max(np.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
     w = w / norm
@@ -191,10 +191,11 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
 
 @kernel
 def _covariance_slopes(row_x, row_y, splat, given, dilation):
-    """Return gradients of row_x and row_y, two rows of J W R S, from the gradients of a splat.
+    """Return the gradients of `row_x` and `row_y`, given the gradients of a splat's fields.
 
-    splat: the fields of the splat; fields 2 to 4 are the conic (inverse 2D covariance). given:
-        gradients of the splat's fields.
+    row_x, row_y: rows of J W R S for the image axes x and y; the module explains the symbols.
+    splat: the splat's fields; fields 2 to 4 are the conic (inverse 2D covariance). given: gradients
+        of the fields.
     """
     xx = _dot(row_x, row_x)
     yy = _dot(row_y, row_y)

@@ -1,4 +1,4 @@
-"""The loss `qgs/visibility`, which moves Gaussians that no target view shows towards a view."""
+"""The loss `qgs/visibility`, which moves Gaussians outside of all target views into a view."""
 
 from collections.abc import Iterable, Iterator
 from typing import Literal

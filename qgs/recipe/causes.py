@@ -59,11 +59,11 @@ def _blames(
 ) -> dict[RecipeProblem, RecipeProblem]:
     """Map each problem in `found` to a new problem, at the line that caused it.
 
-    `written` is the result of merging `written.over`, the last file or override, into
-    `written.under`. The options of `written.over` are merged one by one. An option causes the
-    problems that first appear after it.
-    found: problems that are absent without `written.over`. before: draft (recipe with components
-        chosen, not yet checked) of `written.under`.
+    The last file or override, `written.over`, was merged into `written.under`, which gave
+    `written`. This function merges the options of `written.over` one by one. The option after which
+    a problem first appears is its cause.
+    found: problems that `written` has and `written.under` does not have. before: draft of
+        `written.under` (recipe with components chosen, not yet checked).
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     base: Any = written.under

@@ -39,7 +39,7 @@ class Place:
 
 
 def layer_place(index: int, slot: str) -> KeyPath:
-    """Return the path in a recipe of a slot of decoder layer `index`, counted from 0."""
+    """Return the recipe path of the slot `slot` in the decoder layer `index`, counted from 0."""
     return (*DECODER, "layers", str(index), slot)
 
 

@@ -161,7 +161,7 @@ def load_plugin(name: str) -> InstalledPlugin:
         fix = f"install what it needs, update or fix {release}, or do without the plugin"
         raise PluginError(f"{named} {message}", fix) from error
     if fault := _plugin_fault(plugin, name):
-        raise PluginError(f"{named} {fault}", f"update or fix {release}, or do without it")
+        raise PluginError(f"{named} {fault}", f"update or fix {release}, or do without the plugin")
     folder = Path(sys.modules[entry.module].__file__ or "").parent
     return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, folder)
 

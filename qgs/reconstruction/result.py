@@ -83,7 +83,7 @@ class Reconstruction:
         return replace(seen, depth=seen.depth / float(scale))
 
     def save(self, out: AnyPath) -> list[Path]:
-        """Write the result to the folder or file `out`, as `qgs reconstruct`; return the paths."""
+        """Write the result to the folder or file `out` like `qgs reconstruct`; return the paths."""
         # Matplotlib is slow to import.
         from qgs.reconstruction.saving import write_reconstruction
 

@@ -37,8 +37,8 @@ BELOW = 2.0
 ABOVE = 4.0
 """Multiplier of the largest baseline in training. Baselines are tried up to the product."""
 NEAREST = 0.8
-"""Smallest depth of the point that cameras look at, to assume if the model does not record that of
-its training."""
+"""Smallest depth of the point that cameras look at. It is used if the model does not record the
+smallest depth of its training."""
 REACH = 6.0
 """Multiplier of the smallest depth, in training, of the point that cameras look at. Depths of this
 point are tried up to the product."""

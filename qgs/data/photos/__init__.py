@@ -105,8 +105,10 @@ def present_frames(
     """Return the frames of a folder's listing whose images exist, and paths of missing images.
 
     Frames that belong to no split of the listing are left out. Warnings count all that is left out.
-    format, images, outside: see `read_listing`. Raises FileNotFoundError if fewer than two images
-    exist or a mask is missing, and ValueError for impossible poses and intrinsics.
+
+    format: name of a format, or "auto". images: folder with scaled copies of the photos to read.
+        outside: allow files outside of `folder`. Raises FileNotFoundError if fewer than two images
+        exist or a mask is missing, and ValueError for impossible poses and intrinsics.
     """
     found = read_listing(folder, format, images, outside)
     frames = [frame for frame in found.frames if frame.split != "unused"]

@@ -73,8 +73,11 @@ def found_files(
 
     A file that is not where it is listed is searched for in `folder` and in its folder of images:
     under its whole listed path, then without the first folder of this path, then without the first
-    two, and so on. images, outside: see `located`. Raises ValueError if two files fit a name, or if
-    one file fits the names of two photos.
+    two, and so on.
+
+    images: subfolder of `folder` from which photos are read. outside: allow files outside of
+        `folder`. Raises ValueError if two files fit a name, or if one file fits the names of two
+        photos.
     """
     indexed = cache(_index)
     photo_folder = image_folder(folder, images)
@@ -133,7 +136,7 @@ def _resolved(
 
 
 def _index(folder: UPath) -> _Index:
-    """Return the items in `folder` by each of the `_spellings` of their names."""
+    """Return the files and subfolders of `folder`; the keys are the `_spellings` of their names."""
     index = defaultdict[object, list[UPath]](list)
     for item in sorted(listing(folder), key=str):
         for way in _spellings(item.name):

@@ -304,7 +304,7 @@ def _with_queries(
     """
     for change in ("refinement", "tuning"):
         if record.get(change):
-            raise ValueError(f"{change} changed the Gaussians after their queries made them.")
+            raise ValueError(f"{change} changed the Gaussians, so the model no longer makes them.")
     name = str(record.get("model") or "")
     # nothing is fetched because a file says so
     if not name or "://" in name:

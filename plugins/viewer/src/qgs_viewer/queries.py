@@ -35,8 +35,8 @@ def outline(support: SpatialSupport, query: int, cameras: Cameras) -> Tensor | N
     Returns None if a part of the ellipsoid lies behind the camera. cameras: (1, 1), the camera of
     the photo.
 
-    In coordinates in which the ellipsoid is the unit ball, a camera at e sees as outline the circle
-    with centre e / |e|^2 and radius sqrt(1 - 1 / |e|^2), in a plane at right angles to e.
+    In coordinates in which the ellipsoid is the unit ball, the outline seen from a camera at e is a
+    circle with centre e / |e|^2 and radius sqrt(1 - 1 / |e|^2), in a plane at right angles to e.
     """
     center = support.centers[0, query]
     axes = support.axes[0, query]

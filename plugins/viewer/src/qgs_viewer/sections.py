@@ -184,7 +184,7 @@ def training_curves(models: Shown, detail: Detail) -> Section:
 
 
 def novel_views(models: Shown, detail: Detail) -> Section:
-    """Return a section with the middle target view of up to three scenes.
+    """Return a section with the middle target view of each scene, for at most three scenes.
 
     Each scene has three rows: renders, errors of the renders, depths. The columns are the inputs,
     the real photos (truth) and the models.

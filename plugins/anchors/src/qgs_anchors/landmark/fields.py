@@ -16,10 +16,10 @@ FRAME_FIELD: Fields = {
 FOOTPRINT_FIELD: Fields = {
     FOOTPRINT: FieldSpec((3,), encoding="width and height in sides, rows of cells")
 }
-"""Field of the shapes of footprints (B, N, 3): width, height and number of rows of cells.
+"""Field of the shapes of footprints (B, N, 3): width, height, and number of rows of their cells.
 
-The unit of width and height is the side of a square with the footprint's area. The number of rows
-is 0 if the footprint has no cells. All queries of a set of photos have the same shape."""
+Width and height are multiples of the side of a square with the footprint's area. A footprint may be
+divided into a grid of cells; if not, the number of rows is 0. All queries have the same shape."""
 
 
 def color_field(count: int) -> Fields:

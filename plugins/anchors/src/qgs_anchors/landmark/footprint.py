@@ -102,9 +102,9 @@ class ColoredHead(GaussianHead):
         }
 
     def _of_cells(self, rows: Tensor) -> Tensor:
-        """Convert weights `rows` (K' * 14, ...) for K' cells to (K * 14, ...) for this head's K.
+        """Convert head weights `rows` (K' * 14, ...) from K' to this head's K Gaussians per query.
 
-        Each cell has one Gaussian with 14 output channels. Weights with a first dimension that is
+        The result is (K * 14, ...), with 14 channels per Gaussian. Weights whose first dimension is
         not a multiple of 14 belong to another kind of head; they are returned unchanged.
         """
         if len(rows) % sum(CHANNELS):

@@ -14,7 +14,7 @@ from qgs.types import QueryState
 MAX_PAIRS = 1 << 22
 """Largest number of distances in memory at once (16 MiB in float32)."""
 PLACE = 5
-"""Number of values in a relative position, which `NeighbourAttention` defines."""
+"""Number of values in a relative position; `NeighbourAttention` lists these values."""
 EPS = 1e-6
 
 

@@ -65,7 +65,7 @@ SLACK = 2
 
 
 def check_builds(case: Case) -> None:
-    """Require that `problems` returns none for the options, and that the component can be built."""
+    """Require that `problems` accepts the options, and that the component can be built."""
     found = [f"`{p.option}`: {p.reason}" for p in case.problems(case.size)]
     # A case with invalid options says nothing about the component.
     expect(not found, f"`problems` refuses the options of this case: {', '.join(found)}")

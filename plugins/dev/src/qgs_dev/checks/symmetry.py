@@ -1,4 +1,4 @@
-"""Checks that results do not depend on other scenes, on orders, or on the world frame."""
+"""Checks that results depend on no other scene, no order of queries or views, no world frame."""
 
 from collections.abc import Callable, Collection
 from typing import Any

@@ -255,7 +255,7 @@ class _BiasGradients:
 
 
 class _BiasedAttention(torch.autograd.Function):
-    """Autograd function of `biased_attention`, block by block."""
+    """Autograd function of `biased_attention`, computed for one block of queries at a time."""
 
     @staticmethod
     def forward(

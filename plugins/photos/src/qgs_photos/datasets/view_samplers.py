@@ -94,11 +94,11 @@ class Bounded(ViewSampler):
     def span(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int, parts: int = 1
     ) -> list[Frames]:
-        """Return the frames in a random gap of the video, as one tuple of frames for each time.
+        """Return the frames of a random stretch of the video, as one tuple of frames per time.
 
-        A tuple has several frames if several cameras took photos at that time. parts: number by
-        which the bounds of the gap are divided. Raises ValueError for a scene with too few
-        frames.
+        A tuple has several frames if several cameras took photos at that time. The length of the
+        stretch is random between the bounds that `gaps` returns, divided by `parts`. Raises
+        ValueError for a scene with too few frames.
         """
         refuse_too_many(views.inputs + views.targets, scene)
         options = self.options(step)
@@ -147,17 +147,18 @@ class Bounded(ViewSampler):
 
 
 class Farthest(Bounded):
-    """Sampler of inputs that are far from each other in a random gap, and of targets in the gap.
+    """Sampler of inputs far from each other in a random stretch of a video, and targets in it.
 
-    The gap widens over `warm_up_steps`. This is DepthSplat's sampler `boundedv2` with
-    `farthest_point`. Two inputs are the ends of the gap; of more inputs, each is the one farthest
-    from those chosen before. With n inputs, fewer than `views.inputs`, the bounds of the gap are
-    divided by `views.inputs` // n. Targets may be inputs. Targets repeat only if the gap has too
-    few frames (DepthSplat returns fewer targets).
+    The length of the stretch, the gap, grows over `warm_up_steps`. This is DepthSplat's sampler
+    `boundedv2` with `farthest_point`. Two inputs are the ends of the stretch. More inputs are
+    chosen one after another, each as far as possible from those already chosen. If the number
+    n of inputs is below `views.inputs`, the bounds of the gap are divided by `views.inputs` // n.
+    Targets may be inputs. Targets repeat only if the stretch has too few frames (DepthSplat then
+    returns fewer targets).
 
-    In training, n goes from `fewest` to `views.inputs`, one more in each step, and starts again.
-    DepthSplat chooses n at random. Either way every n is equally frequent; here all samples of a
-    step have the same n, so that they can form one batch.
+    In training, n is `fewest` in the first step, grows by one per step up to `views.inputs`, and
+    then starts again. DepthSplat chooses n at random. Both make every n equally frequent; here all
+    samples of a step have the same n, so that they can form one batch.
     """
 
     name = "farthest"

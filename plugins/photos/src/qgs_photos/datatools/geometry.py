@@ -135,9 +135,9 @@ def off_lines(matches: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray) ->
 def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geometry:
     """Measure how well the poses of a scene fit its photos.
 
-    Each frame is matched with the next and with one that is farther away. usable: frames that may
-    be matched. most: largest number of frames to match; if more are usable, only some runs of
-    neighbours are matched.
+    Each frame is matched with the next frame, and with a frame taken from another position. usable:
+    frames that may be matched. most: largest number of frames to match; if more are usable, only
+    some runs of consecutive frames are matched.
     """
     if len(usable) < 2:
         return Geometry("fewer than 2 usable frames")

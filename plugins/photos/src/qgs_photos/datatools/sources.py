@@ -1,4 +1,4 @@
-"""Find the data source of an installed plugin that reads a path, and list its scenes to check."""
+"""Find the installed data source that can read a path, and list the scenes to check."""
 
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
@@ -37,11 +37,11 @@ def _imported(format: str) -> tuple[Registry, list[str]]:
 
 
 def sources(format: str = "auto") -> dict[str, type[Component]]:
-    """Return the data sources that have an option `path`, as a mapping from PLUGIN/NAME.
+    """Return the data sources that have an option `path`, by type PLUGIN/NAME.
 
-    format: "auto" searches all plugins; PLUGIN/NAME searches PLUGIN and the plugins in OF_FILES;
-    any other format searches only the plugins in OF_FILES. Raises PluginError if PLUGIN cannot be
-    imported.
+    format: "auto" searches all plugins; PLUGIN/NAME searches PLUGIN and the plugins OF_FILES, which
+    are `qgs` and `datasets`; any other format searches only these two. Raises PluginError if PLUGIN
+    cannot be imported.
     """
     found = _imported(format)[0].components("data")
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}

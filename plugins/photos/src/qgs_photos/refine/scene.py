@@ -137,7 +137,7 @@ def masked(views: Views) -> Views:
 
 
 def timed_sweep(views: Views) -> tuple[Gaussians, float]:
-    """Return Gaussians (1, TIMED) at pixels of photos (1, V), and the seconds for each Gaussian."""
+    """Return Gaussians (1, TIMED) at pixels of photos (1, V), and the seconds per Gaussian."""
     began = perf_counter()
     found = swept(views, TIMED, 1.0, torch.Generator().manual_seed(0))
     return found, (perf_counter() - began) / found.count

@@ -19,7 +19,7 @@ SIZES = range(96, 2161, 16)
 LEAST_STEPS = 4000
 """Least number of steps. A larger photo size is chosen only if the time allows this many steps."""
 STEPS_OF_PHOTO = 25
-"""Least number of steps for each photo, if this gives more than LEAST_STEPS in all."""
+"""Least number of steps per photo. LEAST_STEPS applies if it gives more steps in total."""
 # twice as many gained less than their time
 DENSITY = 0.6
 """Number of Gaussians as a fraction of the number of pixels in a photo."""

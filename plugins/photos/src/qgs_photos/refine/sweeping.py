@@ -88,9 +88,9 @@ def pixel_rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> T
 
 
 def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float) -> Tensor:
-    """Return depths (n,) of pixels of one photo, chosen around the scene's distance `size`.
+    """Return the depths (n,) of pixels of one photo, by comparison with other photos.
 
-    Each pixel gets the depth at which its colours differ least from those in other photos.
+    From depths around the distance `size`, each pixel gets the one where colours differ least.
     """
     cameras = views.cameras
     height, width = cameras.size

@@ -75,8 +75,8 @@ def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
 def _paired(reference: Runs, runs: Runs) -> Runs:
     """Pair `runs` with runs of `reference`; return `runs` by the seeds of their partners.
 
-    Runs are paired by equal seeds if at least two seeds are equal, or one if a side has only one
-    run. Otherwise runs are paired in order.
+    Runs with equal seeds are paired if there are at least two such pairs; if `reference` or `runs`
+    is a single run, one such pair is enough. Otherwise runs are paired in order.
     """
     # Trainings with equal seeds saw the same data in the same order.
     if len(reference.keys() & runs.keys()) >= min(2, len(reference), len(runs)):

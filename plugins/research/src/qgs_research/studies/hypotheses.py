@@ -54,8 +54,8 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     # A sum that does not cancel would depend on the data set, not on the variants.
     if sum(terms.values()):
         raise OptionError(
-            f"the weights (1 or -1) of the terms of `{text}` have different sums on its two sides",
-            "write one variant on each side, or differences, such as `A@noisy - A < B@noisy - B`",
+            f"the sides of `{text}` have different sums, counting 1 per variant and -1 after a `-`",
+            "write a variant on each side, or a difference, such as `A@noisy - A < B@noisy - B`",
         )
     terms = {term: coefficient for term, coefficient in terms.items() if coefficient}
     if not terms:

@@ -20,7 +20,7 @@ from qgs.wording import did_you_mean
 from qgs_research.studies.hypotheses import NAME, Contrast, parsed
 
 _BY_NAME = ("variants", "evaluations", "published")
-"""Keys whose entries a study replaces one by one in the study that it extends."""
+"""Keys of mappings. An entry replaces only the entry of the same name in the extended study."""
 
 
 def _folder_name(name: str) -> str:

@@ -83,8 +83,8 @@ def ball(o, d, radius):
 def _last_and_first(x, y, z):
     """Return the overlap of three ranges of t on x, y and z as an interval.
 
-    x, y, z: pairs (entry t, exit t). The entry face and the exit face are the numbers, 0 to 2, of
-    the axes whose range begins last and ends first.
+    x, y, z: pairs (entry t, exit t). The entry face is the number, 0 to 2, of the axis whose range
+    begins last. The exit face is the number of the axis whose range ends first.
     """
     near = max(x[0], y[0], z[0])
     far = min(x[1], y[1], z[1])

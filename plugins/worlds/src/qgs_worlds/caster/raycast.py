@@ -129,11 +129,11 @@ def _row_base(rays, v):
 
 @inner
 def _ray(o, base, step, u):
-    """Return a ray's point nearest to the origin, its direction, and the t of this point.
+    """Return the point of a ray nearest to the origin, the ray's direction, and the point's t.
 
     o, base, step: start of the ray, direction of the ray at pixel 0 of its row, and change of
-    direction per pixel. u: pixel coordinate in the row. Intersections start at the nearest point,
-    because float32 would lose thin shapes far from the camera.
+    direction per pixel. u: pixel coordinate in the row. Intersections are computed with the nearest
+    point as the start of the ray: from a distant start, float32 would lose thin shapes.
     """
     d = along(base, u, step)
     p, t = nearest(o, d)

@@ -102,8 +102,8 @@ def to_world(primitive, n):
 def surface(shape, heights, part, place):
     """Return texture index, world normal and texture coordinates u, v of a point on a shape.
 
-    part: number of the face; faces of the shape's cut have numbers from 3 on. place: the point in
-    the world frame.
+    part: number of the face. Numbers of 3 and above are faces of `shape.cut`, the primitive that is
+    removed from the shape. place: the point in the world frame.
     """
     cut = part >= 3
     primitive = shape.cut if cut else shape.body

@@ -65,7 +65,7 @@ class SlotQueries(LearnedQueries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report an option `extra` that leaves no token to decode Gaussians."""
+        """Report a problem if `extra` is so large that no token is left for Gaussians."""
         if config.extra >= config.count:
             reason = f"all {config.count} tokens are extra ones, which decode no Gaussians"
             yield Problem("extra", reason, f"write at most {config.count - 1}, or raise `count`")

@@ -68,8 +68,8 @@ def width_problems(context: RecipeContext) -> Iterable[Problem]:
 class PixelQueries(Queries):
     """One query for each pixel, with the rays through the pixel and the rotation of its camera.
 
-    The features of a query are the encoder's numbers of the pixel, with harmonics rotated from the
-    camera's frame to the world's.
+    The features of a query are the encoder's features of the pixel. Their spherical harmonics are
+    rotated from the camera's frame to the world's.
     """
 
     name = "pixels"
