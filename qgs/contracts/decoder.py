@@ -188,6 +188,6 @@ class Feedback(ModelComponent):
 
         state: the query state after the last layer. memory: the image memory that the first
             repeated layer read in the first pass. rendering: the last layer's Gaussians, from the
-            cameras of `photos`. photos: the input photos (B, V), as `compared` returns them, of the
-            image size of `rendering`.
+            cameras of `photos`. photos: the input photos (B, V), which `compared` has scaled to
+            the image size of `rendering`.
         """

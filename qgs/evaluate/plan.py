@@ -148,11 +148,11 @@ class EvaluationPlan:
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[Window]:
     """Return windows (input frames, target frames) in which each held-out frame is a target once.
 
-    The length of a window is the largest `views.gap`, counted in training frames or, in a scene
-    with times, in times. The window is centred on the first held-out frame that is in no earlier
-    window, and shifted to lie inside the scene. Its inputs are evenly spaced training frames. Its
-    targets are all held-out frames between the first and the last input that are in no earlier
-    window.
+    A window is made for each held-out frame, in order, that is no target of an earlier window. The
+    window is centred on this frame, and shifted to lie inside the scene. Its length is the upper
+    limit of `views.gap`, counted in training frames or, in a scene with times, in different times.
+    Its inputs are evenly spaced training frames. Its targets are all held-out frames between the
+    first and the last input that are no targets of earlier windows.
     """
     usable = moments(scene)
     gap = gap_range(len(usable), views, scene)[1]
@@ -179,7 +179,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[Window]:
 def _named(scene: Scene, index: EvaluationIndex) -> Window:
     """Return input and target frames of `scene` from `index`.
 
-    Raises ValueError if the scene lacks some of these frames, or images that it lists.
+    Raises ValueError if the scene lacks some of these frames, or if any of its images is missing.
     """
     entry = index[scene.name]
     assert entry is not None

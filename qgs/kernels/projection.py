@@ -213,11 +213,11 @@ def _covariance_slopes(row_x, row_y, splat, given, dilation):
 
 @kernel
 def _axis_slopes(axis, focal, z, of_row, turned_z, of_pixel):
-    """Return the gradients of the inputs of `_axis`, for one image axis.
+    """Return the gradients of the loss with respect to six inputs of `_axis`, for one image axis.
 
-    The gradients are those of x (or y) and z of the camera-frame mean, of focal length and
-    principal point, and of the rows x (or y) and z of W R S. axis: the result of `_axis`. of_row,
-    of_pixel: gradients of the row of J W R S and of the pixel coordinate. turned_z: row z of W R S.
+    The inputs are x (or y) of the camera-frame mean, its z, focal length, principal point, row x
+    (or y) of W R S, and row z of W R S. axis: the result of `_axis`. of_row: gradient of the row of
+    J W R S. of_pixel: gradient of the pixel coordinate. turned_z: row z of W R S.
     """
     slope, held, row = axis
     gain = focal / z

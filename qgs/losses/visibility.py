@@ -66,8 +66,8 @@ class Visibility(Loss):
 
     class Config(VisibilityOptions):
         infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
-        """Pixel coordinate u of a point at depth 0 if its camera-frame x > 0, and minus this for
-        x < 0; likewise v for y. It has no effect if `clamp` is set."""
+        """Pixel coordinate u of a point at depth 0 with camera-frame x > 0. With x < 0, u has the
+        opposite sign. The same rule gives v from y. No effect if `clamp` is set."""
 
     config: Config
 

@@ -237,9 +237,9 @@ def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
 def _shown_parts(parts: Parts) -> dict[KeyPath, Chosen]:
     """Return components by path, without components that a complete recipe need not repeat.
 
-    A path such as `model.decoder.layer` stands for all decoder layers. If all layers have the same
-    component, it has this path. Only layers with another component have separate paths, such as
-    `model.decoder.layers.0.layer`.
+    A path without a layer number, such as `model.decoder.layer`, stands for all decoder layers. If
+    all layers have the same component, the result has only this path. Otherwise, it also has a path
+    such as `model.decoder.layers.0.layer` for each layer that differs from this path's component.
     """
     shown = {path: part for path, part in parts.items() if "layers" not in path}
     layers = {path: part for path, part in parts.items() if "layers" in path}

@@ -148,7 +148,7 @@ def load_plugin(name: str) -> InstalledPlugin:
     if len(entries) > 1:
         releases = ", ".join(sorted(map(_release, entries)))
         reason = f"several distributions offer a plugin `{name}`: {releases}"
-        raise PluginError(reason, "uninstall all of these distributions but one")
+        raise PluginError(reason, "keep one of these distributions, and uninstall the others")
     entry = entries[0]
     release = _release(entry)
     assert entry.dist is not None

@@ -15,10 +15,10 @@ class Slot:
 
     default: `type` of the component if the recipe names none; None if the recipe must name one.
     The remaining fields matter only for slots that are top-level sections.
-    defaults: types of the components, by name, in a recipe without the section. Without
-        any, the section is one component.
-    defaults_stay: True if a recipe's components are added to `defaults`, of which `NAME: null`
-        drops one; False if they replace `defaults`.
+    defaults: types, by name, of the components in a recipe that lacks the section. If empty, the
+        section is a single component.
+    defaults_stay: True if a recipe's components are added to `defaults`, and `NAME: null` removes
+        the default called NAME; False if a recipe's components replace `defaults`.
     """
 
     contract: type[contracts.Component]
@@ -84,9 +84,10 @@ def summary_of(described: object) -> str:
 
 
 def type_at(node: Any, path: KeyPath) -> Any:
-    """Return the `type` that the value `node` at `path` of a recipe sets, else the slot's default.
+    """Return the `type` of the component at `path` of a recipe. node: the value at this path.
 
-    `type: null`, or a null `node`, means the default. Without a slot at `path`, the result is None.
+    If `node` is null, or its `type` is null or not set, the result is the default of the slot at
+    `path`, or None if there is no such slot.
     """
     if isinstance(node, MapNode) and node.get("type") is not None:
         return node["type"]

@@ -43,8 +43,9 @@ REACH = 6.0
 """Multiplier of the smallest depth, in training, of the point that cameras look at. Depths of this
 point are tried up to the product."""
 PENALTY = 5.0
-"""Penalty on a score, in dB per factor e by which depths are smaller than in training. It applies
-only if no photos but the inputs are scored."""
+"""Penalty in dB on the score of a factor that makes depths smaller than in training. It is PENALTY
+times ln(limit / factor), with the limit from `search_range`. It applies only if the
+model is given all scored photos."""
 POOR = 14.0
 """PSNR in dB that the best factor must reach. If it does not, no scale fits, and novel views have
 about 12 dB."""

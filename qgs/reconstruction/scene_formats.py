@@ -228,10 +228,10 @@ def _of_ply(path: Path) -> Gaussians:
 
 
 def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, str]:
-    """Return one scene of Gaussians (G, ...) in float32 on the CPU, and its origin, for a file.
+    """Prepare Gaussians for a file: return one scene (G, ...), float32 on the CPU, and its origin.
 
-    gaussians: (G, ...) or (1, G, ...). kind: file type for messages. lost: names of fields that the
-        file cannot hold; a warning says if they are left out.
+    gaussians: (G, ...) or (1, G, ...). kind: file type for messages. lost: fields that this file
+        type cannot hold; if the Gaussians have some of these, a warning says that they are lost.
     The origin is the point "X Y Z" from which means are measured, or "" for (0, 0, 0).
     Raises ValueError for several scenes or for numbers whose squares are not finite.
     """

@@ -202,8 +202,8 @@ class GivenScene(Scene):
             )
         if views.target_time is not None:
             raise ValueError(
-                "these Views have a target_time, but results are compared at the time of photos: "
-                "remove target_time, and name photos of the wanted time by `compare`"
+                "these Views have a target_time, but renderings are compared with photos, at the "
+                "times of the photos: remove target_time, and give photos of that time as `compare`"
             )
         self.views = views = views.to("cpu")
         self.times = None if views.times is None else views.times[0].double()

@@ -128,7 +128,10 @@ def posact(
 
 
 class FreeCenters(Centers):
-    """Free centers: mean = posact(offset) + (0, 0, z_offset)."""
+    """Free centers: mean = posact(offset) + (0, 0, z_offset).
+
+    `offset` is an output of the head. posact(t) is sign(t) (exp|t| - 1).
+    """
 
     name = "free"
 

@@ -263,7 +263,7 @@ class GoodWeights:
 
     @property
     def last(self) -> tuple[int, Weights]:
-        """Number of optimiser steps and the weights after them, from the older copy."""
+        """Older of the two copies: number of optimiser steps when it was made, and its weights."""
         return self.copies[0]
 
     def observe(self, numbers: Mapping[str, float]) -> None:

@@ -108,8 +108,8 @@ def found_files(
             # A file that exists as listed is meant by no other name; a photo is no mask.
             if other != real and {file, other} <= photos.keys():
                 raise ValueError(
-                    f"{real} may be {name_shown(str(other))} or {name_shown(str(file))}: correct "
-                    "the names in the listing"
+                    f"{real} fits two names, {name_shown(str(other))} and {name_shown(str(file))}: "
+                    "correct the names in the listing"
                 )
     return where
 
@@ -145,7 +145,7 @@ def _index(folder: UPath) -> _Index:
 
 
 def _spellings(name: str) -> enumerate[str]:
-    """Yield (0, name), (1, name in lower case and Unicode form NFC), (2, (1) without suffix)."""
+    """Yield (0, name), (1, name in lower case and NFC), (2, the latter without image suffix)."""
     key = unicodedata.normalize("NFC", name).casefold()
     stem, dot, suffix = key.rpartition(".")
     known = dot + suffix in (*Image.registered_extensions(), ".heic")

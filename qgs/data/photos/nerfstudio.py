@@ -228,7 +228,8 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
     """Return `frames` with the splits that nerfstudio's lists of file names give.
 
     Frames in no list belong to the split that has no list; if both splits have lists, these frames
-    are unused. A frame in both lists is a test frame. Names fit if one is the end of the other.
+    are unused. A frame in both lists is a test frame. If no frame has a listed name, the list and
+    the frames may differ in leading folders: the end of one name may be the other name.
     """
     known = {frame.name for frame in frames}
 

@@ -153,7 +153,7 @@ class Trial:
         )
 
     def state_of(self, outputs: Any) -> Any:
-        """Return the query state in `outputs` of a layer or feedback; else `outputs` unchanged."""
+        """Return the query state if `outputs` are of a layer or feedback, otherwise `outputs`."""
         return outputs[0] if self.case.slot in WITH_MEMORY else outputs
 
 

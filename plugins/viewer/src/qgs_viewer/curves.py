@@ -44,7 +44,7 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def curves_of(file: Path) -> Curves:
-    """Return the records of a training without skipped steps; empty if no records are stored.
+    """Return the stored records of a training, except skipped steps; empty if there are none.
 
     file: checkpoint NAME.safetensors. The history is read from NAME.history.jsonl in the same
     folder, or else from history.jsonl.

@@ -48,7 +48,7 @@ def remarks(models: Sequence[Model]) -> list[str]:
 def chosen_windows(model: Model) -> Iterator[str]:
     """Yield a line for each scene of a user's photos, with inputs and scored photos of each window.
 
-    A window is a choice of input photos with the photos near them that are scored.
+    A window consists of chosen input photos, and of scored photos near these inputs.
     """
     if model.windows is None:
         return

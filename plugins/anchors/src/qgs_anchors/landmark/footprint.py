@@ -91,10 +91,10 @@ class ColoredHead(GaussianHead):
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Adapt the weights `learned` of a head with a different number of Gaussians per query.
 
-        Each Gaussian stands for a cell of a footprint. It takes the weights that the other head has
-        for the nearest cell. Distances between cells are computed for a square footprint, the kind
-        that queries have with `count: null`. In other footprints the rows of cells may differ, so
-        another cell may be nearer.
+        Each Gaussian stands for a cell of a footprint. It takes the weights of the nearest cell in
+        `learned`. Distances are computed with cells in a square, as in the footprints of queries
+        with `count: null`. In other footprints, the cells may form other rows, so another cell may
+        be nearer.
         """
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values

@@ -78,8 +78,8 @@ class ObservedQueries(Queries):
     this side, projected to the anchor's depth.
 
     A query may sample S tokens at points of its footprint. Its features start as the mean of the
-    tokens, plus a learned matrix times the differences between each token but the first and the
-    mean. Its w is the mean of the w of all S tokens.
+    tokens, plus a learned matrix times S - 1 differences: each token except the first, minus the
+    mean. The w of the query is the mean over its S tokens.
     """
 
     name = "observed"

@@ -99,10 +99,10 @@ def rows_in_square(count: int) -> int:
 
 
 def rows_in_tile(count: int) -> int:
-    """Return the number of rows of the most nearly square grid with exactly `count` cells.
+    """Return the number of rows of a grid with exactly `count` cells that is as square as possible.
 
-    The grid has at most twice as many columns as rows. If there is no such grid, the result is that
-    of `rows_in_square`.
+    The grid has at least as many columns as rows, and at most twice as many. If no grid has these
+    properties, such as for 5 cells, the result is the square root of `count`, rounded.
     """
     few = range(math.isqrt(count), 0, -1)
     grids = (rows for rows in few if count % rows == 0 and count <= 2 * rows**2)

@@ -54,11 +54,11 @@ def mismatch(
 def reprojected(
     cameras: Cameras, view_N: Tensor, other_N: Tensor, place_BNP2: Tensor, depth_D: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Project P points of a photo, at D depths each, into another photo, for N pairs of photos.
+    """Project P points of a photo, each at D depths, into a second photo, for N pairs of photos.
 
-    view, other: indices of the photos of each pair. Points are x and y as shares of the photo's
-    width and height. Returns the points in the other photo (B, N, D, P, 2), and whether each is
-    inside that photo.
+    view, other: indices of the first and the second photo of each pair. place: x and y of the
+    points, divided by the photo's width and height. Returns positions in the second photo
+    (B, N, D, P, 2), and whether each is in front of the camera and inside the photo.
     """
     height, width = cameras.size
     points = place_BNP2.shape[2]

@@ -92,9 +92,9 @@ def check_explanation_is_a_softmax(case: Case) -> None:
 def check_updates_are_explained(case: Case) -> None:
     """Require that updates are sums of values with the weights that `explain` returns.
 
-    The values, one vector for each head and token, are not known here. Updates of many queries, or
-    with several masks, are linear in the values, and there are more updates than values. So a
-    least-squares fit of the values to the updates must leave no residual.
+    The values, one vector for each head and token, are not known here. But updates are linear in
+    the values, and there are more updates (of many queries, or with several masks) than values. So
+    a least-squares fit of the values to the updates must leave no residual.
     """
     count = QUERIES if case.slot == "self_attention" else 60
     module = case.lively().double()

@@ -65,10 +65,10 @@ class AttentionBias(ABC):
     def compiled(self) -> tuple[Kernel, Kernel] | None:
         """Return two kernels (`qgs.kernels.kernel`) for float32 on a CPU; None if there are none.
 
-        The first takes arrays (queries, tokens, out) and writes `value` to `out`. The second takes
-        (queries, tokens, gradient, out). From the gradient of the bias (n, M) it computes the
-        gradient of the queries (n, F) and writes it to `out`. Several threads may run a kernel at
-        the same time, each on a part of the queries.
+        The first takes arrays (queries, tokens, out) and writes the bias (n, M) to `out`. The
+        second takes (queries, tokens, gradient, out): `gradient` is that of the bias (n, M), and
+        the kernel writes the gradient of the queries (n, F) to `out`. Several threads may run a
+        kernel at the same time, each on other queries.
         """
         return None
 

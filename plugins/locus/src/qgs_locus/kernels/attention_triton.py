@@ -85,9 +85,9 @@ def _bias_gradients(queries, tokens, step, gradient, sums):
 
 @jit
 def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
-    """Load `rows` of a scene and head as (rows, W), with 0 outside the tensor.
+    """Load `rows` of a scene and head of `x` as (rows, WIDTH); elements outside of `x` are 0.
 
-    x: a tensor (B, h, count, width) and its strides.
+    x: pair of a tensor (B, h, count, width) and its strides. WIDTH: power of 2, at least `width`.
     """
     at, inside = _at(x, scene, head, rows, count, width, WIDTH)
     return tl.load(at, mask=inside, other=0.0)
@@ -196,7 +196,7 @@ def _backward_tokens(
     q, k, v, read_q, read_k, g, lse, rowsum, dk, dv, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradient of k to `dk` and that of v to `dv`, unless `dk` or `dv` is None.
+    """Write the gradients of k and v to `dk` and `dv`; leave one out if its tensor is None.
 
     Rows beyond the last query get log-sum-exp inf, so their attention weights are 0. g: gradient
     of the attention result. rowsum: sum of g times the result over the head's channels, (B, h, N).
@@ -231,8 +231,8 @@ def _backward_tokens(
 class TritonAttention(torch.autograd.Function):
     """Autograd function of `biased_attention` in Triton.
 
-    queries (B, N, F) and tokens (B, G, M) are the numbers of `RayBias`, float32. Tokens get no
-    gradient.
+    queries (B, N, F), tokens (B, G, M): the F numbers of each query and the G numbers of each token
+    that `RayBias` lists, float32. Tokens get no gradient.
     """
 
     @staticmethod
@@ -280,7 +280,7 @@ def _launch(kernel: Any, *tensors: Any) -> None:
 
 
 def _blocks(q: Tensor) -> dict[str, int]:
-    """Return block sizes and numbers of warps that nearly fit into 255 registers per thread.
+    """Return block sizes and numbers of warps for which 255 registers per thread nearly suffice.
 
     Products in float32 do not use the GPU's matrix units, so loading blocks in advance (num_stages
     above 1) would only cost registers.

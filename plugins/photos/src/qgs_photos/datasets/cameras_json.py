@@ -113,7 +113,7 @@ class CamerasJson(PhotoReader):
             find = dict
         read = [_Camera(*pair, find) for pair in zip(cameras, listed, strict=True)]
         if any(camera.in_parts for camera in read):
-            warn_once(f"intrinsics up to 3 in {file} are read as fractions of width and height")
+            warn_once(f"intrinsics <= 3 in {file} are read as fractions of width and height")
         return Listing(file, [camera.frame(folder) for camera in read])
 
 

@@ -204,8 +204,8 @@ class Farthest(Bounded):
 def farthest_points(points: Tensor, count: int) -> list[int]:
     """Choose `count` of the points (N, 3) that are far from each other, and return their indices.
 
-    The first is farthest from the mean of all; each further one is farthest from those chosen
-    before. Points that coincide with a chosen one come last, each once.
+    The first point is farthest from the mean of all; each further point is farthest from those
+    chosen before. Points equal to a chosen point come last. No index is returned twice.
     """
     chosen = [int((points - points.mean(0)).norm(dim=-1).argmax())]
     while len(chosen) < count:

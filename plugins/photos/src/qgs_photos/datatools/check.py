@@ -26,7 +26,7 @@ PHOTOS = 400
 """Number of photos to match in a data set, divided among the scenes whose poses are checked.
 Matching takes about half a second for each photo."""
 FEWEST = 20
-"""Number of photos to match in a scene, if PHOTOS divided among the scenes gives fewer."""
+"""Least number of photos to match in a scene, even if the scenes together then exceed PHOTOS."""
 
 
 @dataclass(frozen=True)

@@ -193,5 +193,5 @@ def _is_black(image: Image.Image) -> bool:
 
 
 def error_text(error: Exception) -> str:
-    """Return an exception's message, preceded by its type unless a file could not be read."""
+    """Return the message of a failed reading of a file; for other errors, also their type."""
     return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)

@@ -40,8 +40,8 @@ class WeightLayout:
     renames: rules from names in qgs to published names, see `renamed`. The first rule that matches
         is used.
     marks: published names that identify this codebase. Every file of its weights has all of them.
-    unused: rules from the published name of a parameter to the name of a tensor that is stored
-        beside it, but that the published code ignores.
+    unused: rules from the published name of a parameter to the name of a further tensor. Files may
+        hold this tensor, but the published code ignores it.
     read: function that takes names and shapes of a state dict and returns a recipe that fits, as a
         plain mapping. It raises LayoutError if none fits.
     undecided: texts about options that names and shapes do not determine, with the published value

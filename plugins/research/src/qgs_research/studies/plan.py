@@ -221,6 +221,6 @@ def refuse_changed(plan: Plan) -> None:
             shown = [f"{path}: {old} then, {new} now" for path, (old, new) in changed.items()]
             raise ValueError(
                 f"{plan.study.file}: {what} has changed since {len(made)} runs in {plan.folder} "
-                f"were made ({listed(shown, between='; ')}); give {what} another name, or give "
-                "another --out"
+                f"were made ({listed(shown, between='; ')}); undo the change, give {what} another "
+                "name, or choose another --out"
             )

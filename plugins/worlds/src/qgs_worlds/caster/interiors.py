@@ -268,11 +268,11 @@ def _shade(room, code, points, n, footprint):
 
 @kernel
 def paint_room(image, t, code, top, samples, room, c2w, rays):
-    """Colour a band of image rows, `image` (rows, W, 3) uint8. This overwrites `code`.
+    """Write the colours of a band of image rows to `image` (rows, W, 3) uint8; overwrite `code`.
 
-    t, code, rays: depths, face codes and ray basis of the band from `trace`. top: number of the
-    band's first row in the image. Rays of a pixel that hit the same face share one computation of
-    light; if the texture has no sharp edges, they share its colour too.
+    t, code, rays: results of `trace` for the band: depth and face hit by each ray, and ray basis.
+    top: number of the band's first row in the image. Rays of a pixel that hit the same face share
+    one computation of light; if the texture has no sharp edges, they share its colour too.
     """
     eye = triple(c2w[:, 3])
     points = np.empty((samples * samples + 1, 3))

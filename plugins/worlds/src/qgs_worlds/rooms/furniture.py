@@ -204,7 +204,7 @@ class Furniture:
 
 
 def _around_table(make: Furniture, sizes: Sizes) -> Piece:
-    """Return random ornaments on a table and chairs around it, without the table."""
+    """Return chairs around a table, and random ornaments on the table, without the table itself."""
     rng = make.rng
     w = sizes["w"]
     d = sizes["d"]

@@ -105,9 +105,9 @@ def draw_cameras(
 
 
 def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
-    """Return 0 if all camera centres are in the allowed box and clear of fixed shapes.
+    """Return 0 if all camera centres are in the allowed box and not close to fixed shapes.
 
-    Otherwise return the penalty 100. eyes: camera centres (F, 3).
+    Otherwise return the penalty 100. Close means CLEARANCE or less. eyes: camera centres (F, 3).
     """
     inside = (eyes >= place.low).all() and (eyes <= place.high).all()
     return 0.0 if inside and clearances(shapes[: place.fixed], eyes).min() > CLEARANCE else 100.0

@@ -92,7 +92,7 @@ class DepthSplatConfig(ComponentConfig):
         return blocks
 
     def level(self, scale: int) -> int:
-        """Return the level of the cost volume in sweep `scale`, which is 0 for the first sweep.
+        """Return the level of the cost volume in sweep number `scale`. The first sweep is number 0.
 
         Level 0, 1 or 2 means 1/2, 1/4 or 1/8 of the image size.
         """
@@ -125,7 +125,7 @@ class Depths(NamedTuple):
 
 
 class Pyramid(nn.Module):
-    """Network that returns its input, and also a map with half the channels and twice the size."""
+    """Network that returns its input, and a second map of twice the size with half the channels."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

@@ -143,9 +143,9 @@ class OnRays(Centers):
 
 
 def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:
-    """Return directions (B, N, K, 3) of rays through positions in pixels.
+    """Return directions (B, N, K, 3) of rays through K points inside each of N pixels.
 
-    place: logits of positions in the pixel (B, N, K, 2). pixel: rays of pixels. unit: True gives
+    place: logits of the points' positions. pixel: encoded as PIXEL_ENCODING. unit: True gives
     directions of length 1, False directions with z = 1 in the camera's frame.
     """
     _, corner, across, down = pixel_BN43[:, :, None].unbind(-2)

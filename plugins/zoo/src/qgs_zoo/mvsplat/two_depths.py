@@ -27,7 +27,7 @@ class Exchange(DecoderLayer):
     reads_layer_scale = False
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Return queries with their two depths swapped, and the memory unchanged."""
+        """Swap the first and the last feature of each query; return the memory unchanged."""
         # The depth in use is first, the other one last.
         own, rest, other = state.features.tensor_split([1, state.features.shape[-1] - 1], -1)
         return state.replace(features=torch.cat([other, rest, own], -1)), memory

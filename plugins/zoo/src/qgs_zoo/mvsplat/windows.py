@@ -50,9 +50,9 @@ def with_positions(x_BVCHW: Tensor) -> Tensor:
 def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
     """Return the numbers (4, L, L) to add to attention logits for a map rolled by half a window.
 
-    A window of a rolled map may contain pixels from opposite edges of the map. The number for such
-    a pair of pixels is MASKED, and for all other pairs 0. L is the number of pixels in each of the
-    four windows.
+    A window of a rolled map may contain pixels from opposite edges of the map. Two pixels from
+    opposite edges get the number MASKED, and all other pairs of pixels 0. L is the number of pixels
+    in each of the four windows.
     """
 
     def pieces(size: int) -> Tensor:
