@@ -42,7 +42,7 @@ def evaluate(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Score a checkpoint, the nearest input view and the mean input colour on held-out views."""
+    """Score a model on held-out views, beside two baselines: nearest input, mean input colour."""
     console = Console()
     settings = list(overrides or ())
     if index is not None:

@@ -64,8 +64,8 @@ Tune: TypeAlias = Annotated[
     str | None,
     typer.Option(
         metavar="[WHAT:]STEPS",
-        help="Fit the queries, or by latents:STEPS the encoder's features, to the input photos for "
-        "STEPS steps before rendering. 0: no fitting. Default: as in the recipe for eval, else 0.",
+        help="Fit WHAT to the input photos for STEPS steps before rendering. WHAT is queries or "
+        "latents (encoder features). 0: no fitting. Default: as in the recipe for eval, else 0.",
     ),
 ]
 

@@ -98,7 +98,7 @@ def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
 class Frusta:
     """Cameras of a scene, in units of the scene's depth, and the overlap of their views.
 
-    trained_on: measurements of the cameras of training. depth: depth of the scene in the scene's
+    trained_on: ranges that the model's training covered. depth: depth of the scene in the scene's
         unit; None computes it by `scene_depth`.
     """
 
@@ -183,7 +183,7 @@ class Frusta:
         return np.linalg.norm(start - along.clip(0, 1)[:, None] * way, axis=-1)
 
     def _filled(self, first: int, last: int, near: Sequence[int], inputs: int) -> Frames:
-        """Return `inputs` frames: `first`, frames of `near` at even steps, and `last`."""
+        """Return `inputs` frames in all: `first`, evenly spaced frames of `near`, and `last`."""
         if inputs == 1:
             return (first,)
         chosen = [first]
@@ -194,7 +194,7 @@ class Frusta:
         return (*chosen, last)
 
     def compared(self, window: Frames, target: int | None = None) -> Frames:
-        """Return up to NOVEL frames to score: the target, and frames whose view the inputs see.
+        """Return up to NOVEL frames to score: the target, and frames that overlap with the inputs.
 
         Frames nearest to the target or, without a target, to the inputs come first. If the scene
         has held-out frames, only these are chosen besides the target.

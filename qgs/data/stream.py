@@ -192,7 +192,7 @@ class SampleStream(Dataset[Batch | Exception]):
     def _drawn(
         self, scene: Scene, rng: np.random.Generator, step: int
     ) -> tuple[bool, Frames, Frames]:
-        """Choose at random whether a sample is mirrored, its input frames and its target frames."""
+        """Return random choices for a sample: whether to mirror it, input frames, target frames."""
         mirror = bool(rng.random() < self.views.mirror)
         return mirror, *self.sampler.draw(scene, self.views, rng, step)
 

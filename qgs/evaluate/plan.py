@@ -73,14 +73,14 @@ class EvaluationPlan:
     With `evaluation.index`, the index file names scenes and frames. Without an index, the first
     `evaluation.scenes` scenes are scored. The samples of a scene are the first of these that exist:
 
-    1. the windows of `sampler.windows`,
-    2. `held_out_windows`, if the scene has held-out frames,
-    3. `evaluation.samples` samples, which `sampler` chooses at random with `evaluation.seed`, as at
-       the end of training. Targets are all frames from the first to the last input that are not
-       inputs; in a scene with times, the sampler's targets.
+    1. the windows (input and target frames) of `sampler.windows`,
+    2. the windows of `held_out_windows`, if the scene has held-out frames,
+    3. `evaluation.samples` random samples of `sampler`, with `evaluation.seed` and the sampler's
+       options at the end of training. Targets are all other frames between the first and the last
+       input; in a scene with times, they are the targets that `sampler` chooses.
 
-    Windows of 1 and 2 are thinned evenly to `evaluation.scenes` windows. Targets at several times
-    become one sample for each time. No sample is mirrored.
+    In 1 and 2, at most `evaluation.scenes` windows of a scene are kept, evenly spread. Targets at
+    several times become one sample for each time. No sample is mirrored.
 
     views_of: function that returns the view settings of a sample, such as its scale; None uses
         `views`. depths: load true depth for targets if the scene has it. wanted: names of the
@@ -112,7 +112,7 @@ class EvaluationPlan:
         Raises ValueError for an unknown scene, and the errors of the scene's reader.
         """
         if name not in self._places:
-            raise ValueError("the data has no test scene of this name: correct the index")
+            raise ValueError("the test split has no such scene: correct its name in the index")
         place = self._places[name]
         scene = self._scenes[place]
         # a generator for each scene: a failing one changes no noise of the others

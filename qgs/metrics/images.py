@@ -50,7 +50,7 @@ class Ssim(Metric):
     config: Config
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the column; its heading names the kind of covariance unless it is the default."""
+        """Return the column "SSIM", or "SSIM (sample covariance)" for the covariance "sample"."""
         covariance = self.config.covariance
         form = "" if covariance == "population" else f" ({covariance} covariance)"
         return {"": Column(f"SSIM{form}", "higher")}

@@ -7,7 +7,7 @@ recipe passes through these steps, each in its own file:
 |---|---|
 | read the recipe and those that it extends, apply overrides | `files.py`, `yaml_text.py` |
 | decode sections and settings | `sections.py` |
-| find the entry of each component, after defaults and swaps | `places.py`, `slots.py` |
+| find the entry of each component, after defaults and section `swap` | `places.py`, `slots.py` |
 | find the class of each component and decode its options | `registry.py`, `decode.py` |
 | check that components fit, and that each field is written before it is read | `checks.py` |
 | find the line of the recipe that caused a problem | `causes.py` |

@@ -87,10 +87,10 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
 
 
 def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
-    """Return the components of `draft` without sublayers that their decoder layer does not use.
+    """Remove each sublayer for which its decoder layer has no slot; return the other components.
 
-    A sublayer that is left out is reported if the recipe sets it for that layer alone, or if the
-    recipe sets it for all layers and no layer uses it.
+    A removed sublayer is reported if the recipe sets it for this one layer. A sublayer that the
+    recipe sets for all layers is reported only if no layer uses it.
     """
     kept = dict(draft.parts)
     layers: dict[KeyPath, Any] = {}

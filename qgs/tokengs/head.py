@@ -1,4 +1,4 @@
-"""The head `qgs/gaussian_head` (TokenGS, LocusGS), and the centers `qgs/free` and `qgs/offset`."""
+"""Head `qgs/gaussian_head` (TokenGS, LocusGS), and means of Gaussians: `qgs/free`, `qgs/offset`."""
 
 import math
 from collections.abc import Iterable

@@ -74,7 +74,7 @@ class OneCycleAdamW(Optimizer):
         return AdamW(own, lr=self.peak, betas=self.options.betas, fused=True)
 
     def learning_rate(self, step: int, seconds: float) -> float:
-        """Return the learning rate of the recipe's schedule; without a schedule, of the cycle."""
+        """Return the learning rate: that of the recipe's schedule, or else that of the cycle."""
         if self.follows_schedule:
             return super().learning_rate(step, seconds)
         # steps - 1: the last step has the last rate, as in torch's OneCycleLR.

@@ -59,9 +59,9 @@ FREE = (
 
 They decide how long to train, where the data is and what is reported. They do not change what the
 model learns. If the budget changes, the learning rate follows the new budget from then on. The list
-`plugins` may change because the types of the model's components are compared.
-`training.accumulate` may change too. `Counters` compares `training.batch_size` with the number of
-samples in a step of the run.
+`plugins` may change, because the types of components, PLUGIN/NAME, are compared. Two options that
+are not listed here are not compared either: `training.accumulate`, which may change, and
+`training.batch_size`, which `Counters` checks.
 """
 
 

@@ -31,7 +31,7 @@ class Tracker(ABC):
     """Base class of experiment trackers, which record numbers and pictures of a run."""
 
     package: ClassVar[str] = ""
-    """Package that the tracker needs, by a name that import and pip share; "" if it needs none."""
+    """Name, for both import and pip, of the package that the tracker needs; "" for no package."""
 
     @abstractmethod
     def __init__(self, run: Path, options: Mapping[str, Any], step: int):

@@ -210,7 +210,7 @@ class DetachedLayer:
         )
 
     def total(self) -> Tensor:
-        """Return the 0-d sum of the terms, whose backward pass hands `gradients` to the model."""
+        """Return the 0-d sum of the terms; its backward pass gives `gradients` to the model."""
         total = _sum(self.terms)
         for name, gradient in self.gradients.items():
             # The graph of the losses is freed. Their gradient g with respect to a source x reaches

@@ -172,7 +172,7 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(tmp_path):
     summary = evaluation.summary()
     assert summary["missing"] == {
         "test/000001": "the index names frames 99, -1, but the scene has only 0 to 7",
-        "gone": "the data has no test scene of this name: correct the index",
+        "gone": "the test split has no such scene: correct its name in the index",
     }
     evaluation.write(tmp_path)
     table = (tmp_path / "table.md").read_text()

@@ -227,9 +227,9 @@ def image_folder(folder: UPath, wanted: str | None) -> UPath:
 
 
 def mended(found: Listing) -> Listing:
-    """Divide uniform scales out of rotations; add a problem to frames far from all others.
+    """Divide rotations by their uniform scale; add a problem to frames with a far-off camera.
 
-    Metashape multiplies all rotations by one number.
+    The scale comes from Metashape, which multiplies all rotations of a file by one number.
     """
     if not found.frames:
         return found
@@ -303,7 +303,7 @@ def are_plausible(intrinsics: Intrinsics, size: Size) -> bool:
 
 
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
-    """Yield a problem if an image of `size` (H, W) is no scaled copy of one of size `listed`.
+    """Yield a problem if an image's `size` (H, W) and `listed` size differ in aspect ratio.
 
     If `listed` is None, there is no problem.
     """

@@ -131,7 +131,7 @@ class Trial:
         return self.module(*{**(inputs or self.inputs), **replaced}.values())
 
     def in_each_mode(self, inputs: Inputs | None = None) -> Iterator[tuple[str, Any]]:
-        """Yield name and outputs of evaluation, then of training mode, with the same seed."""
+        """Yield (mode, outputs) in evaluation, then in training, with the same random seed."""
         for mode in each_mode(self.module):
             # The seed holds for this pass only: the caller keeps its own random state.
             with seeded(0):

@@ -1,4 +1,4 @@
-"""`locus/anchor_visibility`: loss that moves anchors outside of all target views into view."""
+"""`locus/anchor_visibility`: loss that pulls anchors into view if no target view shows them."""
 
 from collections.abc import Iterable
 

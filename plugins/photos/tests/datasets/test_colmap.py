@@ -167,7 +167,7 @@ def test_photos_beside_the_model_are_needed(tmp_path, photos):
 
 
 LEFT = (
-    ("has no points: 3 lines", r"\n[38]\..*", ""),
+    ("lists no 2D points: all 3 lines", r"\n[38]\..*", ""),
     ("no camera 8", "7 view_001", "8 view_001"),
     ("frame 1 .*NaN", r"\n2 \S+", "\n2 -nan(ind)"),
 )

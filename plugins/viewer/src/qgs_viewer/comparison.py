@@ -139,8 +139,8 @@ class Model:
     """A trained model in a comparison.
 
     name: short and unique. file: checkpoint of the model. recipe: recipe of the training, but with
-    the data of the comparison. search: the network, and the scales found for its scenes. step:
-    number of training steps; None if unknown. windows: sampler that chooses the inputs and compared
+    the data of the comparison. search: the network, and the scales of camera positions found for
+    scenes. step: number of training steps; None if unknown. windows: sampler of input and compared
     photos from a user's photos; None if the scenes come from the recipe's data.
     """
 
@@ -178,7 +178,7 @@ class Model:
 
     @property
     def recipe_text(self) -> str:
-        """The recipe of the training with the data of the comparison, as YAML."""
+        """Recipe of the training, with its data replaced by that of the comparison, as YAML."""
         return yaml.safe_dump(dict(self.recipe.tree), sort_keys=False, allow_unicode=True)
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
-    """Yield a sentence with the scales that a search found; without a search, yield nothing."""
+    """Yield a sentence with the scales of camera positions found for each model, if any."""
     parts = []
     for model in models:
         if found := model.search.found.values():

@@ -25,7 +25,7 @@ PICTURED_SCENES = 6
 # Target views of each scene that are shown.
 TARGETS = 2
 RANKED = 5
-"""Least number of samples by which models are ranked."""
+"""Least number of samples with which a report ranks models."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
 
 
 def write_report(comparison: Comparison, folder: Path, console: Console) -> None:
-    """Print remarks, scores and next commands, and write report.html into `folder`."""
+    """Print remarks, scores and commands to run next; write report.html into `folder`."""
     notes = remarks(comparison.models)
     print_lines(console, notes)
     comparison = replace(comparison, notes=[*comparison.notes, *notes])

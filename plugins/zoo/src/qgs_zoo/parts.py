@@ -36,7 +36,8 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
     """Return the rays of each cell of images that are divided into rows x columns cells.
 
     The result (B, V * rows * columns, 4, 3) has the encoding PIXEL_ENCODING: the camera's centre,
-    the direction through the upper left corner of the cell, and its steps across and down the cell.
+    the direction through the cell's upper left corner, and what to add to this direction to reach
+    the upper right and the lower left corner.
     """
     height, width = cameras.size
     c2w = cameras.c2w

@@ -57,7 +57,7 @@ from qgs_anchors.landmark.sweep import mismatch
 SHARPNESS = 300.0
 """Initial factor by which a sweep multiplies colour differences to get logits.
 
-A depth at which the difference is larger by 1/300 (of RGB in [0, 1]) is e times less likely."""
+If a depth's difference grows by 1/300 (RGB in [0, 1]), the depth's weight is divided by e."""
 UNSEEN = 0.2
 """Initial value of the learned colour difference for depths that no other photo sees."""
 SAMPLES = 4
@@ -87,10 +87,10 @@ class ObservedQueries(Queries):
 
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
-        """N, the number of queries, which are spread evenly over the input photos. The
-        footprint of a query is the part of a photo that it represents: one of N equal tiles if such
-        tiles, with nearly square cells, fill the photos; otherwise a square around the query's
-        point. Null puts `per_token` queries at the centre of each token's patch."""
+        """N, the number of queries, spread evenly over the input photos. The footprint of
+        a query is the part of a photo that the query represents. If photos divide into N equal
+        tiles with nearly square cells, each footprint is a tile; otherwise it is a square around
+        the query's point. Null puts `per_token` queries at the centre of each token's patch."""
         tokens: int = Field(default=1, ge=1)
         """S, the number of points in the footprint of a query at which the query samples tokens
         and depths. It has an effect only if `count` is a number."""

@@ -110,7 +110,7 @@ def rows_in_tile(count: int) -> int:
 
 
 def aspect_of(count: int) -> float:
-    """Return height over width of a tile that `count` square cells fill, in `rows_in_tile` rows."""
+    """Return height / width of a grid of `count` square cells; 1 if `rows_in_tile` has no grid."""
     rows = rows_in_tile(count)
     return rows**2 / count if count % rows == 0 else 1.0
 

@@ -1,4 +1,4 @@
-"""Checks of encoders and of attention: shared values, masks and explanations."""
+"""Checks of encoders and attention: memory, masked queries, attention weights, patch grids."""
 
 import math
 from collections.abc import Iterator

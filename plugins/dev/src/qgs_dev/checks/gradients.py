@@ -94,7 +94,7 @@ def _are_zero(outputs: Any) -> bool:
 def check_terms_have_gradients(case: Case) -> None:
     """Require that every loss term has a gradient with respect to the prediction or the rendering.
 
-    A loss that requires no fields and is zero for all inputs passes, such as a loss of weight 0.
+    A loss that is always zero, such as one of weight 0, is accepted if it requires no fields.
     """
     trial = Trial(case)
     terms = trial()

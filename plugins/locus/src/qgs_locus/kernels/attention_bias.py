@@ -311,7 +311,7 @@ def _flash_for_cpu() -> Callable[..., tuple[Tensor, Tensor]] | None:
 def _attend_anywhere(
     q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the same as `_attend`, in float32 or float64, on any device."""
+    """Return attention (h, n, d) and log-sum-exp (h, n), in float32 or float64, on any device."""
     logits_hnM = torch.baddbmm(bias_nM, q_hnd, k_hMd.mT, alpha=q_hnd.shape[-1] ** -0.5)
     lse_hn = logits_hnM.logsumexp(-1)
     return logits_hnM.sub_(lse_hn[..., None]).exp_() @ v_hMd, lse_hn

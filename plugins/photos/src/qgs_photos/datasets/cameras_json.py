@@ -66,10 +66,10 @@ class CamerasJson(PhotoReader):
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
-        """Return whether `folder` holds a `cameras.json` in this format, not of another program.
+        """Return whether `folder` seems to hold a `cameras.json` in the format of this reader.
 
         The file must contain both `c2w` and `K`, or photos must lie beside it or in images/. A file
-        that `qgs reconstruct` wrote is not in this format.
+        that `qgs reconstruct` wrote has another format and is not recognised.
         """
         file = folder / cls.listing
         if not file.is_file():

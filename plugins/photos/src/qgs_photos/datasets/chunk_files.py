@@ -1,8 +1,8 @@
 """Read and check chunk files in RealEstate10K's format, and list the scenes of a folder.
 
-pixelSplat published RealEstate10K and ACID so, DepthSplat DL3DV. In the folder of a data set,
-train/index.json and test/index.json map the key of a scene to a chunk file such as 000000.torch.
-A chunk file is a list with a mapping for each scene of V frames:
+pixelSplat published RealEstate10K and ACID in this format; DepthSplat published DL3DV in it. In
+the folder of a data set, train/index.json and test/index.json map the key of a scene to a chunk
+file such as 000000.torch. A chunk file is a list with a mapping for each scene of V frames:
 
 - `key`: name of the scene. `url`: address of its video. `timestamps`: the frames' times in the
   video, (V,).

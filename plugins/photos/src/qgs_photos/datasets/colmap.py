@@ -174,7 +174,7 @@ def _text_images(model: UPath) -> Iterator[Image]:
     lines = [*_lines(model / "images.txt")]
     posed = [line for line in lines if not _is_points(line)]
     if 1 < len(posed) == len(lines):
-        warn_once(f"{model / 'images.txt'} has no points: {len(posed)} lines are read as poses")
+        warn_once(f"{model / 'images.txt'} lists no 2D points: all {len(posed)} lines are poses")
     for line in posed:
         number, *fields = line.split(maxsplit=9)
         if len(fields) != 9 or not number.isdecimal() or not fields[7].isdecimal():

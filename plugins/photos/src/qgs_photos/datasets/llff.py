@@ -46,7 +46,7 @@ class Llff(PhotoReader):
 
 
 def _rows(file: UPath) -> np.ndarray:
-    """Read the rows (N, 17), float64. Raises ValueError for other contents, and for near > far."""
+    """Return N rows of 3 x 5 matrix, near, far; raise ValueError for other data or near > far."""
     try:
         with open_file(file) as opened:
             rows = load_array(opened)

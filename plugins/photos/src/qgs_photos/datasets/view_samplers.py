@@ -29,8 +29,8 @@ from qgs.data.view_samplers import (
 from qgs.domain import Domain
 
 _SHARE = 0.5
-"""Fraction of the photos among which the inputs of a training sample are chosen. Each sample has a
-new random subset."""
+"""Fraction of the photos that are candidates for the inputs of a training sample. Each sample
+chooses its candidates at random."""
 _JUDGED = 4
 """Number of photos on which a scene without held-out photos is evaluated."""
 
@@ -109,9 +109,9 @@ class Bounded(ViewSampler):
         low = max(min(low, high), 2 * options.margin, views.inputs - 1)
         if high < low:
             raise ValueError(
-                f"scene {scene.name!r} has {len(usable)} frames for inputs, but the inputs and the "
-                f"margin need {low + 1} frames in one gap: lower views.inputs or margin, raise "
-                "max_gap, or remove the scene"
+                f"a sample of scene {scene.name!r} must span {low + 1} frames for its inputs and "
+                f"margins; max_gap or the scene ({len(usable)} frames for inputs) allows fewer: "
+                "lower views.inputs or margin, raise max_gap, or remove the scene"
             )
         gap = int(rng.integers(low, high + 1))
         first = int(rng.integers(0, len(usable) - gap))

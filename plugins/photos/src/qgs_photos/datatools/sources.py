@@ -26,9 +26,9 @@ _SIZE = (256, 256)
 def _imported(format: str) -> tuple[Registry, list[str]]:
     """Import plugins; return their components, and an error for each that cannot be imported.
 
-    format: "auto" imports all plugins; PLUGIN/NAME imports PLUGIN and the plugins in OF_FILES; any
-    other format imports only the plugins in OF_FILES. Unless `format` is "auto", a plugin that
-    cannot be imported raises PluginError.
+    format: "auto" imports all plugins. Every other format imports the plugins `qgs` and `datasets`;
+    PLUGIN/NAME also imports PLUGIN. Unless `format` is "auto", a plugin that cannot be imported
+    raises PluginError.
     """
     if format == "auto":
         return load_usable_plugins()

@@ -163,11 +163,11 @@ def seen_depth(scene: FilmScene) -> float:
 
 
 def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmScene:
-    """Open Gaussians and cameras: a folder of `qgs reconstruct` or `qgs scene`, or a PLY file.
+    """Open the Gaussians of a scene and the cameras of its photos.
 
-    photos: photos of the scene, for their cameras; a folder of `qgs reconstruct` does not need
-    them. name: name of the scene if `photos` holds several. Raises ValueError if photos are needed
-    and missing, FileNotFoundError if `source` is none of these.
+    source: folder of `qgs reconstruct` or `qgs scene`, or a PLY file. photos: photos whose cameras
+    are read; not used for a folder of `qgs reconstruct`. name: scene of `photos` if it has several.
+    Raises FileNotFoundError for any other `source`, ValueError if `photos` is needed but None.
     """
     if has_record(source):
         record = read_record(source)

@@ -110,10 +110,10 @@ def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
 class Intervals:
     """Division of a video into intervals; one frame is taken from each.
 
-    An interval ends after 1 / `rate` seconds, or earlier, when the picture has moved by the
-    fraction STEP of its sides. start, length: first time and duration of the video in seconds.
-    count: number of intervals, all of the same duration whatever the motion; None sets `rate` to
-    at least PER_SECOND and lets motion end intervals earlier.
+    start, length: first time and duration of the video in seconds. count: number of intervals, all
+    of the same duration. With None, an interval ends when the picture has moved by the fraction
+    STEP of its sides, or at the latest after 1 / `rate` seconds. Then `rate` is PER_SECOND; in a
+    short video it is higher, so that there are FEWEST intervals.
     """
 
     def __init__(self, start: float, length: float, count: int | None) -> None:

@@ -146,7 +146,7 @@ def _leave_out_unlikely_pairs(database: str) -> None:
 
 
 def _largest(opened: Any, image: int) -> Array:
-    """Return descriptors (LARGEST, 128), of length 1, of the largest features of a photo.
+    """Return the descriptors (LARGEST, 128) of a photo's largest features, as unit vectors.
 
     If the photo has fewer features, the remaining rows are 0.
     """

@@ -15,8 +15,8 @@ from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Gaussians
 
 DEAD = 0.005
-"""Opacity below which a Gaussian is dead and is relocated, as in the paper. A higher threshold
-would delete fog that the photos show, which consists of faint Gaussians."""
+"""Opacity below which a Gaussian counts as dead and is relocated; the value is that of the paper. A
+higher threshold would remove faint Gaussians, which show fog."""
 # Displacement of a copy over its parent's scales.
 _BESIDE = 0.2
 # Copies of one Gaussian at a time, as in the paper's code.

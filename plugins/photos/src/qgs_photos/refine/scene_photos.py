@@ -10,8 +10,8 @@ from qgs.reconstruction.scenes import Size, installed_sources, named_scene
 from qgs_photos.refine.options import NONE, Options
 
 TIMED = 2048
-"""Number of Gaussians at pixels with which a step is timed. Also the least number of Gaussians at
-the start of a scene without COLMAP's points."""
+"""Number of Gaussians, placed at pixels of photos, in the step that is timed. A scene without
+COLMAP's points starts with at least this many Gaussians."""
 SIZES = range(96, 2161, 16)
 """Photo sizes to choose from: shorter side in pixels."""
 # 1,600 steps on 320 x 320 pixels gave less, at any size, than 2,000 on 128 x 128 did in a fifth of

@@ -141,7 +141,7 @@ def _notes(scores: Scores) -> Iterator[str]:
 
 
 def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
-    """Return the runs and scenes that do not count in the difference from the reference, by reason.
+    """Return names of runs and scenes that the comparison with the reference leaves out, by reason.
 
     name: the model that is compared with the reference.
     """

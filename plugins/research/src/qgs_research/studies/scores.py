@@ -132,7 +132,7 @@ class Scores:
         return [result for runs in parts for result in runs.values()]
 
     def unlike(self, terms: Terms) -> bool:
-        """Return True if `terms` compares results of one evaluation that have different protocols.
+        """Return True if `terms` compares results of the same evaluation under different protocols.
 
         terms: weights of mean scores in a sum, such as 1 and -1 for a difference.
         """

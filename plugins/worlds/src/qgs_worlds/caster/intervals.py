@@ -113,10 +113,10 @@ def block(o, d, h):
 
 @inner
 def interior(o, d, h):
-    """Return an interval from the t at which a ray hits the surfaces of a room, to inf.
+    """Return an interval that starts where a ray hits a room from inside, and ends at infinity.
 
-    The ray starts inside the room. Entry faces 0 to 5 are the walls at -x, +x, -y and +y, the floor
-    and the ceiling. The floor is at z = 0. h: half size of the room in x and y, full size in z.
+    The ray starts inside the room. Entry faces 0 to 3 are the walls at -x, +x, -y and +y, 4 is the
+    floor (z = 0), 5 the ceiling. h: half size of the room in x and y, full size in z.
     """
     tx = (math.copysign(h[0], d[0]) - o[0]) / d[0]
     ty = (math.copysign(h[1], d[1]) - o[1]) / d[1]

@@ -72,9 +72,9 @@ class Things:
         self._textures = textures
 
     def texture(self) -> tuple[int, int]:
-        """Return the random index of a shape's first texture, and its number of textures, 1 or 6.
+        """Return random textures for a shape: index of the first, and their number, 1 or 6.
 
-        If there are 6 textures, their indices are consecutive, and each is for one face.
+        Six textures have consecutive indices; each is for one face.
         """
         faces = 6 if self.rng.random() < 0.3 else 1
         # five more textures follow the first one if there are six faces

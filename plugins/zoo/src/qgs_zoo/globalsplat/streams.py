@@ -138,7 +138,7 @@ class Round(DecoderLayer):
 
 
 class Stream(nn.Module):
-    """Layers of one stream in a round: cross-attention to the memory, MLP and ViT blocks.
+    """Layers of `Round` for one stream: cross-attention to the memory, MLP and ViT blocks.
 
     The layers have pre-norms. Each update is multiplied by a LayerScale and added.
     """

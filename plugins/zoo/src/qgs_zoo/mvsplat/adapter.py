@@ -119,11 +119,10 @@ def band_mask(degree: int, like: Tensor) -> Tensor:
 def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
     """Return matrices (..., K, K) from raw to world-frame coefficients of K harmonics.
 
-    Raw coefficients are in a camera's frame. rotation: camera to world (..., 3, 3). Degrees above
-    SH_DEGREE stay in e3nn's basis. The matrix first rotates in e3nn's basis, then changes the
-    basis. These steps do not commute, because pixelSplat's rasteriser uses different signs than
-    e3nn. Published weights expect this order, and the world frame in which they were trained
-    (`views.frame: given`).
+    Raw coefficients are in a camera's frame. rotation: camera to world (..., 3, 3). A matrix first
+    rotates in e3nn's basis, then changes the basis; degrees above SH_DEGREE stay in e3nn's basis.
+    The order matters, because pixelSplat's rasteriser uses different signs than e3nn. Published
+    weights were trained with this order and with `views.frame: given`, so they need both.
     """
     turn = turn_of_harmonics(rotation, degree) * band_mask(degree, rotation)
     return _fixed(degree, rotation.device)[2].to(rotation) @ turn

@@ -84,7 +84,7 @@ class DynamicQueries(Queries):
         return _FIELDS if config.dynamic else {}
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """Return initial queries. The field `dynamic.moves` (B, N) marks dynamic ones, if any.
+        """Return initial queries; the field `dynamic.moves` (B, N) marks dynamic queries, if any.
 
         Raises ValueError for views without a target time, except with `time_channels: 0`.
         """
