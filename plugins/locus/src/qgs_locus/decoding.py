@@ -27,10 +27,10 @@ class OffsetOptions(ComponentConfig):
     """Displacement for a raw offset t: posact(t) = sign(t) (exp|t| - 1) (LocusGS release), or t
     itself ("linear", LocusGS paper)."""
     input_limit: float | None = Field(default=100.0, gt=0)
-    """With `offset: posact`, clamp raw offsets to [-input_limit, input_limit]. Null: no limit."""
+    """Limit of raw offsets, from -input_limit to input_limit, with `offset: posact`. Null: none."""
     output_limit: float | None = Field(default=1000.0, gt=0)
-    """With `offset: posact`, clamp displacements to [-output_limit, output_limit]. Null means no
-    limit."""
+    """Limit of displacements, from -output_limit to output_limit, with `offset: posact`. Null means
+    no limit."""
 
     def displacement(self, raw: Tensor) -> Tensor:
         """Return displacements for raw offsets of any shape, in float32 or float64."""

@@ -33,11 +33,11 @@ class AnchorRefinement(Refinement):
         """Step of a centre for an output t of its MLP: posact(t) = sign(t) (exp|t| - 1) (LocusGS
         release), or t itself ("linear", LocusGS paper)."""
         input_limit: float | None = Field(default=100.0, gt=0)
-        """With `center_step: posact`, clamp outputs of the MLP of centres to
-        [-input_limit, input_limit]. Null means no limit."""
+        """Limit of outputs of the MLP of centres, from -input_limit to input_limit, with
+        `center_step: posact`. Null means no limit."""
         output_limit: float | None = Field(default=1000.0, gt=0)
-        """With `center_step: posact`, clamp steps along each axis to
-        [-output_limit, output_limit], world units. Null means no limit."""
+        """Limit of steps along each axis, from -output_limit to output_limit in world units, with
+        `center_step: posact`. Null means no limit."""
         zero_init: bool = False
         """Initialise the last layer of each MLP with zeros, so that anchors do not move at first.
         With false, as in the LocusGS release, this layer is initialised randomly."""
