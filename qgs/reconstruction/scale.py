@@ -33,15 +33,15 @@ BASELINES = (0.06, 0.25)
 """Smallest and largest baseline to assume if the model does not record those of its training. A
 baseline is the largest distance between the inputs of a sample."""
 BELOW = 2.0
-"""Divisor of the smallest baseline in training. Baselines are tried down to the quotient."""
+"""Ratio of the smallest baseline in training to the smallest that the search tries."""
 ABOVE = 4.0
-"""Multiplier of the largest baseline in training. Baselines are tried up to the product."""
+"""Ratio of the largest baseline that the search tries to the largest in training."""
 NEAREST = 0.8
 """Smallest depth of the point that cameras look at. It is used if the model does not record the
 smallest depth of its training."""
 REACH = 6.0
-"""Multiplier of the smallest depth, in training, of the point that cameras look at. Depths of this
-point are tried up to the product."""
+"""Largest depth that the search tries for the point that cameras look at, in multiples of the
+smallest depth of this point in training."""
 PENALTY = 5.0
 """Penalty in dB on the score of a factor that makes depths smaller than in training. It is PENALTY
 times ln(limit / factor), with the limit from `search_range`. It applies only if the

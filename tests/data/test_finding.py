@@ -32,7 +32,7 @@ D\\a\\N.webp: Images/N.jpg: told
 """As listed, as the file is called, and whether a note tells it."""
 REFUSED = """
 names 3 images, but 0 exist: images/N.png: masks/N.png
-may be: N/0.png: images/0.png
+fits two names: N/0.png: images/0.png
 names 3 images, but 0 exist: /data/N.png: masks/N.png
 may be any of: images/N.jpg: images/N.JPG images/N.Jpg
 may be any of: images/N.webp: images/N.jpg images/N.png

@@ -109,7 +109,7 @@ def found_files(
             if other != real and {file, other} <= photos.keys():
                 raise ValueError(
                     f"{real} fits two names, {name_shown(str(other))} and {name_shown(str(file))}: "
-                    "correct the names in the listing"
+                    "correct these names in the file of poses"
                 )
     return where
 

@@ -343,7 +343,7 @@ def upright(frame: PhotoFrame) -> PhotoFrame:
     if not _quarters(_swapped(size), frame):
         return frame
     if turns % 2 and size[0] == size[1]:
-        warn_once(f"EXIF turns square photos in {frame.path.parent}, and their poses too: {TURN}")
+        warn_once(f"turned square photos in {frame.path.parent} and their poses upright: {TURN}")
     frame = replace(frame, size=frame.size or size)
     for _ in range(turns):
         frame = _quarter(frame)

@@ -352,7 +352,7 @@ class LearnedLayers(TorchFunctionMode):
     A product, such as `matmul`, counts as a learned layer if all its factors require gradients.
     Parameters, features, and values computed from them require gradients.
     replayed: recorded outputs, which layers return in the order of their calls; None records.
-    halved: names of products of float32 geometry that autocast computed in bfloat16.
+    halved: names of matrix products of geometry that autocast computed in bfloat16.
     differs: True after a layer was called whose name or shapes are not the next in `replayed`.
         From this call on, layers return what they compute.
     """

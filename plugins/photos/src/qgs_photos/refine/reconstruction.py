@@ -159,7 +159,7 @@ def refine_reconstruction(
 def _chosen_frames(
     scene: Scene, start: Reconstruction, inputs_only: bool
 ) -> tuple[list[int], Frames]:
-    """Return indices of photos to optimise on (inputs_only: inputs alone), and to compare with."""
+    """Return the indices of the photos to optimise on, and of the held-out photos to score."""
     inputs = start.sample.input_frames
     targets = start.sample.target_frames
     # A reconstruction is compared near its inputs; its refinement covers the whole scene, and is

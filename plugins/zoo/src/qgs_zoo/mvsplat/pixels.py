@@ -44,9 +44,9 @@ WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 
 
 
 def degree_of(width: int) -> int:
-    """Return the largest degree of harmonics that fits into the D = `width` numbers of a pixel.
+    """Return the largest degree of harmonics that fits into the `width` features of a pixel.
 
-    Numbers after the harmonics of this degree are not read.
+    Features after those of this degree are not read.
     """
     return max([1, *(degree for least, degree in WIDTHS.items() if least <= width)])
 
