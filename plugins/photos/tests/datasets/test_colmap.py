@@ -129,6 +129,9 @@ cameras.txt: 7 PINHOLE 4_0 30 50 52 19 16/
 cameras.txt: 7 PINHOLE 40 30 50 52 19 16/7 PINHOLE 40 30 50 52 19 16/
 images.txt: 1 1 0 0 0 0 0 1 a.png//
 images.txt: 1 1 0 0 0 0 0 1 7 a.png//1 1 0 0 0 0 0 1 7 a.png//
+images.txt: # Number of images: 3/1 1 0 0 0 0 0 1 7 view_000.png//2 1 0 0 0 0 0 1 7 view_001.png//
+images.txt: 1 1 0 0 0 0 0 1 7 view_000.png/1 2 3/2 1 0 0 0 0 0 1 7 view_001.png/1 2 3/3 1 0/
+images.txt: 1 1 0 0 0 0 0 1 7 view_000.png//2 1 0 0 0 0 0 1 7 view_001.png//3 .6 .8/
 images.txt: 1 1 0 0 0 zero 0 1 7 a.png//
 images.txt: 1 3 0 0 0 0 0 1 7 a.png//
 images.txt: 1 0 0 0 0 0 0 1 7 a.png//
@@ -137,7 +140,8 @@ images.txt: 1 1 0 0 0 0 0 1 8 a.png//
 """
 """Lines of a file, each ended by a slash.
 
-Digits of Python, a camera twice; a number too few, an image twice, no number, a
+Digits of Python, a camera twice; a number too few, an image twice, an image less than the
+header says, two that are cut off where a line of points or none comes before; no number, a
 quaternion of length 3 and of length 0, digits of Python, no such camera.
 """
 
@@ -147,7 +151,7 @@ def test_broken_models_are_told(tmp_path, photos):
     whole = folders["binary"] / "sparse/0"
     broken = [("cameras.bin", UNKNOWN_CAMERA)]
     for line in BROKEN.strip().splitlines():
-        name, lines = line.split(": ")
+        name, lines = line.split(": ", 1)
         broken.append((name, lines.replace("/", "\n").encode()))
     broken += [(n, (whole / n).read_bytes()[:kept]) for n, parts in CUT.items() for kept in parts]
     broken += [(n, count + (whole / n).read_bytes()[1:]) for n, count in COUNTS.items()]

@@ -6,6 +6,7 @@ any file system. The formats are described at colmap.github.io/format.html.
 
 import io
 import math
+import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -45,6 +46,8 @@ _PLACES = (
 )
 _LONGER = "a file has more data than the number of records at its start says"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
+_HEADER = 1000
+"""Bytes at the start of images.txt that are searched for the number of images."""
 
 
 class Colmap(PhotoReader):
@@ -171,24 +174,38 @@ def _text_cameras(model: UPath) -> Iterator[Camera]:
 
 
 def _text_images(model: UPath) -> Iterator[Image]:
-    lines = [*_lines(model / "images.txt")]
+    file = model / "images.txt"
+    with open_file(file) as opened:
+        # other programs leave it out
+        told = re.search(rb"# Number of images: (\d+)", opened.read(_HEADER))
+    lines = [*_lines(file)]
     posed = [line for line in lines if not _is_points(line)]
+    # a pose that is cut off may pass for points
+    expected = max(int(told[1]) if told else 0, len(lines) - len(posed))
+    if len(posed) < expected:
+        raise ValueError(f"images.txt has {len(posed)} poses, expected {expected}: it is cut off")
     if 1 < len(posed) == len(lines):
-        warn_once(f"{model / 'images.txt'} lists no 2D points: all {len(posed)} lines are poses")
+        warn_once(f"{file} has no points: {len(posed)} lines are read as poses")
     for line in posed:
         number, *fields = line.split(maxsplit=9)
         if len(fields) != 9 or not number.isdecimal() or not fields[7].isdecimal():
             raise ValueError(
-                f"images.txt has the line {line[:60]!r}, expected 9 numbers and a file name"
+                f"images.txt has the line {line[:60]!r}, expected 9 numbers and a file name: it is "
+                "cut off or damaged"
             )
         yield fields[8], [*map(_number, fields[:7])], int(fields[7])
 
 
 def _is_points(line: str) -> bool:
-    """Return whether a line of images.txt lists points (x, y, number) and is not a pose."""
+    """Return whether a line of images.txt lists points (x, y, number) and is not a pose.
+
+    The number of a point is an integer, unlike what the start of a pose has in its place.
+    """
     words = line.split()
     # the first points and the last: there are thousands
-    return len(words) % 3 == 0 and not np.isnan([*map(_number, words[:12] + words[-1:])]).any()
+    values = [*map(_number, words[:12] + words[-1:])]
+    are_integers = all(map(float.is_integer, values[2::3]))
+    return len(words) % 3 == 0 and are_integers and not np.isnan(values).any()
 
 
 def _number(word: str) -> float:
