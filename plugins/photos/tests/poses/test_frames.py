@@ -103,7 +103,7 @@ def test_a_broken_tail_costs_its_frames(tmp_path):
     found = levels(tmp_path)
     assert len(found) >= 5
     assert max(found) < 50
-    assert len(found) == 12 or remarks
+    assert "5.5 s" in remarks[0]
 
 
 @pytest.fixture

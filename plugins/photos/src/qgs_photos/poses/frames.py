@@ -1,6 +1,6 @@
 """Extract the sharpest frame of each interval of a video; intervals are shorter in fast motion."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
@@ -23,6 +23,8 @@ STEP = 0.06
 """Motion after which the next frame is taken, as a fraction of the picture's sides."""
 # Frames of an interval that are compared.
 _JUDGED = 8
+# Most seconds from frame to frame of a whole video; phones vary the rate by far less.
+_PAUSE = 1.0
 # Longer side in pixels at which sharpness is measured.
 _SIDE = 640
 # Height and width of the pictures that motion is measured by.
@@ -40,14 +42,14 @@ def extract(
 ) -> list[str]:
     """Write the sharpest frame of each interval of a video into `folder`.
 
-    Files are upright JPEGs, numbered from 0. Frames that cannot be decoded are left out. Returns
-    remarks on a damaged video.
+    Files are upright JPEGs, numbered from 0. Frames that cannot be decoded are left out. Returns a
+    remark on a video that is damaged or lacks frames.
 
     count: number of intervals, all of the same duration. None makes intervals shorter in fast
     motion, and keeps at most MOST frames. progress: called with the stage, the seconds done, and
     the video's length. Raises PosesError if fewer than LEAST frames can be read.
     """
-    times, aspect, damaged = _times(video)
+    times, aspect, damaged, end = _times(video)
     if len(times) < LEAST:
         raise PosesError(
             f"{video} has {counted(len(times), 'frame')} that can be read, but poses need at least "
@@ -60,13 +62,13 @@ def extract(
     every = max(int(len(times) / (length * intervals.rate) / _JUDGED), 1)
     scores = dict[Path, float]()
     best: tuple[Any, Path] | None = None
-    last = start
+    shown = list[float]()
     for number, (time, frame) in enumerate(_decoded(video)):
         if frame is None:
             damaged = True
             continue
-        last = max(last, time)
-        place = intervals.place(float(time), frame)
+        shown.append(float(time))
+        place = intervals.place(shown[-1], frame)
         progress("seconds of the video", int(time - start), int(length))
         path = folder / f"{place:05d}.jpg"
         if path in scores and number % every:
@@ -88,10 +90,22 @@ def extract(
     if count is None:
         for path in scores.keys() - {*thinned(scores, MOST)}:
             path.unlink()
-    if not damaged:
+    lost = _lost(shown, end)
+    if not damaged and not lost:
         return []
-    seconds = f"{float(last - start):.1f} s"
-    return [f"{video} is damaged: only frames up to {seconds} that can be decoded are used"]
+    whole = end - float(start)
+    seconds = f"{whole - lost:.1f} of {whole:.1f} s"
+    return [f"{video} is damaged or lacks frames, copy it again: {seconds} are used"]
+
+
+def _lost(times: Sequence[float], end: float) -> float:
+    """Return the seconds of a video that have no frames: all pauses of more than _PAUSE.
+
+    times: of the decoded frames. end: time at which the video ends.
+    """
+    steps = np.diff([*sorted(times), end])
+    # at less than a frame a second no step is a pause
+    return float(steps[steps > max(_PAUSE, 3 * np.median(steps))].sum())
 
 
 def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
@@ -173,16 +187,19 @@ def _opened(video: Path) -> Any:
     return container
 
 
-def _times(video: Path) -> tuple[list[Fraction], float, bool]:
-    """Return frame times of a video in seconds, its pixel aspect, and whether it is damaged.
+def _times(video: Path) -> tuple[list[Fraction], float, bool, float]:
+    """Return frame times of a video in seconds, its pixel aspect, if it is damaged, and its end.
 
-    Times ascend. The pixel aspect is a pixel's width over its height. Packets are not decoded.
+    Times ascend. The pixel aspect is a pixel's width over its height. The end is the time that the
+    file lists, but not before the last frame. Packets are not decoded.
     """
     times = list[Fraction]()
     broken = False
     with _opened(video) as container:
         stream = container.streams.video[0]
         aspect = float(stream.sample_aspect_ratio or 1)
+        # sound may be longer than the frames, whose own length not all kinds of files have
+        seconds = (stream.duration or 0) * stream.time_base or (container.duration or 0) / 1e6
         try:
             for packet in container.demux(stream):
                 if packet.pts is not None:
@@ -190,7 +207,7 @@ def _times(video: Path) -> tuple[list[Fraction], float, bool]:
                 broken |= packet.is_corrupt
         except FFmpegError:
             broken = True
-    return sorted(times), aspect, broken
+    return sorted(times), aspect, broken, float(max(seconds, *times))
 
 
 def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
