@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -57,19 +56,19 @@ def extract(
         )
     start = times[0]
     # the last frame is shown as long as the others in the mean
-    length = float(times[-1] - start) * len(times) / (len(times) - 1) or 1.0
-    intervals = Intervals(float(start), length, count)
+    length = (times[-1] - start) * len(times) / (len(times) - 1) or 1.0
+    intervals = Intervals(start, length, count)
     every = max(int(len(times) / (length * intervals.rate) / _JUDGED), 1)
     scores = dict[Path, float]()
     best: tuple[Any, Path] | None = None
     shown = list[float]()
-    for number, (time, frame) in enumerate(_decoded(video)):
+    for number, frame in enumerate(_decoded(video)):
         if frame is None:
             damaged = True
             continue
-        shown.append(float(time))
-        place = intervals.place(shown[-1], frame)
-        progress("seconds of the video", int(time - start), int(length))
+        shown.append(frame.time)
+        place = intervals.place(frame)
+        progress("seconds of the video", int(frame.time - start), int(length))
         path = folder / f"{place:05d}.jpg"
         if path in scores and number % every:
             continue
@@ -90,22 +89,22 @@ def extract(
     if count is None:
         for path in scores.keys() - {*thinned(scores, MOST)}:
             path.unlink()
-    lost = _lost(shown, end)
-    if not damaged and not lost:
-        return []
-    whole = end - float(start)
-    seconds = f"{whole - lost:.1f} of {whole:.1f} s"
-    return [f"{video} is damaged or lacks frames, copy it again: {seconds} are used"]
+    return _remarks(video, shown, end, damaged)
 
 
-def _lost(times: Sequence[float], end: float) -> float:
-    """Return the seconds of a video that have no frames: all pauses of more than _PAUSE.
+def _remarks(video: Path, times: Sequence[float], end: float, damaged: bool) -> list[str]:
+    """Return a remark on a video that is `damaged` or has no frames for more than _PAUSE, or none.
 
-    times: of the decoded frames. end: time at which the video ends.
+    times: of the decoded frames, in seconds. end: time at which the video ends.
     """
     steps = np.diff([*sorted(times), end])
     # at less than a frame a second no step is a pause
-    return float(steps[steps > max(_PAUSE, 3 * np.median(steps))].sum())
+    lost = steps[steps > max(_PAUSE, 3 * np.median(steps))].sum()
+    if not damaged and not lost:
+        return []
+    whole = end - min(times)
+    seconds = f"{whole - lost:.1f} of {whole:.1f} s"
+    return [f"{video} is damaged or lacks frames, copy it again: {seconds} are used"]
 
 
 def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
@@ -139,22 +138,22 @@ class Intervals:
         self._moved = 0.0
         self._thumb: np.ndarray | None = None
 
-    def place(self, time: float, frame: Any) -> int:
-        """Return the index of the interval that holds the next frame, shown at `time` (seconds).
+    def place(self, frame: Any) -> int:
+        """Return the index of the interval that holds the next frame.
 
         Frames must come in the order of time.
         """
-        # times are fractions: an interval ends with the frame that is due, in spite of rounding
+        # an interval ends with the frame that is due, in spite of rounding
         if self.count:
-            place = int((time - self.start) * self.rate + 1e-6)
+            place = int((frame.time - self.start) * self.rate + 1e-6)
             return min(max(place, 0), self.count - 1)
         thumb = _grey(frame, _THUMB)
         if self._thumb is not None:
             self._moved += shift(self._thumb, thumb)
         self._thumb = thumb
-        if max((time - self._opened) * self.rate + 1e-6, self._moved / STEP) >= 1:
+        if max((frame.time - self._opened) * self.rate + 1e-6, self._moved / STEP) >= 1:
             self._place += 1
-            self._opened = time
+            self._opened = frame.time
             self._moved = 0.0
         return self._place
 
@@ -187,13 +186,13 @@ def _opened(video: Path) -> Any:
     return container
 
 
-def _times(video: Path) -> tuple[list[Fraction], float, bool, float]:
+def _times(video: Path) -> tuple[list[float], float, bool, float]:
     """Return frame times of a video in seconds, its pixel aspect, if it is damaged, and its end.
 
     Times ascend. The pixel aspect is a pixel's width over its height. The end is the time that the
     file lists, but not before the last frame. Packets are not decoded.
     """
-    times = list[Fraction]()
+    times = list[float]()
     broken = False
     with _opened(video) as container:
         stream = container.streams.video[0]
@@ -203,15 +202,15 @@ def _times(video: Path) -> tuple[list[Fraction], float, bool, float]:
         try:
             for packet in container.demux(stream):
                 if packet.pts is not None:
-                    times.append(packet.pts * stream.time_base)
+                    times.append(float(packet.pts * stream.time_base))
                 broken |= packet.is_corrupt
         except FFmpegError:
             broken = True
     return sorted(times), aspect, broken, float(max(seconds, *times))
 
 
-def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
-    """Yield each frame of a video with its time in seconds; (0, None) for an undecodable packet."""
+def _decoded(video: Path) -> Iterator[Any]:
+    """Yield each frame of a video that has a time, and None for an undecodable packet."""
     with _opened(video) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
@@ -221,11 +220,9 @@ def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
                 try:
                     frames = packet.decode()
                 except FFmpegError:
-                    yield Fraction(0), None
+                    yield None
                     continue
-                for frame in frames:
-                    if frame.pts is not None:
-                        yield frame.pts * stream.time_base, frame
+                yield from (frame for frame in frames if frame.time is not None)
 
 
 def _sharpness(frame: Any) -> float:
