@@ -10,6 +10,8 @@ import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from fnmatch import fnmatch
+from functools import cache
 from itertools import chain
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
@@ -53,8 +55,8 @@ _HEADER = 1000
 class Colmap(PhotoReader):
     """Reader of the posed images of a COLMAP model, sorted by name.
 
-    Models are searched in the folders of `_PLACES`, in this order. In a folder with a binary
-    and a text model, the binary one is read.
+    Models are searched in the folders of `_PLACES`, in this order, in upper or lower case. In a
+    folder with a binary and a text model, the binary one is read.
     """
 
     listing = "sparse/0/{cameras,images}.{bin,txt}"
@@ -62,7 +64,7 @@ class Colmap(PhotoReader):
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
         """Return whether `folder` has a COLMAP model, itself or in a folder such as sparse/0."""
-        return any(_models(folder))
+        return any(not missing for *_, missing in models(folder))
 
     @classmethod
     def lens(cls, model: str, coefficients: Mapping[str, float]) -> Lens | None:
@@ -88,7 +90,7 @@ class Colmap(PhotoReader):
         come before others. A warning names the models that are not read. Raises ValueError for an
         unreadable model.
         """
-        found = [_read(*model) for model in _models(folder)]
+        found = [_read(place, end) for place, end, missing in models(folder) if not missing]
         # beside its own photos first: those of dense/0 are undistorted; then the largest
         best = max(found, key=lambda one: (_has_photos(one.folder or folder), len(one.frames)))
         if others := [f"{one.file} ({len(one.frames)})" for one in found if one is not best]:
@@ -135,29 +137,35 @@ def _project(model: UPath) -> UPath:
     For a model elsewhere, or with photos beside its files, it is the model's folder.
     """
     places = (model, model.parent)
-    sparse = next((place for place in places if place.absolute().name == "sparse"), None)
+    sparse = next((place for place in places if place.absolute().name.lower() == "sparse"), None)
     if sparse is None or image_files(model):
         return model
-    return sparse.parent.parent if sparse.parent.name == "colmap" else sparse.parent
+    return sparse.parent.parent if sparse.parent.name.lower() == "colmap" else sparse.parent
 
 
 def _has_photos(folder: UPath) -> bool:
     return image_folder(folder, None) != folder or bool(image_files(folder))
 
 
-def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
-    """Yield the folder of each COLMAP model in `folder`, and the suffix of the model's files."""
-    for pattern in (*_PLACES, "*") if folder.name == "sparse" else _PLACES:
+def models(folder: UPath) -> Iterator[tuple[UPath, str, set[str]]]:
+    """Yield each COLMAP model in `folder`: its folder, the suffix of its files, and missing files.
+
+    A folder with one of a model's two files counts as a model, too.
+    """
+    inside = cache(listing)
+    for pattern in (*_PLACES, "*") if folder.name.lower() == "sparse" else _PLACES:
         places = [folder]
-        for part in pattern.split("/"):
-            inside = (sorted(listing(p), key=str) if part == "*" else [p / part] for p in places)
-            places = [*chain.from_iterable(inside)]
+        for part in PurePosixPath(pattern).parts:
+            items = sorted(chain.from_iterable(map(inside, places)), key=str)
+            places = [item for item in items if fnmatch(item.name.lower(), part)]
         for place in places:
-            held = {item.name for item in listing(place)}
+            held = {item.name for item in inside(place)}
             # binary keeps all digits of a pose
             for suffix in ("bin", "txt"):
-                if {f"cameras.{suffix}", f"images.{suffix}"} <= held:
-                    yield place, suffix
+                needed = {f"cameras.{suffix}", f"images.{suffix}"}
+                if needed & held:
+                    yield place, suffix, needed - held
+                if needed <= held:
                     break
 
 

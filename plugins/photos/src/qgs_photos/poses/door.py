@@ -8,7 +8,8 @@ from filelock import FileLock
 from rich.console import Console
 from upath import UPath
 
-from qgs_photos.datasets.colmap import Colmap
+from qgs.wording import listed
+from qgs_photos.datasets.colmap import Colmap, models
 from qgs_photos.image_files import image_files
 from qgs_photos.poses.making import RECORD, Options, fingerprint, make_poses
 from qgs_photos.poses.photos import PosesError, photo_files
@@ -27,8 +28,16 @@ class ColmapOrPhotos(Colmap):
         """Return the folder NAME_poses with the poses of `path`, a folder of photos or a video.
 
         The folder lies beside `path`. COLMAP computes missing poses. Returns None if `path` is
-        neither a video nor a folder with photos.
+        neither a video nor a folder with photos. Raises FileNotFoundError if a folder such as
+        sparse/0 in `path` has only a part of a COLMAP model.
         """
+        for place, _, missing in models(path):
+            # beside photos the other file may be of another program
+            if place != path:
+                raise FileNotFoundError(
+                    f"{place} has a COLMAP model without {listed(missing)}: copy this file too, or "
+                    f"move {place} away to compute poses anew"
+                )
         # anything else is left to the readers of listings, whose errors say what it lacks
         is_video = path.suffix.lower() in VIDEOS and path.is_file()
         if is_video or any(map(image_files, (path, path / "images"))):
