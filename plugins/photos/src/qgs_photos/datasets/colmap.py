@@ -295,13 +295,9 @@ def _faulty(reason: str) -> dict[str, Any]:
 def _c2w(*cam_from_world: float) -> np.ndarray:
     """Return OpenCV camera-to-world (4, 4) from COLMAP's quaternion and translation.
 
-    COLMAP's pose maps the world to the camera. All NaN if the quaternion's length differs from 1 by
-    more than 0.1.
+    COLMAP's pose maps the world to the camera. NaN if the quaternion's length is 0.
     """
     quaternion, translation = torch.tensor(cam_from_world, dtype=torch.float64).split([4, 3])
-    # not a rotation: NaN is told with the frame
-    if not abs(float(quaternion.norm()) - 1) <= 0.1:
-        return np.full((4, 4), math.nan)
     rotation = quat_to_matrix(quaternion / quaternion.norm()).T
     c2w = torch.eye(4, dtype=torch.float64)
     c2w[:3, :3] = rotation
