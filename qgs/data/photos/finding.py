@@ -59,7 +59,8 @@ def located(found: Listing, folder: UPath, images: str | None, outside: bool) ->
             f"{len(moved)} of {len(where)} files are in another folder or have another name than "
             f"{found.file} lists, for example {name_shown(f'{moved[file]} instead of {file}')}"
         )
-    return replace(found, frames=frames, present={*where.values()})
+    # A frame that names no file has the folder as its path: its problem is told, not its absence.
+    return replace(found, frames=frames, present={folder, *where.values()})
 
 
 def found_files(

@@ -58,7 +58,7 @@ def forms(names, poses):
         "one K": {"K": LENS, "c2w": poses[:, :3].tolist()},
         "padded K": {"c2w": c2w, "K": padded},
         "K of each": {"c2w": c2w, "K": [K] * 6, "images": names},
-        "a size": {"w": 80, "h": 60, "frames": doubled},
+        "a size": {"w": 80, "h": "60", "frames": doubled},
         "cam2world": rows({"image": names, "cam2world": c2w}, K=K),
         "w2c": rows({"image": names, "w2c": w2c.tolist()}, K=K),
         "w2c of each": {"world_to_camera": w2c[:, :3].tolist(), "intrinsics": LENS},

@@ -42,6 +42,8 @@ _FOCAL = (("fx", "fl_x"), ("fy", "fl_y"), ("cx",), ("cy",))
 _NORMALISED = 3.0
 # Bytes of a file that are looked at; a thousand cameras have a tenth of that.
 _START = 4_000_000
+_NO_POSE = np.full((4, 4), np.nan)
+_NO_SIZE = (math.nan, math.nan)
 _FORM = '{"frames": [{"image": "0.png", "c2w": 4 x 4, "K": 3 x 3}, ...]}'
 
 
@@ -171,8 +173,9 @@ class _Camera:
         sides = [values.get(s, values.get(long)) for s, long in (("h", "height"), ("w", "width"))]
         self.size: Size | None = None
         if None not in sides:
-            plain = (s if isinstance(s, int | float) else math.nan for s in sides)
-            self.size, wrong = listed_size(*plain)
+            # some programs write numbers as text
+            plain = numbers(sides)
+            self.size, wrong = listed_size(*(plain if plain.shape == (2,) else _NO_SIZE))
             self.problems += wrong
         self.in_parts = False
         self.pose = self._pose()
@@ -195,15 +198,15 @@ class _Camera:
             ambiguous = f"{unclear!r} may be camera-to-world or world-to-camera"
             reason = ambiguous if unclear else "it has no pose"
             self._wrong(f"{reason}: expected {_C2W[0]} or {_W2C[0]}")
-            return np.full((4, 4), np.nan)
+            return _NO_POSE
         if pose.shape == (3, 4):
             pose = np.vstack([pose, [0, 0, 0, 1]])
         if pose.shape != (4, 4):
             self._wrong(f"{key or 'rotation'!r} has the shape {pose.shape}")
-            return np.full((4, 4), np.nan)
+            return _NO_POSE
         if key in _W2C:
             singular = not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-9
-            return np.full((4, 4), np.nan) if singular else np.linalg.inv(pose)
+            return _NO_POSE if singular else np.linalg.inv(pose)
         return pose * [1, -1, -1, 1] if key in _OPENGL else pose
 
     def _intrinsics(self) -> np.ndarray:

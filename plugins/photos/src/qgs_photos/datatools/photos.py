@@ -129,8 +129,7 @@ class DecodedScene:
 
 
 def _is_read(photo: Photo) -> bool:
-    # a photo without a name is refused, not left out
-    return (photo.exists or not photo.listed.name) and photo.listed.split != "unused"
+    return photo.exists and photo.listed.split != "unused"
 
 
 def decode(photo: Photo, headers_only: bool) -> Decoded:
