@@ -84,6 +84,7 @@ def test_a_turned_phone_gives_upright_frames(tmp_path):
 
 @pytest.mark.parametrize("name", ["hlg.mov", pytest.param("pq.mov", marks=pytest.mark.slow)])
 def test_hdr_videos_look_as_others(tmp_path, name):
+    """The video in HLG does not say which primaries it has."""
     shown = []
     for video in ("bt709.mp4", name):
         extract(Path(__file__).parent / "videos" / video, tmp_path, 3)

@@ -28,6 +28,8 @@ _PAUSE = 1.0
 _SIDE = 640
 # Height and width of the pictures that motion is measured by.
 _THUMB = (48, 64)
+# Transfer functions of HLG and PQ.
+_HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)
 # Keeps its table of colours, which takes a second, from frame to frame.
 _REFORMATTER = VideoReformatter()
 _WINDOW = np.outer(np.hanning(_THUMB[0]), np.hanning(_THUMB[1]))
@@ -246,6 +248,9 @@ def _write(frame: Any, path: Path, aspect: float) -> None:
 
     aspect: width of a stored pixel over its height. HDR colours (HLG, PQ) become sRGB.
     """
+    # where HDR has no primaries, they are those of nearly all HDR
+    if frame.color_trc in _HDR and frame.color_primaries == ColorPrimaries.UNSPECIFIED:
+        frame.color_primaries = ColorPrimaries.BT2020
     if frame.color_primaries == ColorPrimaries.BT2020:
         frame = _REFORMATTER.reformat(
             frame,
