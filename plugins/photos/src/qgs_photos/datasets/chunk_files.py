@@ -71,7 +71,7 @@ class Record:
     sizes: Tensor | None
     masks: Sequence[Tensor] | None
     held_out: tuple[int, ...]
-    times: Tensor | None = None
+    times: Tensor | None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -317,9 +317,7 @@ class Chunk:
 
 def has_chunks(folder: UPath) -> bool:
     """Return whether a folder holds index.json or .torch files, as folders of chunks do."""
-    return folder.is_dir() and any(
-        item.name == INDEX or item.suffix == SUFFIX for item in folder.iterdir()
-    )
+    return any(item.name == INDEX or item.suffix == SUFFIX for item in listing(folder))
 
 
 def stays_inside(name: str) -> bool:

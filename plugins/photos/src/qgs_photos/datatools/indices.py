@@ -5,14 +5,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from upath import UPath
 
 from qgs.evaluate.plan import IndexEntry, read_index
-from qgs.paths import read_json
+from qgs.paths import listing, read_json
 from qgs_photos.datatools.findings import Finding, SceneReport, spans
 
 
 def found_indices(path: UPath) -> list[UPath]:
     """Return the JSON files in the folder `path` that have the form of an evaluation index."""
-    files = path.iterdir() if path.is_dir() else ()
-    return sorted((file for file in files if file.suffix == ".json" and _is_index(file)), key=str)
+    files = (file for file in listing(path) if file.suffix == ".json" and _is_index(file))
+    return sorted(files, key=str)
 
 
 def _is_index(file: UPath) -> bool:

@@ -13,7 +13,7 @@ from upath import UPath
 
 from qgs.contracts import SceneSource, Split
 from qgs.files import replacing
-from qgs.paths import is_local, read_json
+from qgs.paths import is_local, listing, read_json
 from qgs.wording import listed
 from qgs_photos.datasets.chunk_files import INDEX, SUFFIX, load_chunk
 from qgs_photos.datatools.entries import ChunkEntry, Encoding, chunk_entry, encoded_frames
@@ -87,8 +87,7 @@ def _begin(folder: UPath, settings: Mapping[str, Any]) -> None:
                 "these settings to finish that packing, or give a new folder"
             )
         return
-    inside = folder.iterdir() if folder.is_dir() else ()
-    if held := sorted(item.name for item in inside if not _is_unfinished(item)):
+    if held := sorted(item.name for item in listing(folder) if not _is_unfinished(item)):
         raise FileExistsError(
             f"{folder} is not empty ({listed(held)}), and packing never overwrites: "
             "give a new folder"
@@ -104,7 +103,7 @@ def _is_unfinished(path: UPath) -> bool:
 def _packed_before(folder: UPath) -> dict[str, str]:
     """Return the chunk file of each packed scene by the scene's name; delete unfinished files."""
     files: dict[str, str] = {}
-    for item in sorted(folder.iterdir(), key=str) if folder.is_dir() else ():
+    for item in sorted(listing(folder), key=str):
         if _is_unfinished(item):
             item.unlink()
         elif item.suffix == SUFFIX:
