@@ -112,9 +112,8 @@ def find_scenes(path: UPath) -> dict[str, UPath]:
             "or {hash}/"
         )
     found = sorted(_places(path, _DEPTH), key=lambda item: (item[1].suffix == ".zip", str(item[1])))
-    scenes: dict[str, UPath] = {}
-    for name, place in found:
-        scenes.setdefault(name, place)
+    # the first of a name wins
+    scenes = dict(reversed(found))
     if not scenes:
         inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
         raise FileNotFoundError(
