@@ -4,7 +4,7 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from itertools import islice
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.images import CropResize, decode_rgb, to_tensor
-from qgs.data.photos.reader import Size
+from qgs.data.photos.reader import Size, size_problems
 from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
 from qgs.data.view_samplers import held_out_frames
 from qgs.paths import opened_path
@@ -34,8 +34,6 @@ from qgs_photos.datasets.encoded import EncodedFrame
 
 # Chunks kept open.
 _OPEN = 4
-# Relative difference between an image's aspect ratio and the scene's.
-_SAME_ASPECT = 0.01
 
 
 class ChunksConfig(SceneSource.Config):
@@ -161,15 +159,14 @@ class ChunkScene(Scene):
                 f"{record.place(frame)} cannot be read as an image ({error}): copy or pack the "
                 "chunk again, or remove the scene from index.json"
             ) from error
+        size = (image.height, image.width)
         # intrinsics were cropped for the size that the scene gives
-        height, width = record.image_sizes[frame]
-        if abs(image.width * height / (image.height * width) - 1) > _SAME_ASPECT:
+        for problem in size_problems(size, record.image_sizes[frame]):
             raise ValueError(
-                f"{record.place(frame)} has {image.width} x {image.height} pixels, another aspect "
-                f"ratio than the {width} x {height} of its scene: pack the data set again with "
+                f"{record.place(frame)}: {problem.reason}: pack the data set again with "
                 "`qgs data pack`, which writes the entry 'sizes' that chunks of mixed sizes need"
             )
-        return CropResize((image.height, image.width), self._config.image_size).image(image)
+        return CropResize(size, self._config.image_size).image(image)
 
     def _mask(self, record: Record, frame: int) -> np.ndarray:
         mask = read_mask(record, frame)
@@ -248,8 +245,7 @@ def _folders(path: UPath) -> dict[Split, UPath]:
         raise FileNotFoundError(
             f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
         )
-    folders: dict[Split, UPath] = {"train": path / "train", "test": path / "test"}
-    found: dict[Split, UPath] = {s: inside for s, inside in folders.items() if has_chunks(inside)}
+    found: dict[Split, UPath] = {s: path / s for s in get_args(Split) if has_chunks(path / s)}
     if not found and has_chunks(path):
         return {"train": path}
     if not found:
