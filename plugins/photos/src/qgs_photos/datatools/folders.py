@@ -25,7 +25,7 @@ def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Cand
     if formats_of(root):
         yield from _listed(root, folder_name(root), wanted, images)
         return
-    inside = sorted((item for item in root.iterdir() if item.is_dir()), key=lambda item: item.name)
+    inside = sorted((item for item in root.iterdir() if item.is_dir()), key=str)
     scenes = [item for item in inside if formats_of(item)]
     for folder in scenes:
         yield from _listed(folder, folder.name, wanted, images)
