@@ -35,8 +35,9 @@ class Adjustments:
             name: [like.new_zeros(shape).requires_grad_() for _ in range(photos)]
             for name, shape in shapes.items()
         }
-        groups = [{"params": part, "name": name} for name, part in self._parts.items()]
-        self._optimizer = torch.optim.Adam(groups, eps=1e-15) if groups else None
+        self._optimizers = {
+            name: torch.optim.Adam(part, eps=1e-15) for name, part in self._parts.items()
+        }
 
     def cameras(self, photo: int, cameras: Cameras) -> Cameras:
         """Return the corrected camera (1, 1) of the photo with index `photo`."""
@@ -52,7 +53,7 @@ class Adjustments:
     def every_camera(self, cameras: Cameras) -> Cameras:
         """Return the corrected cameras (1, V) of all photos, without gradients."""
         with torch.no_grad():
-            each = [self.cameras(v, cameras[:, v : v + 1]).c2w for v in range(cameras.shape[1])]
+            each = [self.cameras(v, cameras[:, [v]]).c2w for v in range(cameras.shape[1])]
         return Cameras(torch.cat(each, 1), cameras.intrinsics, cameras.size)
 
     def seen(self, photo: int, rgb: Tensor) -> Tensor:
@@ -72,8 +73,7 @@ class Adjustments:
 
         used: fraction of the optimisation's time already spent; the learning rate falls with it.
         """
-        if self._optimizer is not None:
-            for group in self._optimizer.param_groups:
-                group["lr"] = _RATES[group["name"]] * _LAST**used
-            self._optimizer.step()
-            self._optimizer.zero_grad()
+        for name, optimizer in self._optimizers.items():
+            optimizer.param_groups[0]["lr"] = _RATES[name] * _LAST**used
+            optimizer.step()
+            optimizer.zero_grad()
