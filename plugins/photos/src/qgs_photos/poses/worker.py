@@ -9,6 +9,7 @@ import json
 import os
 import sys
 import threading
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -216,7 +217,7 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
             "apart. Take more photos, and walk around your subject: do not turn on the spot"
         )
         return {"refused": reason}
-    largest = max(solid, key=lambda model: model.num_reg_images())
+    largest = max(solid, key=COLMAP.Reconstruction.num_reg_images)
     best = Path(job.models, "best")
     best.mkdir()
     _scaled(_centred(largest, job.threads), job.sizes).write(best)
@@ -230,10 +231,8 @@ def _centred(model: Any, threads: int) -> Any:
     With long lenses a principal point cannot be measured: for photos with an angle of view of 19
     degrees, refinement would leave the error unchanged and turn the cameras by half a degree.
     """
-    counts = dict.fromkeys(model.cameras, 0)
-    for image in model.images.values():
-        counts[image.camera_id] += 1
-    if all(count < FREE_CENTRE for count in counts.values()):
+    counts = Counter(image.camera_id for image in model.images.values())
+    if max(counts.values()) < FREE_CENTRE:
         return model
     options = COLMAP.BundleAdjustmentOptions()
     options.refine_principal_point = True
