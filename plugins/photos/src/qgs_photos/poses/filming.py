@@ -1,6 +1,5 @@
 """Render videos of Gaussians along a camera path, as mp4 or WebP."""
 
-import math
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -22,7 +21,7 @@ from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians
-from qgs_photos.poses.paths import KINDS, path_of, read_path
+from qgs_photos.poses.paths import KINDS, focal_length, path_of, read_path
 from qgs_photos.record import GAUSSIANS, has_record, read_record
 from qgs_photos.viewing import VIEWER, in_own_world
 
@@ -142,7 +141,7 @@ def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
         fx = fx * factor
         fy = fy * factor
     else:
-        fy = torch.full_like(fy, height / 2 / math.tan(math.radians(fov) / 2))
+        fy = torch.full_like(fy, focal_length(fov, height))
         fx = fy
     cx = torch.full_like(fx, width / 2)
     cy = torch.full_like(fx, height / 2)

@@ -88,7 +88,7 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
         ) from error
     height, width = size
     # focal lengths of both axes are the same: paths list one angle
-    given = fov and _focal(fov, height)
+    given = fov and focal_length(fov, height)
     lenses = [(given or focal,) * 2 + (width / 2, height / 2) for _, focal in read]
     return torch.from_numpy(poses), torch.tensor(lenses, dtype=torch.float64)
 
@@ -96,7 +96,7 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
 def _keyframe(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[np.ndarray, float]:
     """Return the OpenCV camera-to-world pose (4, 4) and fy in pixels of nerfstudio's keyframe."""
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
-    return pose * _OPENGL, _focal(float(entry.get("fov") or 50.0), size[0])
+    return pose * _OPENGL, focal_length(float(entry.get("fov") or 50.0), size[0])
 
 
 def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]:
@@ -108,6 +108,6 @@ def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]
     return frame.c2w, frame.intrinsics[1] * size[0] / frame.size[0]
 
 
-def _focal(angle: float, height: int) -> float:
+def focal_length(angle: float, height: int) -> float:
     """Return the focal length in pixels for a vertical `angle` of view in degrees."""
     return height / 2 / math.tan(math.radians(angle) / 2)
