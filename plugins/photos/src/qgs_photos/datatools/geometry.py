@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -57,7 +57,7 @@ class Geometry:
     """
 
     unjudged: str = ""
-    pairs: Pairs = field(default_factory=list)
+    pairs: Pairs = ()
     diagonal: float = 0.0
 
     @property

@@ -4,7 +4,7 @@ import hashlib
 import io
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,7 +36,7 @@ class Photo:
 
     listed: PhotoFrame
     read: Callable[[], bytes]
-    maps: Mapping[str, Callable[[], np.ndarray | None]] = field(default_factory=dict)
+    maps: Mapping[str, Callable[[], np.ndarray | None]]
     exists: bool = True
 
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +116,10 @@ class DecodedScene:
     def numbers(self) -> Sequence[int | None]:
         """Frame number of each photo in the loaded scene; None for photos that are left out."""
         count = itertools.count()
-        return [next(count) if _is_read(photo) else None for photo in self.photos]
+        return [
+            next(count) if photo.exists and photo.listed.split != "unused" else None
+            for photo in self.photos
+        ]
 
     def label(self, frame: int) -> str:
         """Return a photo's name in messages: frame number and file name, or the file name alone.
@@ -126,10 +129,6 @@ class DecodedScene:
         name = self.photos[frame].listed.name
         number = self.numbers[frame]
         return name if number is None else f"frame {numbered(number, name)}"
-
-
-def _is_read(photo: Photo) -> bool:
-    return photo.exists and photo.listed.split != "unused"
 
 
 def decode(photo: Photo, headers_only: bool) -> Decoded:
