@@ -47,10 +47,6 @@ class BendingLens(Lens):
         turned = (bent @ [1, 1j]).reshape(plane.shape) * 1j**self.turns
         return torch.view_as_real(torch.from_numpy(turned)).to(points)
 
-    def sees(self, points: Tensor) -> Tensor:
-        """Return whether the distortion is one-to-one at points (..., 2) of the plane z = 1."""
-        return points.norm(dim=-1) < _reach(self)
-
     def turned(self) -> Self:
         """Return the lens of this camera after a clockwise turn by 90 degrees."""
         return replace(self, turns=self.turns + 1)
@@ -158,7 +154,8 @@ def _in_photo(
     # From the pinhole's pixel to the photo's: the distortion is given in this direction.
     source = focal * lens.distorted(directions) + centre
     grid = source / source.new_tensor(size[::-1]) * 2 - 1
-    return grid, lens.sees(directions) & (grid.abs() <= 1).all(-1)
+    # beyond the reach the distortion is not one-to-one
+    return grid, (directions.norm(dim=-1) < _reach(lens)) & (grid.abs() <= 1).all(-1)
 
 
 @lru_cache(maxsize=4096)
