@@ -176,7 +176,7 @@ Image: TypeAlias = tuple[str, list[float], int]
 
 
 def _text_cameras(model: UPath) -> Iterator[Camera]:
-    for line in _lines(model / "cameras.txt"):
+    for line in read_lines(model / "cameras.txt"):
         number, name, width, height, *parameters = line.split()
         yield int(number), (name, _number(width), _number(height), [*map(_number, parameters)])
 
@@ -186,7 +186,7 @@ def _text_images(model: UPath) -> Iterator[Image]:
     with open_file(file) as opened:
         # other programs leave it out
         told = re.search(rb"# Number of images: (\d+)", opened.read(_HEADER))
-    lines = [*_lines(file)]
+    lines = [*read_lines(file)]
     posed = [line for line in lines if not _is_points(line)]
     # a pose that is cut off may pass for points
     expected = max(int(told[1]) if told else 0, len(lines) - len(posed))
@@ -224,7 +224,7 @@ def _number(word: str) -> float:
     return math.nan
 
 
-def _lines(file: UPath) -> Iterator[str]:
+def read_lines(file: UPath) -> Iterator[str]:
     """Yield the lines of a file that are neither blank nor a comment, stripped of spaces."""
     with io.TextIOWrapper(open_file(file), encoding="utf-8-sig") as lines:
         for line in lines:
@@ -246,7 +246,7 @@ def _binary_images(model: UPath) -> Iterator[Image]:
     with open_file(model / "images.bin") as file:
         for _ in range(_unpacked("<Q", file)[0]):
             _, *pose, camera = _unpacked("<I7dI", file)
-            name = b"".join(iter(lambda: _unpacked("<c", file)[0], b"\0")).decode("utf-8")
+            name = b"".join(iter(lambda: _unpacked("<c", file)[0], b"\0")).decode()
             if points := _unpacked("<Q", file)[0]:  # skipped unread: they are most of the file
                 file.seek(_BYTES_OF_A_POINT * min(points, 2**32) - 1, 1)
                 _unpacked("<c", file)

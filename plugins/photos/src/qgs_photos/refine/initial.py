@@ -20,7 +20,7 @@ from qgs.paths import read_file
 from qgs.recipe.registry import load_usable_plugins
 from qgs.reconstruction.reconstruct import reconstruct
 from qgs.types import Gaussians, Views
-from qgs_photos.datasets.colmap import Colmap
+from qgs_photos.datasets.colmap import Colmap, read_lines
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.scene_photos import TIMED, ScenePhotos
 from qgs_photos.refine.sweeping import balls, swept
@@ -144,7 +144,7 @@ def sparse_points(folder: UPath) -> tuple[Tensor, Tensor] | None:
     if file is None:
         return None
     try:
-        found = torch.tensor(readers[file](read_file(file)), dtype=torch.float64)
+        found = torch.tensor(readers[file](file), dtype=torch.float64)
     except (ValueError, struct.error) as error:
         raise ValueError(f"{file} cannot be read: {error}; export the model again") from error
     found = found.reshape(-1, 6)
@@ -152,12 +152,12 @@ def sparse_points(folder: UPath) -> tuple[Tensor, Tensor] | None:
     return (found[:, :3], found[:, 3:] / 255) if len(found) else None
 
 
-def _text(content: bytes) -> list[list[float]]:
-    lines = [line for line in content.decode().splitlines() if line.strip() and line[0] != "#"]
-    return [[float(word) for word in line.split()[1:7]] for line in lines]
+def _text(file: UPath) -> list[list[float]]:
+    return [[float(word) for word in line.split()[1:7]] for line in read_lines(file)]
 
 
-def _binary(content: bytes) -> list[list[float]]:
+def _binary(file: UPath) -> list[list[float]]:
+    content = read_file(file)
     (count,) = struct.unpack_from("<Q", content)
     start = 8
     rows = list[list[float]]()
