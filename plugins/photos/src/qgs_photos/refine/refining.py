@@ -136,7 +136,7 @@ def refine(
 
 
 def seconds_of_step(
-    gaussians: Gaussians, views: Views, renderer: nn.Module, extras: Extras = NO_EXTRAS
+    gaussians: Gaussians, views: Views, renderer: nn.Module, extras: Extras
 ) -> tuple[float, float]:
     """Measure the seconds of a step of `refine` on these Gaussians and photos (1, V).
 

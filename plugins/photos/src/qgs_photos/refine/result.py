@@ -62,10 +62,6 @@ class Result:
         gaussians = in_own_world(self.world, load_ply(file).to(self.world[0].device))
         return replace(self, refined=replace(self.refined, gaussians=gaussians))
 
-    def photo(self, frame: int) -> str:
-        """Return the file name of the photo with index `frame`."""
-        return self.photos.small.frame_name(frame)
-
     def render(self, views: Views) -> Rendering:
         """Render the scene from the cameras of `views` (1, V)."""
         gaussians = replace(self.refined.gaussians, features=None)
@@ -127,6 +123,7 @@ def write_scene(
 def scores(result: Result) -> dict[str, Any]:
     """Return what metrics.json holds: command, facts on the optimisation, held-out scores."""
     refined = result.refined
+    name_of = result.photos.small.frame_name
     rows = list[dict[str, Any]]()
     for place, frame in enumerate(result.photos.held_out):
         photo = result.judged.select([place])
@@ -136,7 +133,7 @@ def scores(result: Result) -> dict[str, Any]:
         rows.append(
             {
                 "frame": frame,
-                "photo": result.photo(frame),
+                "photo": name_of(frame),
                 "psnr": float(psnr(rendering.rgb, photo.images).mean()),
                 "ssim": float(ssim(rendering.rgb, photo.images).mean()),
                 "alpha": float(rendering.alpha.mean()),
@@ -150,7 +147,7 @@ def scores(result: Result) -> dict[str, Any]:
         "steps": refined.steps,
         "seconds": round(refined.seconds, 1),
         "stopped_by": refined.stopped_by,
-        "refined_on": [result.photo(frame) for frame in result.photos.frames],
+        "refined_on": [*map(name_of, result.photos.frames)],
         "mean": mean,
         "held_out": rows,
     }
@@ -203,7 +200,7 @@ def plain(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
     size = gaussians.means.new_tensor(cameras.size[::-1])
     # all views at once would take gigabytes
     for view in range(views):
-        camera = cameras[:, view : view + 1]
+        camera = cameras[:, [view]]
         points = to_camera(gaussians.means, camera)
         pixels = to_pixels(points, camera.intrinsics)
         inside = (points[..., 2] > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
