@@ -148,7 +148,7 @@ def chunk_entry(
         masks = [b"" if frame.mask is None else encoded(frame.mask) for frame in frames]
         entry["masks"] = [*map(_bytes, masks)]
     if held_out:
-        entry["held_out"] = torch.tensor(list(held_out), dtype=torch.int64)
+        entry["held_out"] = torch.tensor(list(held_out))
     if times is not None:
         entry["times"] = times.double().clone()
     return entry
@@ -175,4 +175,4 @@ def _timestamps(names: Sequence[str]) -> Tensor:
     """Return the names as integers if all are whole numbers; otherwise the indices 0, 1, ..."""
     # 19 digits may be more than an int64 holds
     stamps = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
-    return torch.tensor([int(name) for name in (names if stamps else range(len(names)))]).long()
+    return torch.tensor([int(name) for name in (names if stamps else range(len(names)))])
