@@ -16,6 +16,7 @@ from qgs.reconstruction.result import Reconstruction, reconstruct_sample
 from qgs.reconstruction.scenes import Size, chosen_scene
 from qgs.types import Views
 from qgs.wording import listed
+from qgs_photos.printing import say
 from qgs_photos.record import Record, has_record, read_record
 from qgs_photos.refine.refining import RefinedScene, refine
 from qgs_photos.refine.surroundings import edge_color, surrounded
@@ -174,10 +175,9 @@ def _chosen_frames(
 def _tell(start: Reconstruction, refined: RefinedScene, photos: Views, console: Console) -> None:
     height, width = photos.cameras.size
     ended = f", ended by {refined.stopped_by}" if refined.stopped_by else ""
-    console.print(
+    say(
+        console,
         f"refined for {refined.seconds:.1f} s{ended}: {refined.steps} steps on "
         f"{photos.images.shape[1]} photos of {width} x {height} pixels, "
         f"{start.gaussians.count:,} -> {refined.gaussians.count:,} Gaussians",
-        highlight=False,
-        soft_wrap=True,
     )
