@@ -34,7 +34,7 @@ class Blender(PhotoReader):
                 f"`images` is {images!r}, but the transforms files of {folder} name a folder for "
                 "each split: leave `images` out"
             )
-        frames: list[PhotoFrame] = []
+        frames = list[PhotoFrame]()
         for part, split in _SPLITS.items():
             file = folder / f"transforms_{part}.json"
             if file.is_file():

@@ -94,7 +94,7 @@ class CamerasJson(PhotoReader):
         """
         file = folder / cls.listing
         cameras = _cameras(file, read_json(file, f"write {_FORM}"))
-        names: list[str] = []
+        names = list[str]()
         for camera in cameras:
             given = (camera[key] for key in _NAMES if isinstance(camera.get(key), str))
             names.append(next(given, ""))

@@ -82,7 +82,7 @@ def check(
         some = f"poses were checked by photos in {len(judged)} of {count} scenes"
         notes.append(f"{some}; --geometry {count} checks all")
     held = defaultdict[str, list[SceneReport]](list)
-    scenes: list[SceneReport] = []
+    scenes = list[SceneReport]()
     for number, candidate in enumerate(candidates):
         progress(number, count, candidate.name)
         most = max(PHOTOS // len(judged), FEWEST) if number in judged else 0

@@ -147,7 +147,7 @@ def _listed_sizes(record: Record) -> list[Size] | None:
     """
     if record.sizes is not None:
         return record.image_sizes
-    stored: Counter[Size] = Counter()
+    stored = Counter[Size]()
     for frame in range(len(record)):
         try:
             stored[record.stored_size(frame)] += 1

@@ -169,7 +169,7 @@ def pack(
     written: dict[Split, dict[str, str]] = {}
     for split, places in splits.items():
         files = written[split] = _packed_before(folder / split)
-        for chunk in _chunks(entries(places, frozenset(files)), chunk_bytes):
+        for chunk in _chunks(entries(places, files), chunk_bytes):
             # numbers go on after the chunks of an interrupted run
             file = f"{len({*files.values()}):06d}{SUFFIX}"
             with opened_replacing(folder / split / file) as opened:

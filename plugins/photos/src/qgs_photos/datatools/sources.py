@@ -79,7 +79,7 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
     config = source.config_for(str(path), _SIZE, None)
     opened = source(config if images is None else config.model_copy(update={"images": images}))
     # a scene in both splits is checked once, and may be in an index
-    known: set[str] = set()
+    known = set[str]()
     for split in reversed(get_args(Split)):
         for place, name in enumerate(opened.names(split)):
             if name not in known:
