@@ -115,8 +115,10 @@ def test_an_angle_of_view_without_a_size_goes_with_the_first_image(folder):
 def test_doubtful_intrinsics_are_read_and_told(folder, caplog):
     change(folder, 2, cx=55.0)
     change(folder, 4, fl_x=2000.0, fl_y=2000.0)
+    change(folder, 5, file_path=None)
     assert read(folder).cameras.intrinsics[[2, 4], [2, 0]].tolist() == [55, 2000]
-    assert re.search(r"2 of 6 frames .*implausible.*: images/view_002\.png", caplog.text)
+    told = r"frame 5: its 'file_path'[\s\S]*2 of 6 frames .*implausible.*: images/view_002\.png"
+    assert re.search(told, caplog.text)
 
 
 def test_the_world_is_that_of_the_poses(folder):

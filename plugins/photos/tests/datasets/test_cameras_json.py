@@ -99,11 +99,7 @@ def test_what_is_refused_names_the_file(photos, file):
         rows({"image": names, "location": c2w}, K=K),
     ):
         file.write_text(json.dumps(content))
-        must_refuse(r"cameras\.json", read_cameras, file.parent)
-
-
-def read_cameras(folder):
-    return scene(folder, format="cameras")
+        must_refuse(r"cameras\.json", scene, file.parent, format="cameras")
 
 
 def test_four_numbers_a_camera_are_those_of_each(photos, file):

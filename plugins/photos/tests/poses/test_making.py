@@ -160,8 +160,11 @@ def test_poses_are_made_once_and_kept_beside_the_photos(folder, calls):
     must_refuse("holiday_poses", photos_of, folder, kind=PosesError)
 
 
-def test_a_training_makes_none(folder, calls):
+def test_a_training_makes_none_nor_does_a_part_of_a_model(folder, calls):
     must_refuse("Run `qgs poses`", opened, folder, kind=FileNotFoundError)
+    (folder / "sparse").mkdir()
+    (folder / "sparse/images.bin").touch()
+    must_refuse(r"sparse .*cameras\.bin", photos_of, folder, kind=FileNotFoundError)
     assert not calls
 
 
