@@ -193,7 +193,7 @@ def _text_images(model: UPath) -> Iterator[Image]:
     if len(posed) < expected:
         raise ValueError(f"images.txt has {len(posed)} poses, expected {expected}: it is cut off")
     if 1 < len(posed) == len(lines):
-        warn_once(f"{file} has no points: {len(posed)} lines are read as poses")
+        warn_once(f"{file} lists no 2D points: all {len(posed)} lines are poses")
     for line in posed:
         number, *fields = line.split(maxsplit=9)
         if len(fields) != 9 or not number.isdecimal() or not fields[7].isdecimal():
