@@ -128,6 +128,17 @@ def refuse_existing(target: Path) -> None:
         raise FileExistsError(f"{target} exists and is never overwritten; choose another name")
 
 
+def refuse_filled(out: Path, advice: str = "delete it yourself") -> None:
+    """Raise FileExistsError if `out` is a file, or a folder that is not empty.
+
+    advice: what a user can do instead of choosing another name; it ends the message.
+    """
+    if out.is_file() or (out.is_dir() and any(out.iterdir())):
+        raise FileExistsError(
+            f"{out} is a file or a folder that is not empty: choose another --out, or {advice}"
+        )
+
+
 def write_text(path: AnyPath, text: str) -> None:
     """Write `text` as UTF-8 to `path`; if this fails, `path` stays unchanged."""
     with replacing(path) as temporary:

@@ -19,6 +19,7 @@ from qgs.cli.options import (
     Tune,
     ViewsSettings,
 )
+from qgs.files import refuse_filled
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -94,8 +95,8 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
     overwrite: True allows an `out` that exists.
     """
     # This comes before heavy imports, so that the user need not wait.
-    if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
-        raise FileExistsError(f"{out} already exists: choose another --out, or add --overwrite")
+    if not overwrite:
+        refuse_filled(out, "add --overwrite")
 
     from qgs.reconstruction.scene_formats import scene_writers
 

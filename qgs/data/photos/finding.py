@@ -149,7 +149,7 @@ def _spellings(name: str) -> enumerate[str]:
     """Yield (0, name), (1, name in lower case and NFC), (2, the latter without image suffix)."""
     key = unicodedata.normalize("NFC", name).casefold()
     stem, dot, suffix = key.rpartition(".")
-    known = dot + suffix in (*Image.registered_extensions(), ".heic")
+    known = dot + suffix in (*Image.registered_extensions(), ".heic", ".heif")
     return enumerate((name, key, stem if known else key))
 
 

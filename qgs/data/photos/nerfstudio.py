@@ -144,7 +144,8 @@ class _Values(dict[str, Any]):
         if read.shape == (1,) and not isinstance(value, bool) and math.isfinite(read[0]):
             return float(read[0])
         if value is not None:
-            self.problem(f"{key!r} must be a finite number, got {value!r}", "correct the value")
+            shown = str(value)[:99]
+            self.problem(f"{key!r} must be a finite number, got {shown!r}", "correct the value")
         return None
 
 
@@ -203,7 +204,7 @@ def _focal(values: _Values, axis: str, side: int | None) -> float | None:
 def _lens(values: _Values) -> Lens | None:
     fisheye = values.get("is_fisheye")
     # No name is longer.
-    given = str(values.get("camera_model", "PINHOLE"))[:99]
+    given = str(values.get("camera_model") or "PINHOLE")[:99]
     model = "OPENCV_FISHEYE" if fisheye else given
     # An ignored coefficient would shift pixels against the poses without an error.
     found = {key: number for key in _COEFFICIENTS if (number := values.number(key))}
@@ -241,9 +242,9 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
         names = set[str]()
         for wanted in map(image_name, given):
             fitting = {wanted} & known or {name for name in known if _is_end(name, wanted)}
-            if not fitting:
+            if len(fitting) != 1:
                 raise ValueError(
-                    f"{key!r} names {wanted}, but there is no such frame: remove the name"
+                    f"{key!r} names {wanted}, but {len(fitting)} frames are called so: correct it"
                 )
             names |= fitting
         return names

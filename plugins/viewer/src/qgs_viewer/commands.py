@@ -29,6 +29,7 @@ from qgs.cli.options import (
     scale_settings,
     use_threads,
 )
+from qgs.files import refuse_filled
 from qgs.wording import listed
 
 if TYPE_CHECKING:
@@ -360,9 +361,5 @@ def new_folder(out: Path | None, name: str) -> Path:
     if out is None:
         names = (Path(f"{name}-{number}" if number > 1 else name) for number in count(1))
         return next(name for name in names if not name.exists())
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(
-            f"{out} is a file or a folder that is not empty; choose another --out, or delete it "
-            "yourself"
-        )
+    refuse_filled(out)
     return out

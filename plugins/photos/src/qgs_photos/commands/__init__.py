@@ -1,16 +1,5 @@
 """Commands of qgs_photos. Heavy modules are imported when a command runs, so --help is fast."""
 
-from pathlib import Path
-
-
-def refuse_filled(out: Path) -> None:
-    """Raise FileExistsError if `out` is a file, or a folder that is not empty."""
-    if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise FileExistsError(
-            f"{out} is a file or a folder that is not empty: choose another --out, or delete it "
-            "yourself"
-        )
-
 
 def refuse_no_time(option: str, value: float | None) -> None:
     """Raise ValueError if the value of a time option is infinite or not above 0; None passes."""

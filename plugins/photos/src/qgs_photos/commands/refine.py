@@ -6,7 +6,8 @@ from typing import Annotated, TypeAlias
 import typer
 
 from qgs.cli.options import Device, SceneName, parse_size
-from qgs_photos.commands import refuse_filled, refuse_no_time
+from qgs.files import refuse_filled
+from qgs_photos.commands import refuse_no_time
 from qgs_photos.printing import say
 
 app = typer.Typer(help="Fit a reconstruction to the photos of its scene.")

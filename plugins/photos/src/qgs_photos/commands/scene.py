@@ -8,7 +8,8 @@ from typing import Annotated, TypeAlias
 import typer
 
 from qgs.cli.options import Device, Frames, Scale, SceneName, parse_size
-from qgs_photos.commands import refuse_filled, refuse_no_time
+from qgs.files import refuse_filled
+from qgs_photos.commands import refuse_no_time
 
 app = typer.Typer(help="Make the best 3D scene from photos in a given time.")
 

@@ -48,8 +48,6 @@ _PLACES = (
 )
 _LONGER = "a file has more data than the number of records at its start says"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
-_HEADER = 1000
-"""Bytes at the start of images.txt that are searched for the number of images."""
 
 
 class Colmap(PhotoReader):
@@ -184,14 +182,16 @@ def _text_cameras(model: UPath) -> Iterator[Camera]:
 def _text_images(model: UPath) -> Iterator[Image]:
     file = model / "images.txt"
     with open_file(file) as opened:
-        # other programs leave it out
-        told = re.search(rb"# Number of images: (\d+)", opened.read(_HEADER))
+        # within the first lines; other programs leave it out
+        told = re.search(rb"# Number of images: (\d+)", opened.read(1000))
     lines = [*read_lines(file)]
     posed = [line for line in lines if not _is_points(line)]
     # a pose that is cut off may pass for points
     expected = max(int(told[1]) if told else 0, len(lines) - len(posed))
     if len(posed) < expected:
-        raise ValueError(f"images.txt has {len(posed)} poses, expected {expected}: it is cut off")
+        raise ValueError(
+            f"images.txt has {len(posed)} poses, not {expected}: it or its header is wrong"
+        )
     if 1 < len(posed) == len(lines):
         warn_once(f"{file} lists no 2D points: all {len(posed)} lines are poses")
     for line in posed:

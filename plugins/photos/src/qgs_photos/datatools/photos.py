@@ -181,7 +181,7 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
 def _edges(image: Image.Image) -> np.ndarray:
     """Return the lengths of the gradients of an image, after it is resized to _SQUARE."""
     x, y = np.gradient(np.array(image.resize(_SQUARE), np.float32))
-    return np.hypot(x, y)
+    return np.hypot(x, y).flatten()
 
 
 def _is_black(image: Image.Image) -> bool:

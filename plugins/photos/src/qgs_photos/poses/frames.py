@@ -106,7 +106,7 @@ def _remarks(video: Path, times: Sequence[float], end: float, damaged: bool) -> 
         return []
     whole = end - min(times)
     seconds = f"{whole - lost:.1f} of {whole:.1f} s"
-    return [f"{video} is damaged or lacks frames, copy it again: {seconds} are used"]
+    return [f"{video} has frames for {seconds}: if it is damaged, copy it again"]
 
 
 def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
@@ -199,8 +199,9 @@ def _times(video: Path) -> tuple[list[float], float, bool, float]:
     with _opened(video) as container:
         stream = container.streams.video[0]
         aspect = float(stream.sample_aspect_ratio or 1)
-        # sound may be longer than the frames, whose own length not all kinds of files have
-        seconds = (stream.duration or 0) * stream.time_base or (container.duration or 0) / 1e6
+        # not all kinds of files have the length of the frames, and sound may be longer
+        length = container.duration if len(container.streams) == 1 else 0
+        seconds = (stream.duration or 0) * stream.time_base or (length or 0) / 1e6
         try:
             for packet in container.demux(stream):
                 if packet.pts is not None:
@@ -208,7 +209,7 @@ def _times(video: Path) -> tuple[list[float], float, bool, float]:
                 broken |= packet.is_corrupt
         except FFmpegError:
             broken = True
-    return sorted(times), aspect, broken, float(max(seconds, *times))
+    return sorted(times), aspect, broken, float(max([seconds, *times]))
 
 
 def _decoded(video: Path) -> Iterator[Any]:

@@ -19,9 +19,8 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from qgs.files import naming_full_disk, replacing_entries, write_text
+from qgs.files import naming_full_disk, refuse_filled, replacing_entries, write_text
 from qgs.wording import counted, listed
-from qgs_photos.commands import refuse_filled
 from qgs_photos.poses.colmap import run
 from qgs_photos.poses.frames import extract
 from qgs_photos.poses.job import Job
