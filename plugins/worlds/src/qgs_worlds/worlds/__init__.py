@@ -9,6 +9,6 @@ plugin = Plugin(
     components=(WorldsSource,),
     models={
         name: f"models/{name}.safetensors"
-        for name in ("landmark-64", "landmark-128", "locus-64", "tokengs-64")
+        for name in ("landmark-64", "landmark-128", "landmark-256", "locus-64", "tokengs-64")
     },
 )
