@@ -61,16 +61,17 @@ def _with_exchanged_masks(photos: Sequence[Decoded]) -> list[int]:
     A mask fits a photo if its border runs along edges of the photo. Each of two photos must fit
     the other's mask best of all: textures behind small masks favour any mask but no certain one.
     """
-    masked = [frame for frame, photo in enumerate(photos) if photo.edges is not None]
+    masked = {frame: photo.edges for frame, photo in enumerate(photos) if photo.edges is not None}
     if not masked:
         return []
-    edges, borders = np.stack([photos[frame].edges for frame in masked], 1)
+    edges, borders = np.stack([*masked.values()], 1)
     borders = borders > 0
     fits = edges @ borders.T / borders.sum(1).clip(1)
     best = fits.argmax(1)
     better = fits.max(1) > _BETTER * fits.diagonal()
     mutual = best[best] == np.arange(len(best))
-    return [masked[place] for place in np.flatnonzero(better & mutual)]
+    frames = [*masked]
+    return [frames[place] for place in np.flatnonzero(better & mutual)]
 
 
 def pose_findings(scene: DecodedScene) -> Iterator[Finding]:
