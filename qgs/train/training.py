@@ -145,10 +145,10 @@ class Trainer:
                 source,
                 recipe.views,
                 recipe.seed,
-                self.config.on_bad_sample == "skip",
-                recipe.build_view_sampler(),
-                self.config.batch_size,
-                self.training_pass.reads_depths,
+                skips=self.config.on_bad_sample == "skip",
+                sampler=recipe.build_view_sampler(),
+                per_step=self.config.batch_size,
+                depths=self.training_pass.reads_depths,
             )
             self._build_watchers(source, samples)
             if saved:

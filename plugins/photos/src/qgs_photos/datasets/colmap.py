@@ -190,7 +190,7 @@ def _text_images(model: UPath) -> Iterator[Image]:
     expected = max(int(told[1]) if told else 0, len(lines) - len(posed))
     if len(posed) < expected:
         raise ValueError(
-            f"images.txt has {len(posed)} poses, not {expected}: it or its header is wrong"
+            f"images.txt has {len(posed)} poses, not {expected}: it is cut off, or its header wrong"
         )
     if 1 < len(posed) == len(lines):
         warn_once(f"{file} lists no 2D points: all {len(posed)} lines are poses")
