@@ -182,21 +182,22 @@ def test_other_files_are_refused_by_name(tmp_path):
     still = saved(tmp_path / "still.ply", replace(some, quats=some.quats * 0)).read_bytes()
     faces = b"element face 100000000\nproperty list uint float v\nend_header"
     for name, content in {
-        "compressed": ply(vertex=points, chunk=chunks),
-        "cut": whole[:-5],
-        "noise": b"\x89PNG\r\n\xff",
-        "promise": whole.replace(b"vertex 3", b"vertex 3000000000"),
-        "long": whole.replace(b"element", b"comment x\n" * 10_000 + b"element"),
-        "faces": whole.replace(b"end_header", faces),
-        "without rotation": still,
-        "without any": saved(tmp_path / "none.ply", random_gaussians(0)).read_bytes(),
+        "compressed.ply": ply(vertex=points, chunk=chunks),
+        "cut.ply": whole[:-5],
+        "noise.ply": b"\x89PNG\r\n\xff",
+        "promise.ply": whole.replace(b"vertex 3", b"vertex 3000000000"),
+        "long.ply": whole.replace(b"element", b"comment x\n" * 10_000 + b"element"),
+        "faces.ply": whole.replace(b"end_header", faces),
+        "without rotation.ply": still,
+        "without any.ply": saved(tmp_path / "none.ply", random_gaussians(0)).read_bytes(),
+        "4.spz": b"NGSP\4\0\0\0\5\0\0\0",
     }.items():
-        path = tmp_path / f"{name}.ply"
+        path = tmp_path / name
         path.write_bytes(content)
-        must_refuse(path.name, load_ply, path)
+        must_refuse(f"{name}.*(splat-transform|holds no Gaussians)", load_ply, path)
     os.mkfifo(tmp_path / "pipe.ply")  # reading it would wait for a writer
-    for name in ("missing", "pipe"):
-        must_refuse(name, load_ply, tmp_path / f"{name}.ply", kind=FileNotFoundError)
+    for name in ("missing.ply", "pipe.ply"):
+        must_refuse(name, load_ply, tmp_path / name, kind=FileNotFoundError)
 
 
 def test_convert_keeps_the_most_opaque(tmp_path):

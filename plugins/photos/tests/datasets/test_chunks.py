@@ -25,7 +25,7 @@ def encoded(color, size=(64, 36)):
     return as_tensor(photo_formats.encoded(Image.new(mode, size, color)))
 
 
-def camera(x=0.0):
+def camera(x):
     """A camera at (x, 2, 3) that is turned a quarter about z."""
     w2c = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]], float)
     w2c[:, 3] = -w2c[:, :3] @ [x, 2, 3]

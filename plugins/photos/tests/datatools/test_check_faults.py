@@ -122,7 +122,7 @@ def test_faults_of_masks(planted, shots):
     damaged.files["masks/1.png"] = b"no image"
     swapped = planted("warning: frames 1, 4 *: the mask fits another photo better*")
     for number, shot in enumerate(shots):
-        thing = (slice(30, 60), slice(20 * number, 20 * number + 30))
+        thing = np.s_[30:60, 20 * number : 20 * number + 30]
         image = shot.image.copy()
         image[thing] = 255
         masks[number] = 0

@@ -101,7 +101,9 @@ def test_pixels_of_a_video_become_square(tmp_path):
 def test_a_broken_tail_costs_its_frames(tmp_path):
     video = cut(write_video(tmp_path / "a.mkv", numbered_images(55), g="5"), 0.6)
     remarks = extract(video, tmp_path, 12)
-    assert 5 < max(levels(tmp_path)) < 50
+    found = levels(tmp_path)
+    assert len(found) >= 5
+    assert max(found) < 50
     assert "5.5 s" in remarks[0]
 
 
