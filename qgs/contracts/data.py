@@ -175,7 +175,8 @@ class ViewSampler(Component):
     def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
         """Draw input frames, in ascending order, and target frames.
 
-        There are at most `views.inputs` input frames, and the same number in all samples of a step.
+        All samples of a step have the same number of input frames: in evaluation at most
+        `views.inputs`, in training any number.
         Held-out frames are never drawn. step: number of optimiser steps before the sample is used;
         `qgs.contracts.schedule.END` in evaluation. Raises ValueError for a scene with too few
         frames.

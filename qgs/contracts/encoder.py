@@ -98,7 +98,7 @@ class PatchEncoder(Encoder):
             yield Problem(
                 "patch_size",
                 f"patches of {patch} pixels do not divide images of {size[0]} x {size[1]} (H x W)",
-                f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
+                f"choose images of {nearest}, or a patch_size that divides both sides",
             )
 
     @classmethod

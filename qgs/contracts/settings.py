@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, PositiveInt
 
 from qgs.contracts.component import ComponentConfig, OptionError
 from qgs.precision import Precision
@@ -84,6 +84,9 @@ class TrainingConfig(ComponentConfig):
     collapse_window: int = Field(default=50, ge=10, le=100)
     """Stop training after this many steps in a row in which renderings are empty or the gradient
     vanishes."""
+    image_sizes: tuple[tuple[PositiveInt, PositiveInt], ...] = ()
+    """Sizes [H, W] of training images. Each step takes one at random. []: `data.image_size`, which
+    is always the size in evaluation."""
     workers: int = Field(default=0, ge=0)
     """Number of processes that load data. 0: a thread of the training process loads data."""
     render_views: int = Field(default=0, ge=0)

@@ -5,7 +5,8 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from threading import Lock
 from typing import Any, Generic, TypeVar
 
-from qgs.contracts import Scene, SceneSource, Split
+from qgs.contracts import Scene, SceneSource, SceneSourceConfig, Split
+from qgs.types import Size
 
 Value = TypeVar("Value")
 
@@ -91,3 +92,8 @@ class LazySource(SceneSource):
     def names(self, split: Split) -> Sequence[str]:
         """Return the names of the scenes of a split."""
         return self.scenes(split).names
+
+
+def resized(source: SceneSource, config: SceneSourceConfig, size: Size) -> SceneSource:
+    """Return `source` opened again, with the options `config` and images of size (H, W)."""
+    return type(source)(config.model_copy(update={"image_size": size}))

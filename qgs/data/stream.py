@@ -20,12 +20,12 @@ from torch.utils.data import DataLoader, Dataset
 
 from qgs.contracts import Frames, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.data.samples import Batch, Sample, cameras_in, collate, make_sample, own_world, with_noise
-from qgs.data.scenes import BoundedCache
+from qgs.data.scenes import BoundedCache, resized
 from qgs.data.view_samplers import Span
 from qgs.domain import Domain
 from qgs.machine import is_out_of_memory
 from qgs.terminal import show_safely
-from qgs.types import Cameras
+from qgs.types import Cameras, Size
 from qgs.wording import one_line
 
 MEASURED = 512
@@ -105,6 +105,7 @@ class SampleStream(Dataset[Batch | Exception]):
     per_step: number of samples per optimiser step. The stream computes from it the step that uses a
         sample, because options of the sampler may depend on the step.
     depths: read depth maps if a scene has them.
+    sizes: sizes (H, W) of images; each optimiser step takes one at random. Empty: that of `source`.
     """
 
     source: InitVar[SceneSource]
@@ -114,11 +115,15 @@ class SampleStream(Dataset[Batch | Exception]):
     sampler: ViewSampler = _SPAN
     per_step: int = 1
     depths: bool = False
+    sizes: Sequence[Size] = ()
 
     def __post_init__(self, source: SceneSource) -> None:
-        self._open = partial(type(source), source.config)
-        self._scenes = source.scenes("train")
-        if not len(self._scenes):
+        sources = [source]
+        if self.sizes:
+            sources = [resized(source, source.config, size) for size in self.sizes]
+        self._openers = [partial(type(source), each.config) for each in sources]
+        self._scenes = [each.scenes("train") for each in sources]
+        if not len(self._scenes[0]):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
         self._groups = [np.asarray(group, np.int64) for group in source.groups("train")]
         self._orders: BoundedCache[np.ndarray] = BoundedCache(2)
@@ -128,13 +133,15 @@ class SampleStream(Dataset[Batch | Exception]):
         return {name: value for name, value in vars(self).items() if name != "_scenes"}
 
     @cached_property
-    def _scenes(self) -> Sequence[Scene]:
-        return self._open().scenes("train")
+    def _scenes(self) -> Sequence[Sequence[Scene]]:
+        """The training scenes, once for each image size."""
+        return [opened().scenes("train") for opened in self._openers]
 
-    def _scene(self, number: int) -> Scene:
-        epoch, place = divmod(number, len(self._scenes))
+    def _scene(self, number: int, step: int) -> Scene:
+        epoch, place = divmod(number, len(self._scenes[0]))
         order = self._orders.get(epoch, lambda: self._draw_epoch(epoch))
-        return self._scenes[int(order[place])]
+        size = np.random.default_rng([self.seed, 2, step]).integers(len(self._openers))
+        return self._scenes[size][int(order[place])]
 
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self.seed, 0, epoch])
@@ -182,7 +189,7 @@ class SampleStream(Dataset[Batch | Exception]):
         step: optimiser step, on which options of the view sampler may depend.
         """
         rng = np.random.default_rng([self.seed, 1, number])
-        scene = self._scene(number)
+        scene = self._scene(number, step)
         _, inputs, targets = self._drawn(scene, rng, step)
         count = len(inputs)
         both = cameras_in(own_world(scene, inputs, self.views), scene, (*inputs, *targets))
@@ -201,8 +208,9 @@ class SampleStream(Dataset[Batch | Exception]):
         # The first attempt always draws from (seed, 1, number), also if other samples failed.
         key = [self.seed, 1, number]
         rng = np.random.default_rng([*key, attempt] if attempt else key)
-        scene = self._scene(number + attempt)
-        mirror, inputs, targets = self._drawn(scene, rng, number // self.per_step)
+        step = number // self.per_step
+        scene = self._scene(number + attempt, step)
+        mirror, inputs, targets = self._drawn(scene, rng, step)
         try:
             return make_sample(scene, inputs, targets, self.views, mirror, rng, self.depths)
         except Exception as error:

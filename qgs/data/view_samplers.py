@@ -14,6 +14,7 @@ from pydantic import Field
 
 from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig, Window
 from qgs.contracts.component import ComponentConfig
+from qgs.contracts.schedule import END
 from qgs.machine import refuse_more_than_memory
 from qgs.wording import warn_once
 
@@ -139,14 +140,21 @@ class Span(ViewSampler):
         max_gap: int | None = Field(default=None, ge=1)
         """Largest distance in frames from the first to the last input view. null uses `views.gap`.
         With a schedule, it can grow during training."""
+        most_inputs: int | None = Field(default=None, ge=1)
+        """Largest number of inputs in training. The first step uses `views.inputs`, each further
+        step one more, up to this number, and then it starts again. Evaluation always uses
+        `views.inputs`. null: training uses `views.inputs` too."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Yield a problem if `min_gap` is larger than `max_gap`."""
+        """Yield problems if `min_gap` is above `max_gap`, or `most_inputs` below `views.inputs`."""
         if config.min_gap and config.max_gap and config.min_gap > config.max_gap:
             yield Problem("min_gap", "`min_gap` is larger than `max_gap`", "raise `max_gap`")
+        if config.most_inputs and context.inputs and config.most_inputs < context.inputs:
+            reason = f"it is smaller than `views.inputs`, {context.inputs}"
+            yield Problem("most_inputs", reason, "raise `most_inputs`, or lower `views.inputs`")
 
     def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
         """Choose input and target frames from a random span of `scene`."""
@@ -154,18 +162,21 @@ class Span(ViewSampler):
         high = options.max_gap or views.gap[1]
         # A schedule may lower the largest gap below the least one of the recipe.
         low = min(options.min_gap or views.gap[0], high)
-        views = views.model_copy(update={"gap": (low, high)})
-        refuse_too_many(views.inputs + views.targets, scene)
+        count = views.inputs
+        if options.most_inputs and step != END:
+            count += step % (options.most_inputs - count + 1)
+        views = views.model_copy(update={"gap": (low, high), "inputs": count})
+        refuse_too_many(count + views.targets, scene)
         usable = moments(scene)
         low, high = gap_range(len(usable), views, scene)
         gap = int(rng.integers(low, high + 1))
         # The draws follow the order of the release; another order would change all trainings.
         first = int(rng.integers(0, len(usable) - gap))
         span = usable[first : first + gap + 1]
-        if views.inputs == 1:
+        if count == 1:
             places = [int(rng.choice(gap + 1))]
         else:
-            more = views.inputs - 2
+            more = count - 2
             between = rng.choice(range(1, gap), more, replace=False) if more else ()
             places = [0, *sorted(map(int, between)), gap]
         # Permuting one camera draws no random number, so static scenes are unaffected.

@@ -10,6 +10,7 @@ from torch import Tensor
 from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceConfig, Split
 from qgs.data.recognition import open_for
 from qgs.data.samples import views_in
+from qgs.data.scenes import resized
 from qgs.data.view_samplers import training_frames
 from qgs.files import AnyPath
 from qgs.recipe import Recipe
@@ -51,7 +52,7 @@ def photo_scene(path: str, size: Size | None, name: str | None) -> Scene:
     scene = named_scene(source, path, name)
     # The stored size is known once the scene is open.
     if size is None and (stored := scene.stored_size(0)):
-        scene = named_scene(_resized(source, source.config, stored), path, name)
+        scene = named_scene(resized(source, source.config, stored), path, name)
     return scene
 
 
@@ -82,12 +83,7 @@ def chosen_scene(
     # Size and split depend on the photos, so the scene is opened once more.
     whole = size or whole_size(scene, size_multiple(recipe))
     config = holding_out(source.config, scene) if holdout else source.config
-    return named_scene(_resized(source, config, whole), path, name), None
-
-
-def _resized(source: SceneSource, config: SceneSourceConfig, size: Size) -> SceneSource:
-    """Return `source` opened again, with the options `config` and images of size (H, W)."""
-    return type(source)(config.model_copy(update={"image_size": size}))
+    return named_scene(resized(source, config, whole), path, name), None
 
 
 def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:

@@ -149,6 +149,7 @@ class Trainer:
                 sampler=recipe.build_view_sampler(),
                 per_step=self.config.batch_size,
                 depths=self.training_pass.reads_depths,
+                sizes=self.config.image_sizes,
             )
             self._build_watchers(source, samples)
             if saved:

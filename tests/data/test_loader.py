@@ -2,13 +2,15 @@
 
 import multiprocessing
 import threading
+from contextlib import closing
+from itertools import islice
 
 import pytest
 import torch
 from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
 from tables import must_refuse
-from training_runs import batches, same
+from training_runs import batches, same, tiny
 
 from qgs.containers import named_tensors
 from qgs.contracts import ViewsConfig
@@ -99,6 +101,38 @@ def test_processes_share_what_one_would_see():
             assert torch.equal(ours.inputs.images, whole.inputs.images[place])
             assert torch.equal(ours.targets.cameras.c2w, whole.targets.cameras.c2w[place])
         assert_same(batches(ROOMS, 1, 2, **own, start=2), part[2:])
+
+
+def test_samples_of_a_step_have_one_image_size_and_one_number_of_inputs():
+    sizes = [(8, 24), (24, 8)]
+    recipe = tiny(
+        "tokengs", f"training.image_sizes={[*map(list, sizes)]}", "view_sampler.most_inputs=4"
+    )
+    sampler = recipe.build_view_sampler()
+    samples = SampleStream(
+        recipe.build_data(), recipe.views, 0, sampler=sampler, per_step=2, sizes=sizes
+    )
+
+    def found(start, workers=0):
+        with closing(training_batches(samples, 1, start, workers=workers)) as stream:
+            return [*islice(stream, 12 - start)]
+
+    seen = found(0)
+    shapes = [batch.inputs.images.shape for batch in seen]
+    assert shapes[::2] == shapes[1::2]
+    assert [shape[1] for shape in shapes[::2]] == [2, 3, 4, 2, 3, 4]
+    assert {tuple(shape[3:]) for shape in shapes} == {*sizes}
+    assert all(
+        batch.inputs.cameras.size == shape[3:] for batch, shape in zip(seen, shapes, strict=True)
+    )
+    assert_same(seen[5:], found(5, workers=1))
+    must_refuse(r"smaller than `views.inputs`", tiny, "tokengs", "view_sampler.most_inputs=1")
+    must_refuse(
+        "patches of 8 pixels do not divide images of 16 x 20",
+        tiny,
+        "tokengs",
+        "training.image_sizes=[[16,20]]",
+    )
 
 
 class Grouped(Lines):
