@@ -3,7 +3,7 @@
 import os
 import sys
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -16,7 +16,7 @@ class ExtensionError(ValueError):
     """Error for an entry point that cannot be loaded; the message names its distribution."""
 
 
-def installed(group: str) -> tuple[EntryPoint, ...]:
+def installed(group: str) -> EntryPoints:
     """Return the entry points of `group`, including distributions installed since the last call.
 
     This imports no distribution.
@@ -54,5 +54,5 @@ def _where(entry: EntryPoint) -> str:
 
 
 @lru_cache(maxsize=16)
-def _read(group: str, *searched: str | float) -> tuple[EntryPoint, ...]:
-    return tuple(entry_points(group=group))
+def _read(group: str, *searched: str | float) -> EntryPoints:
+    return entry_points(group=group)

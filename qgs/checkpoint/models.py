@@ -51,7 +51,7 @@ def checkpoint_path(name: AnyPath) -> Path:
             return downloaded(text)
         # Only a plug-in that is installed makes a name of what may be a path.
         is_name = bool(model) and "/" not in model and path.suffix != ".safetensors"
-        if is_name and plugin in available_plugins():
+        if is_name and plugin in available_plugins().names:
             path = _shipped(plugin, text)
     if not path.is_file():
         raise FileNotFoundError(

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoints
 from typing import Any
 
 import typer
@@ -24,14 +24,14 @@ class CommandGroup(TyperGroup):
         """Return the names of all commands, core commands first."""
         # Not sorted by the alphabet: a newcomer needs the first commands first.
         own = super().list_commands(ctx)
-        return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
+        return [*own, *sorted(installed(GROUP).names - {*own})]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command `cmd_name` of the core or a plug-in; raise ValueError if missing."""
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own
-        offers = [entry for entry in installed(GROUP) if entry.name == cmd_name]
+        offers = installed(GROUP).select(name=cmd_name)
         if not offers:
             hint = did_you_mean(cmd_name, self.list_commands(ctx), "commands")
             raise ValueError(
@@ -41,7 +41,7 @@ class CommandGroup(TyperGroup):
         return offered_command(cmd_name, offers)
 
 
-def offered_command(name: str, offers: list[EntryPoint]) -> Any:
+def offered_command(name: str, offers: EntryPoints) -> Any:
     """Import the command `name` of a plug-in, and return the command.
 
     offers: entry points with this name. If there are several, or the import fails, the returned

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 
 import qgs.data
@@ -91,12 +91,9 @@ class Registry:
         }
 
 
-def available_plugins() -> dict[str, list[EntryPoint]]:
-    """Return the entry points of all installed plugins, by plugin name, without importing them."""
-    found: dict[str, list[EntryPoint]] = {}
-    for entry in extensions.installed(ENTRY_POINT_GROUP):
-        found.setdefault(entry.name, []).append(entry)
-    return found
+def available_plugins() -> EntryPoints:
+    """Return the entry points of all installed plugins, without importing them."""
+    return extensions.installed(ENTRY_POINT_GROUP)
 
 
 def load_registry(names: Iterable[str]) -> Registry:
@@ -129,7 +126,7 @@ def load_usable_plugins() -> tuple[Registry, list[str]]:
     plugins = {"qgs": BUILTIN}
     broken = []
     # A plug-in of the framework's own name hides nothing.
-    for name in sorted(available_plugins().keys() - {"qgs"}):
+    for name in sorted(available_plugins().names - {"qgs"}):
         try:
             plugins[name] = load_plugin(name)
         except PluginError as error:
@@ -142,14 +139,16 @@ def load_plugin(name: str) -> InstalledPlugin:
     if name == "qgs":
         return BUILTIN
     available = available_plugins()
-    if not (entries := available.get(name)):
-        fix = f"{extensions.INSTALL_ALL}; {did_you_mean(name, available, 'installed plugins')}"
+    entries = available.select(name=name)
+    if not entries:
+        hint = did_you_mean(name, available.names, "installed plugins")
+        fix = f"{extensions.INSTALL_ALL}; {hint}"
         raise PluginError(f"no installed distribution offers a plugin `{name}`", fix)
     if len(entries) > 1:
         releases = ", ".join(sorted(map(_release, entries)))
         reason = f"several distributions offer a plugin `{name}`: {releases}"
         raise PluginError(reason, "keep one of these distributions, and uninstall the others")
-    entry = entries[0]
+    (entry,) = entries
     release = _release(entry)
     assert entry.dist is not None
     named = f"the plugin `{name}` of {release}"

@@ -62,11 +62,11 @@ class Trackers:
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        offered = {entry.name: entry for entry in installed("qgs.trackers")}
-        if unknown := sorted({*names} - offered.keys()):
+        offered = installed("qgs.trackers")
+        if unknown := sorted({*names} - offered.names):
             raise ValueError(
                 f"training.trackers names {listed(unknown)}, but installed distributions offer "
-                f"{listed(sorted(offered)) or 'no tracker'}: remove it, or {INSTALL_ALL}"
+                f"{listed(sorted(offered.names)) or 'no tracker'}: remove it, or {INSTALL_ALL}"
             )
         self._kinds: dict[str, type[Tracker]] = {
             name: load(offered[name], Tracker) for name in names

@@ -2,6 +2,7 @@
 
 import json
 import pickle  # noqa: TID251
+from importlib.metadata import EntryPoints
 from pathlib import Path
 
 import pytest
@@ -82,7 +83,7 @@ def test_only_plugins_that_are_used_are_needed(tmp_path, monkeypatch):
     path = tmp_path / "photos.safetensors"
     photos = "tiny/photos.yaml"
     save(qgs.compose(photos, SMALL), path)
-    without_rooms = {n: e for n, e in available_plugins().items() if n != "rooms"}
+    without_rooms = EntryPoints(e for e in available_plugins() if e.name != "rooms")
     monkeypatch.setattr("qgs.recipe.registry.available_plugins", lambda: without_rooms)
     assert set(CheckpointFile(path).recipe.releases) == {"qgs", "locus", "datasets"}
     assert qgs.load(path).queries.count == 8

@@ -74,14 +74,14 @@ def test_broken_plugins_and_impostors_hide_no_other_plugin(write, install, monke
 def test_a_plugin_that_comes_to_a_folder_or_leaves_it_is_noticed(tmp_path, monkeypatch):
     """Though what is installed is read once for as long as nothing changes."""
     monkeypatch.syspath_prepend(tmp_path)
-    assert "late" not in available_plugins()
+    assert "late" not in available_plugins().names
     info = tmp_path / "late-1.0.dist-info"
     info.mkdir()
     (info / "entry_points.txt").write_text("[qgs.plugins]\nlate = late:plugin\n")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: late\nVersion: 1.0\n")
-    assert "late" in available_plugins()
+    assert "late" in available_plugins().names
     info.rename(tmp_path / "gone")
-    assert "late" not in available_plugins()
+    assert "late" not in available_plugins().names
 
 
 def test_the_tracebacks_of_plugins_and_components_are_all_shown(write, install):
