@@ -48,9 +48,14 @@ def imported(entry: EntryPoint) -> Any:
         ) from error
 
 
+def release_of(entry: EntryPoint) -> str:
+    """Return the name and version of the distribution that offers an entry point."""
+    assert entry.dist is not None
+    return f"{entry.dist.name} {entry.dist.version}"
+
+
 def _where(entry: EntryPoint) -> str:
-    of = f" of {entry.dist.name} {entry.dist.version}" if entry.dist else ""
-    return f"{entry.group} {entry.name!r}{of} ({entry.value})"
+    return f"{entry.group} {entry.name!r} of {release_of(entry)} ({entry.value})"
 
 
 @lru_cache(maxsize=16)

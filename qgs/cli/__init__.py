@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from qgs.cli import convert, evaluate, inspect, reconstruct, train
-from qgs.extensions import INSTALL_ALL, installed
+from qgs.extensions import INSTALL_ALL, installed, release_of
 from qgs.terminal import show_safely
 from qgs.wording import did_you_mean, listed
 
@@ -53,9 +53,9 @@ def offered_command(name: str, offers: EntryPoints) -> Any:
         assert isinstance(offered, typer.Typer), f"its entry is {type(offered)}, not a typer.Typer"
     # Importing runs the distribution's code.
     except (Exception, SystemExit) as error:
-        releases = [f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist]
+        releases = sorted(map(release_of, offers))
         reason = (
-            f"the command `qgs {name}` of {listed(sorted(releases))} cannot be used: "
+            f"the command `qgs {name}` of {listed(releases)} cannot be used: "
             f"{type(error).__name__}: {error}; update it, and keep only one if several are named"
         )
 

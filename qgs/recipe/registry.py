@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, EntryPoints
+from importlib.metadata import EntryPoints
 from pathlib import Path
 
 import qgs.data
@@ -145,11 +145,11 @@ def load_plugin(name: str) -> InstalledPlugin:
         fix = f"{extensions.INSTALL_ALL}; {hint}"
         raise PluginError(f"no installed distribution offers a plugin `{name}`", fix)
     if len(entries) > 1:
-        releases = ", ".join(sorted(map(_release, entries)))
+        releases = ", ".join(sorted(map(extensions.release_of, entries)))
         reason = f"several distributions offer a plugin `{name}`: {releases}"
         raise PluginError(reason, "keep one of these distributions, and uninstall the others")
     (entry,) = entries
-    release = _release(entry)
+    release = extensions.release_of(entry)
     assert entry.dist is not None
     named = f"the plugin `{name}` of {release}"
     try:
@@ -163,11 +163,6 @@ def load_plugin(name: str) -> InstalledPlugin:
         raise PluginError(f"{named} {fault}", f"update or fix {release}, or do without the plugin")
     folder = Path(sys.modules[entry.module].__file__ or "").parent
     return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, folder)
-
-
-def _release(entry: EntryPoint) -> str:
-    assert entry.dist is not None
-    return f"{entry.dist.name} {entry.dist.version}"
 
 
 def _plugin_fault(plugin: object, name: str) -> str:
