@@ -7,6 +7,15 @@ module, but without tensors over all pairs of Gaussian and pixel. Tests compare 
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+# In float32: with plain numbers, kernels would compute in float64.
+ZERO = np.float32(0)
+HALF = np.float32(0.5)
+ONE = np.float32(1)
+TWO = np.float32(2)
+LOG2_E = np.float32(1.4426950408889634)
+
 
 def kernel(function: Callable[..., Any], **more: Any) -> Any:
     """Compile `function` with numba on first use; cache the result on disk if possible.

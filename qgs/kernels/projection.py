@@ -12,18 +12,13 @@ to pixels, L the loss.
 
 import numpy as np
 
-from qgs.kernels import kernel
+from qgs.kernels import HALF, LOG2_E, ONE, TWO, ZERO, kernel
 
 # Number of gradients: C by rows, p, fx, fy, cx, cy.
 CAMERA_GRADIENTS = 16
 
-_ZERO = np.float32(0)
-_HALF = np.float32(0.5)
-_ONE = np.float32(1)
-_TWO = np.float32(2)
 # A quaternion's norm is at least this, as in F.normalize.
 _SHORTEST = np.float32(1e-12)
-_LOG2_E = np.float32(1.4426950408889634)
 # Added to a power of 2 against rounding.
 _SLACK = np.float32(0.05)
 # Half extent in pixels that still converts to an integer.
@@ -84,9 +79,9 @@ def _rotation(quat):
     y = y / norm
     z = z / norm
     rows = (
-        (_ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y)),
-        (_TWO * (x * y + w * z), _ONE - _TWO * (x * x + z * z), _TWO * (y * z - w * x)),
-        (_TWO * (x * z - w * y), _TWO * (y * z + w * x), _ONE - _TWO * (x * x + y * y)),
+        (ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y)),
+        (TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x)),
+        (TWO * (x * z - w * y), TWO * (y * z + w * x), ONE - TWO * (x * x + y * y)),
     )
     return rows, (w, x, y, z), norm
 
@@ -128,7 +123,7 @@ def _view(c2w, lens, mean, factor, margin, height, width):
     axes are results of `_axis`.
     """
     pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
-    offset = _plus(_vector(mean), -_ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
+    offset = _plus(_vector(mean), -ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
     seen = _combine(offset, pose)
     axes = _columns(pose)
     # Rows of C^T F.
@@ -154,9 +149,9 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
         rows, _, _ = _rotation(quats[g])
         factor = _scaled_columns(rows, _vector(scales[g]))
         opacity = opacities[g]
-        fall = max(np.log(opacity / alpha_min), _ZERO)
-        reach = np.sqrt(_TWO * fall)
-        lowest = -_LOG2_E * fall - _SLACK
+        fall = max(np.log(opacity / alpha_min), ZERO)
+        reach = np.sqrt(TWO * fall)
+        lowest = -LOG2_E * fall - _SLACK
         for v in range(c2w.shape[0]):
             _, _, seen, _, (x, _, row_x), (y, _, row_y) = _view(
                 c2w[v], lenses[v], means[g], factor, margin, height, width
@@ -164,11 +159,11 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
             fx, fy, cx, cy = _four(lenses[v])
             z = seen[2]
             out = splats[v, g]
-            out[6] = _ZERO
-            out[7] = _ZERO
+            out[6] = ZERO
+            out[7] = ZERO
             # Written so that NaN is dropped too.
             if not (opacity >= alpha_min and z >= near and z <= far):
-                out[5] = _ONE
+                out[5] = ONE
                 continue
             xx = _dot(row_x, row_x)
             xy = _dot(row_x, row_y)
@@ -179,14 +174,14 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
             out[0] = cx + fx * x
             out[1] = cy + fy * y
             out[5] = z
-            if not (determinant > _ZERO and determinant < np.float32(np.inf)):
+            if not (determinant > ZERO and determinant < np.float32(np.inf)):
                 continue
             out[2] = (yy + dilation) / determinant
             out[3] = -xy / determinant
             out[4] = (xx + dilation) / determinant
             out[8] = lowest
-            out[6] = min(reach * np.sqrt(xx + dilation) + _HALF, _LARGEST)
-            out[7] = min(reach * np.sqrt(yy + dilation) + _HALF, _LARGEST)
+            out[6] = min(reach * np.sqrt(xx + dilation) + HALF, _LARGEST)
+            out[7] = min(reach * np.sqrt(yy + dilation) + HALF, _LARGEST)
 
 
 @kernel
@@ -200,12 +195,12 @@ def _covariance_slopes(row_x, row_y, splat, given, dilation):
     xx = _dot(row_x, row_x)
     yy = _dot(row_y, row_y)
     minors = _cross(row_x, row_y)
-    inverse = _ONE / (_dot(minors, minors) + dilation * (xx + yy) + dilation * dilation)
+    inverse = ONE / (_dot(minors, minors) + dilation * (xx + yy) + dilation * dilation)
     of_determinant = -inverse * (given[2] * splat[2] + given[3] * splat[3] + given[4] * splat[4])
-    of_xx = _TWO * (given[4] * inverse + dilation * of_determinant)
+    of_xx = TWO * (given[4] * inverse + dilation * of_determinant)
     of_xy = -given[3] * inverse
-    of_yy = _TWO * (given[2] * inverse + dilation * of_determinant)
-    of_minors = _times(_TWO * of_determinant, minors)
+    of_yy = TWO * (given[2] * inverse + dilation * of_determinant)
+    of_minors = _times(TWO * of_determinant, minors)
     of_row_x = _plus(_plus(_cross(row_y, of_minors), of_xx, row_x), of_xy, row_y)
     of_row_y = _plus(_plus(_cross(of_minors, row_x), of_yy, row_y), of_xy, row_x)
     return of_row_x, of_row_y
@@ -253,11 +248,11 @@ def _quat_slopes(quat, norm, m, out):
     s_yz = m[2][1] + m[1][2]
     s_zx = m[0][2] + m[2][0]
     s_xy = m[1][0] + m[0][1]
-    of_w = _TWO * (x * yz + y * zx + z * xy)
-    of_x = _TWO * (w * yz + y * s_xy + z * s_zx - _TWO * x * (m[1][1] + m[2][2]))
-    of_y = _TWO * (w * zx + x * s_xy + z * s_yz - _TWO * y * (m[0][0] + m[2][2]))
-    of_z = _TWO * (w * xy + x * s_zx + y * s_yz - _TWO * z * (m[0][0] + m[1][1]))
-    along = w * of_w + x * of_x + y * of_y + z * of_z if norm > _SHORTEST else _ZERO
+    of_w = TWO * (x * yz + y * zx + z * xy)
+    of_x = TWO * (w * yz + y * s_xy + z * s_zx - TWO * x * (m[1][1] + m[2][2]))
+    of_y = TWO * (w * zx + x * s_xy + z * s_yz - TWO * y * (m[0][0] + m[2][2]))
+    of_z = TWO * (w * xy + x * s_zx + y * s_yz - TWO * z * (m[0][0] + m[1][1]))
+    along = w * of_w + x * of_x + y * of_y + z * of_z if norm > _SHORTEST else ZERO
     out[0] = (of_w - along * w) / norm
     out[1] = (of_x - along * x) / norm
     out[2] = (of_y - along * y) / norm
@@ -304,18 +299,18 @@ def project_backward_unit(
         cameras to of_cameras (V, 16), in the order of `_add_camera`.
     """
     _, _, dilation, _, margin, height, width = limits
-    zeros = (_ZERO, _ZERO, _ZERO)
+    zeros = (ZERO, ZERO, ZERO)
     slopes = np.empty(given.shape[3], np.float32)
     for g in range(bounds[0], bounds[1]):
         rows, quat, norm = _rotation(quats[g])
         scale = _vector(scales[g])
         factor = _scaled_columns(rows, scale)
         of_mean = zeros
-        of_opacity = _ZERO
+        of_opacity = ZERO
         of_factor = (zeros, zeros, zeros)
         for v in range(c2w.shape[0]):
             splat = splats[v, g]
-            if not splat[6] > _ZERO:
+            if not splat[6] > ZERO:
                 continue
             _sum_parts(given[v], g, slopes)
             of_opacity += slopes[6]
@@ -331,13 +326,13 @@ def project_backward_unit(
                 y_axis, fy, seen[2], of_row_y, turned[2], slopes[1]
             )
             of_seen = (of_x, of_y, z_x + z_y + slopes[5])
-            of_turned = (of_turned_x, of_turned_y, _plus(turned_z_x, _ONE, turned_z_y))
+            of_turned = (of_turned_x, of_turned_y, _plus(turned_z_x, ONE, turned_z_y))
             of_offset = _dots(of_seen, pose)
-            of_mean = _plus(of_mean, _ONE, of_offset)
+            of_mean = _plus(of_mean, ONE, of_offset)
             of_factor = (
-                _plus(of_factor[0], _ONE, _combine(pose[0], of_turned)),
-                _plus(of_factor[1], _ONE, _combine(pose[1], of_turned)),
-                _plus(of_factor[2], _ONE, _combine(pose[2], of_turned)),
+                _plus(of_factor[0], ONE, _combine(pose[0], of_turned)),
+                _plus(of_factor[1], ONE, _combine(pose[1], of_turned)),
+                _plus(of_factor[2], ONE, _combine(pose[2], of_turned)),
             )
             if wants_cameras:
                 _add_camera(

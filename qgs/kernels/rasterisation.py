@@ -21,7 +21,7 @@ splats j behind it. Then dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 
 import numpy as np
 
-from qgs.kernels import kernel
+from qgs.kernels import HALF, LOG2_E, ONE, ZERO, kernel
 
 TILE = 16
 SPLAT_FIELDS = 9
@@ -39,10 +39,6 @@ _LAST_LANE = np.float32(TILE - 1)
 # Splats between two checks for open rows.
 _CHECK_EVERY = 16
 
-_ZERO = np.float32(0)
-_HALF = np.float32(0.5)
-_ONE = np.float32(1)
-_LOG2_E = np.float32(1.4426950408889634)
 _LOWEST = np.float32(-126)
 # 2^f on [0, 1]: least-squares fit of degree 5, relative error 8e-8.
 _C0, _C1, _C2, _C3, _C4, _C5 = (
@@ -103,8 +99,8 @@ def _open(state, live, rows, columns):
     tile row inside the image. rows, columns: how many of the tile's rows and columns lie inside the
     image.
     """
-    state[:] = _ZERO
-    state.reshape(TILE, _ROW)[:rows, : TILE + columns] = _ONE
+    state[:] = ZERO
+    state.reshape(TILE, _ROW)[:rows, : TILE + columns] = ONE
     live[:] = False
     live[:rows] = True
 
@@ -128,12 +124,12 @@ def _take(state, i, dx, power_of, opacity, options):
     """
     linear, quadratic, constant = power_of
     alpha_min, alpha_cap, transmittance_min = options
-    power = max(min((quadratic * dx + linear) * dx + constant, _ZERO), _LOWEST)
+    power = max(min((quadratic * dx + linear) * dx + constant, ZERO), _LOWEST)
     full = opacity * _exp2(power)
     before = state[i]
     live = state[i + _BLOCKS[1]]
-    alpha = min(full, alpha_cap) if full >= alpha_min else _ZERO
-    live = live if before - before * alpha > transmittance_min else _ZERO
+    alpha = min(full, alpha_cap) if full >= alpha_min else ZERO
+    live = live if before - before * alpha > transmittance_min else ZERO
     alpha = alpha * live
     weight = before * alpha
     state[i] = before - weight
@@ -178,8 +174,8 @@ def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
         value = g_r * r + g_g * g + g_b * b + g_z * z_here + state[i + _BLOCKS[7]]
         rest = state[i + _BLOCKS[2]] - weight * value
         state[i + _BLOCKS[2]] = rest
-        slope = before * value - rest / (_ONE - alpha)
-        h = slope * alpha if full <= options[1] else _ZERO
+        slope = before * value - rest / (ONE - alpha)
+        h = slope * alpha if full <= options[1] else ZERO
         hx = h * dx
         hy = h * dy
         totals[lane] += h
@@ -202,15 +198,15 @@ def _add_gradients(totals, xx, xy, yy, opacity, out):
     """
     t = np.empty(GRADIENTS, np.float32)
     for block in range(GRADIENTS):
-        total = _ZERO
+        total = ZERO
         for lane in range(TILE):
             total += totals[block * TILE + lane]
         t[block] = total
     out[0] += xx * t[1] + xy * t[2]
     out[1] += xy * t[1] + yy * t[2]
-    out[2] -= _HALF * t[3]
+    out[2] -= HALF * t[3]
     out[3] -= t[4]
-    out[4] -= _HALF * t[5]
+    out[4] -= HALF * t[5]
     out[5] += t[6]
     out[6] += t[0] / opacity
     for channel in range(3):
@@ -232,7 +228,7 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
             x = x0 + lane
             base = row * _ROW + lane
             weight = sums[4, y, x]
-            depth = sums[3, y, x] / weight if weight > _ZERO else _ZERO
+            depth = sums[3, y, x] / weight if weight > ZERO else ZERO
             for channel in range(4):
                 state[base + (3 + channel) * TILE] = slopes[channel, y, x]
             of_weight = slopes[4, y, x] + depth * slopes[3, y, x]
@@ -292,17 +288,17 @@ def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out,
                     continue
                 xx, xy, yy = splats[g, 2], splats[g, 3], splats[g, 4]
                 look = opacities[g], colors[g, 0], colors[g, 1], colors[g, 2], splats[g, 5]
-                first, last = _rows_within(v - np.float32(y0) - _HALF, ey)
-                dx0 = np.float32(x0) + _HALF - u
-                quadratic = -_HALF * _LOG2_E * xx
+                first, last = _rows_within(v - np.float32(y0) - HALF, ey)
+                dx0 = np.float32(x0) + HALF - u
+                quadratic = -HALF * LOG2_E * xx
                 lean = -xy / xx  # the peak of a row moves by lean dy
                 touched = False
                 for row in range(first, last + 1):
                     if not live[row]:
                         continue
-                    dy = np.float32(y0 + row) + _HALF - v
-                    linear = -_LOG2_E * xy * dy
-                    constant = -_HALF * _LOG2_E * yy * dy * dy
+                    dy = np.float32(y0 + row) + HALF - v
+                    linear = -LOG2_E * xy * dy
+                    constant = -HALF * LOG2_E * yy * dy * dy
                     # If the largest power over all lanes is too low, skip the row.
                     peak = min(max(lean * dy, dx0), dx0 + _LAST_LANE)
                     if (quadratic * peak + linear) * peak + constant < splats[g, 8]:
@@ -313,7 +309,7 @@ def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out,
                         _blend_row(state, base, dx0, power, look, options)
                         continue
                     if not touched:
-                        totals[:] = _ZERO
+                        totals[:] = ZERO
                         touched = True
                     _backward_row(state, base, totals, dx0, dy, power, look, options)
                 if touched:

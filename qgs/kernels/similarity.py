@@ -5,12 +5,9 @@ The formula is that of `qgs.similarity.similarity_map`; tests compare values and
 
 import numpy as np
 
-from qgs.kernels import kernel
+from qgs.kernels import ONE, TWO, ZERO, kernel
 
 _REACH = 5
-_ZERO = np.float32(0)
-_ONE = np.float32(1)
-_TWO = np.float32(2)
 
 
 @kernel
@@ -22,7 +19,7 @@ def _windowed(planes, row, weights, framed, out):
         (N, W + 2 _REACH).
     """
     parts, height, width = planes.shape
-    framed[:] = _ZERO
+    framed[:] = ZERO
     for part in range(parts):
         for other in range(max(row - _REACH, 0), min(row + _REACH + 1, height)):
             weight = weights[abs(other - row)]
@@ -50,26 +47,26 @@ def similarity_sum(moments, weights, stabilisers, slope):
     slopes = np.empty((3, height, width), np.float32)
     for row in range(height):
         _windowed(moments, row, weights, framed, means)
-        of_row = _ZERO
+        of_row = ZERO
         for column in range(width):
             a = means[0, column]
             b = means[1, column]
             energy = a * a + b * b
-            luminance = _TWO * a * b + c1
-            structure = _TWO * (means[3, column] - a * b) + c2
+            luminance = TWO * a * b + c1
+            structure = TWO * (means[3, column] - a * b) + c2
             bright = energy + c1
             spread = means[2, column] - energy + c2
-            inverse = _ONE / (bright * spread)
+            inverse = ONE / (bright * spread)
             value = luminance * structure * inverse
             of_mean = b * (structure - luminance) * inverse
             of_row += value
-            slopes[0, row, column] = _TWO * (of_mean + a * value * (_ONE / spread - _ONE / bright))
+            slopes[0, row, column] = TWO * (of_mean + a * value * (ONE / spread - ONE / bright))
             slopes[1, row, column] = -value / spread
-            slopes[2, row, column] = _TWO * luminance * inverse
+            slopes[2, row, column] = TWO * luminance * inverse
         total += of_row
     for row in range(height):
         _windowed(slopes, row, weights, framed, means)
         for column in range(width):
-            of_squares = means[0, column] + _TWO * moments[0, row, column] * means[1, column]
+            of_squares = means[0, column] + TWO * moments[0, row, column] * means[1, column]
             slope[row, column] = of_squares + moments[1, row, column] * means[2, column]
     return total
