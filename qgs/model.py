@@ -64,8 +64,8 @@ class QueryGaussianModel(nn.Module):
         self.decoder = nn.ModuleList(decoder)
         self.refinements = nn.ModuleList(dict.fromkeys(refinements))
         # One module may refine after several layers: its weights count once.
-        shared = {id(module): index for index, module in enumerate(self.refinements)}
-        self.refinement_of = [shared[id(module)] for module in refinements]
+        shared = {module: index for index, module in enumerate(self.refinements)}
+        self.refinement_of = [shared[module] for module in refinements]
         self.feedback = feedback
         self.head = head
         self.centers = centers

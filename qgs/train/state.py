@@ -161,10 +161,10 @@ class OptimizerState:
     """
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
-        names = {id(parameter): name for name, parameter in module.named_parameters()}
+        names = {parameter: name for name, parameter in module.named_parameters()}
         self._names: list[str] = []
         for group in optimizer.param_groups:
-            self._names += [names[id(parameter)] for parameter in group["params"]]
+            self._names += [names[parameter] for parameter in group["params"]]
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
