@@ -34,8 +34,15 @@ def _check_unit_images(views: Any) -> None:
         )
 
 
+class _Batch(TensorContainer):
+    """Container whose index selects from the leading axes of all of its tensors."""
+
+    def __getitem__(self, index: Any) -> Self:
+        return map_tensors(lambda x: x[index], self)
+
+
 @dataclass(frozen=True)
-class Cameras(TensorContainer):
+class Cameras(_Batch):
     """Pinhole cameras of one image size.
 
     c2w: (..., 4, 4) camera-to-world, OpenCV axes, rigid.
@@ -62,9 +69,6 @@ class Cameras(TensorContainer):
         rotation = self.c2w[..., :3, :3].mT
         translation = -rotation @ self.c2w[..., :3, 3:]
         return torch.cat([torch.cat([rotation, translation], -1), self.c2w[..., 3:, :]], -2)
-
-    def __getitem__(self, index: Any) -> Self:
-        return map_tensors(lambda x: x[index], self)
 
 
 @dataclass(frozen=True)
@@ -273,7 +277,7 @@ class GaussianAttributes(TensorContainer):
 
 
 @dataclass(frozen=True)
-class Gaussians(TensorContainer):
+class Gaussians(_Batch):
     """Gaussians, G per scene, ordered query by query.
 
     means: (B, G, 3) world. scales: (B, G, 3) standard deviations, world units.
@@ -300,9 +304,6 @@ class Gaussians(TensorContainer):
     def count(self) -> int:
         """Number of Gaussians per scene."""
         return self.means.shape[-2]
-
-    def __getitem__(self, index: Any) -> Self:
-        return map_tensors(lambda x: x[index], self)
 
     def most_opaque(self, count: int) -> Self:
         """Return the `count` most opaque Gaussians of each scene, in unchanged order.
