@@ -43,7 +43,6 @@ def evaluate(
     device: Device = "auto",
 ) -> None:
     """Score a model on held-out views, beside two baselines: nearest input, mean input colour."""
-    console = Console()
     settings = list(overrides or ())
     if index is not None:
         settings.append(f"evaluation.index={json.dumps(index, ensure_ascii=False)}")
@@ -74,7 +73,7 @@ def evaluate(
     # Results are written beside a checkpoint of the user's own, not into a cache.
     own = Path(run).expanduser().exists()
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
-    evaluation = evaluate_into(model, recipe, step, folder, console)
+    evaluation = evaluate_into(model, recipe, step, folder)
     # Scripts need this: a mean over fewer scenes is not comparable.
     if strict and evaluation.missing:
         raise typer.Exit(1)
@@ -102,13 +101,13 @@ def evaluate_into(
     recipe: Recipe,
     step: int | None,
     folder: Path,
-    console: Console,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and print them."""
     from rich.progress import Progress
 
     from qgs.evaluate.evaluation import evaluate as judge
 
+    console = Console()
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("scoring scenes", total=None)
         evaluation = judge(

@@ -72,7 +72,7 @@ def train(
         elif finished and (folder / "protocol.json").exists():
             console.print(f"already evaluated, see {folder}")
         else:
-            evaluate_into(result.model, resolved, result.steps, folder, console)
+            evaluate_into(result.model, resolved, result.steps, folder)
     if result.stopped_by:
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
 
