@@ -101,10 +101,8 @@ def load_registry(names: Iterable[str]) -> Registry:
     return Registry({"qgs": BUILTIN, **{name: load_plugin(name) for name in names}})
 
 
-def load_plugins(
-    names: Sequence[str], tree: MapNode, problems: Problems, given: Sequence[Plugin]
-) -> Registry:
-    """Load the plugins `names`; add a problem for each plugin that cannot be used.
+def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin]) -> Registry:
+    """Load the plugins that a recipe names; add a problem for each plugin that cannot be used.
 
     tree: the merged recipe, whose lines the problems name. given: Plugin objects, which are used in
         place of installed plugins of the same names.
@@ -112,13 +110,12 @@ def load_plugins(
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
     plugins = {"qgs": BUILTIN}
     written = items_of(tree.get("plugins"), tree.origin_of("plugins"))
-    for index, name in enumerate(names):
+    for index, (name, origin) in enumerate(written):
         try:
             plugins[name] = at_hand.get(name) or load_plugin(name)
         except PluginError as error:
-            origin = written[index][1]
             problems.add(origin, f"plugins.{index}", error.reason, error.fix, error)
-    return Registry(plugins, complete=plugins.keys() >= {*names})
+    return Registry(plugins, complete=all(name in plugins for name, _ in written))
 
 
 def load_usable_plugins() -> tuple[Registry, list[str]]:

@@ -188,7 +188,7 @@ def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) ->
     # `losses: {}` means no losses, a recipe without `losses` gets the defaults.
     sound, settings = decode_settings(written, problems)
     tree = _with_defaults(sound)
-    registry = load_plugins(settings.plugins or (), tree, problems, plugins)
+    registry = load_plugins(tree, problems, plugins)
     expanded = expand(tree, settings.model.decoder.depth, problems)
     places = apply_swaps(tree.child("swap"), expanded, problems)
     found = [decode_place(place, registry, problems) for place in places.values()]
