@@ -1,7 +1,5 @@
 """`qgs eval`: evaluate a checkpoint."""
 
-from __future__ import annotations
-
 import json
 from itertools import count
 from pathlib import Path
@@ -97,11 +95,11 @@ def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:
 
 
 def evaluate_into(
-    model: QueryGaussianModel,
-    recipe: Recipe,
+    model: "QueryGaussianModel",
+    recipe: "Recipe",
     step: int | None,
     folder: Path,
-) -> Evaluation:
+) -> "Evaluation":
     """Evaluate `model` as `recipe` says, write the results into `folder` and print them."""
     from rich.progress import Progress
 

@@ -1,7 +1,5 @@
 """`qgs reconstruct`: Gaussians and pictures from a checkpoint and a folder of photos."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -105,7 +103,7 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
         find()
 
 
-def show(result: Reconstruction, console: Console) -> None:
+def show(result: "Reconstruction", console: "Console") -> None:
     """Print the PSNR of model and baselines in each view, means by kind of view, and remarks."""
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr

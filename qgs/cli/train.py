@@ -1,7 +1,5 @@
 """`qgs train`: train a model and evaluate it."""
 
-from __future__ import annotations
-
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -77,7 +75,7 @@ def train(
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
 
 
-def with_absolute_path(recipe: Recipe) -> Recipe:
+def with_absolute_path(recipe: "Recipe") -> "Recipe":
     """Return the recipe with absolute paths of data and evaluation index.
 
     Then `qgs eval` works in every directory.

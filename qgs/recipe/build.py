@@ -1,7 +1,5 @@
 """Construction of a recipe's model, and the learning-rate factors of its parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -37,7 +35,7 @@ if TYPE_CHECKING:
     from qgs.recipe.recipe import Recipe
 
 
-def build_model(recipe: Recipe, device: torch.device | str | None) -> QueryGaussianModel:
+def build_model(recipe: "Recipe", device: torch.device | str | None) -> QueryGaussianModel:
     """Build the model of a checked recipe; on the device "meta", no memory is allocated.
 
     Initial parameters are sampled on the CPU from the recipe's seed, whatever `device` is. The
@@ -56,7 +54,7 @@ def build_model(recipe: Recipe, device: torch.device | str | None) -> QueryGauss
     return model if on_meta or device is None else model.to(device)
 
 
-def _assemble(recipe: Recipe) -> QueryGaussianModel:
+def _assemble(recipe: "Recipe") -> QueryGaussianModel:
     shared: list[tuple[Chosen, nn.Module]] = []
 
     def at(*path: str) -> Any:

@@ -1,7 +1,5 @@
 """Photos in folders: formats of camera listings, and reading the listing of a folder."""
 
-from __future__ import annotations
-
 from upath import UPath
 
 from qgs.data.photos.finding import located
