@@ -102,9 +102,8 @@ class PatchEncoder(Encoder):
             )
 
     @classmethod
-    def size_multiple(cls, config: ComponentConfig) -> int:
+    def size_multiple(cls, config: Config) -> int:
         """Return the side of a patch in pixels, which must divide both sides of an image."""
-        assert isinstance(config, PatchEncoder.Config)
         return config.patch_size
 
     def grid(self, views: Views) -> tuple[int, int, int]:

@@ -58,5 +58,5 @@ def follow(parts: Iterable[object], step: int) -> None:
 
 def steps_followed(parts: Iterable[object]) -> int | None:
     """Return the step last passed to `follow` for `parts`; None if no option has a schedule."""
-    found = [x.followed for x in parts if isinstance(x, Component) and x.schedules]
-    return found[0] if found else None
+    found = (x.followed for x in parts if isinstance(x, Component) and x.schedules)
+    return next(found, None)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from itertools import count
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import yaml
 
@@ -127,7 +127,7 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
     """
     taken = list[str | int]()
     origin = tree.origin
-    node = cast("Any", tree)
+    node: Any = tree
     for step in path:
         # Pydantic names the tag of a union as a step, which nobody writes.
         key: Any = str(step) if isinstance(node, MapNode) else step
