@@ -69,10 +69,10 @@ def ellipsoid(o, d):
 @inner
 def ball(o, d, radius):
     """Return the interval of a ray in a sphere around the origin; the exit t (not used) is inf."""
-    inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
-    x, y, z = along(o, middle, d)
-    inside = radius * radius - (x * x + y * y + z * z)
+    inverse = ONE / dot(d, d)
+    middle = -dot(o, d) * inverse
+    p = along(o, middle, d)
+    inside = radius * radius - dot(p, p)
     root = math.sqrt(max(inside, ZERO) * inverse)
     met = inside > ZERO
     # shapes of furnished rooms have no cut, so nothing asks for the exit
@@ -80,12 +80,15 @@ def ball(o, d, radius):
 
 
 @inner
-def _last_and_first(x, y, z):
-    """Return the overlap of three ranges of t on x, y and z as an interval.
+def block(o, d, h):
+    """Return the interval of a ray in a box of half sizes h; a face is its axis number, 0 to 2.
 
-    x, y, z: pairs (entry t, exit t). The entry face is the number, 0 to 2, of the axis whose range
-    begins last. The exit face is the number of the axis whose range ends first.
+    The entry face is on the axis whose range of t begins last, the exit face on the axis whose
+    range ends first.
     """
+    x = slab(o[0], reciprocal(d[0]), h[0])
+    y = slab(o[1], reciprocal(d[1]), h[1])
+    z = slab(o[2], reciprocal(d[2]), h[2])
     near = max(x[0], y[0], z[0])
     far = min(x[1], y[1], z[1])
     entry = ZERO if near == x[0] else (ONE if near == y[0] else _TWO)
@@ -96,19 +99,7 @@ def _last_and_first(x, y, z):
 @inner
 def box(o, d):
     """Return the interval of a ray in the cube [-1, 1]^3; a face is its axis number, 0 to 2."""
-    x = slab(o[0], reciprocal(d[0]), ONE)
-    y = slab(o[1], reciprocal(d[1]), ONE)
-    z = slab(o[2], reciprocal(d[2]), ONE)
-    return _last_and_first(x, y, z)
-
-
-@inner
-def block(o, d, h):
-    """Return the interval of a ray in a box of half sizes h; a face is its axis number, 0 to 2."""
-    x = slab(o[0], reciprocal(d[0]), h[0])
-    y = slab(o[1], reciprocal(d[1]), h[1])
-    z = slab(o[2], reciprocal(d[2]), h[2])
-    return _last_and_first(x, y, z)
+    return block(o, d, (ONE, ONE, ONE))
 
 
 @inner
