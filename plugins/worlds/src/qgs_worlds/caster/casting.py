@@ -1,12 +1,11 @@
 """Cast all rays of images in parallel: depth maps and colours of procedural scenes."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 
 import numpy as np
-import torch
 
+from qgs.machine import in_threads
 from qgs.types import Size
 from qgs_worlds.caster.raycast import trace
 from qgs_worlds.caster.tables import Room, World
@@ -34,8 +33,7 @@ def cast(
     height, width = size
     depths = np.empty((len(c2w), samples * height, samples * width), np.float32)
 
-    def band(place: tuple[int, int]) -> None:
-        frame, top = place
+    def band(frame: int, top: int) -> None:
         rows = min(_BAND, height - top)
         area = (rows, width, top, samples)
         t, code, rays = trace(*area, scene.shapes, scene.heights, c2w[frame], intrinsics)
@@ -44,12 +42,5 @@ def cast(
             painted = images[frame, top : top + rows]
             paint(painted, t, code, top, samples, scene, c2w[frame], rays)
 
-    bands = [*product(range(len(c2w)), range(0, height, _BAND))]
-    if torch.get_num_threads() == 1:
-        for place in bands:
-            band(place)
-        return depths
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        # reading the results raises the errors of the threads
-        list(pool.map(band, bands))
+    in_threads(band, product(range(len(c2w)), range(0, height, _BAND)))
     return depths
