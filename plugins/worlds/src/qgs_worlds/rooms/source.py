@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field
 from qgs.contracts.data import Split
 from qgs.contracts.settings import ascending
 from qgs_worlds.caster.lens import lens, look_along
+from qgs_worlds.caster.shapes import about_z
 from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
 
 if TYPE_CHECKING:
@@ -123,7 +124,5 @@ def camera_path(
     if rng.random() < 0.5:
         eyes = eyes[::-1]
         target = target[::-1]
-    cos = math.cos(side * math.pi / 2)
-    sin = math.sin(side * math.pi / 2)
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    turn = np.reshape(about_z(side * math.pi / 2), (3, 3))
     return look_along(eyes @ turn.T, (target - eyes) @ turn.T)
