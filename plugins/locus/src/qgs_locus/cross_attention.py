@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from qgs.contracts import (
     AttentionWeights,
-    CrossAttention,
     Fields,
     ModelDims,
     Problem,
@@ -18,7 +17,7 @@ from qgs.contracts import (
     memory_fields,
     without_effect,
 )
-from qgs.tokengs import NORM_EPS, CrossAttentionCore
+from qgs.tokengs import ContentCrossAttention
 from qgs.tokengs.blocks import attention_weights, merge_heads
 from qgs.types import ImageMemory, QueryState
 from qgs_locus.fields import (
@@ -33,7 +32,7 @@ from qgs_locus.kernels.attention_bias import AttentionBias, biased_attention
 from qgs_locus.ray_bias import RayBias, ray_tokens
 
 
-class RayBiasedCrossAttention(CrossAttention):
+class RayBiasedCrossAttention(ContentCrossAttention):
     """Cross-attention that prefers image patches whose rays pass near the query's anchor.
 
     It computes softmax(q k / sqrt(d) + gamma b) v with the bias b = -1/2 (D / sigma)^2. D is the
@@ -45,7 +44,7 @@ class RayBiasedCrossAttention(CrossAttention):
     raw_radius = RAW_RADIUS
     reads: ClassVar[Fields] = {**memory_fields("keys", "values", "patch_rays"), **CENTER_FIELD}
 
-    class Config(RadiusOptions):
+    class Config(RadiusOptions, ContentCrossAttention.Config):
         bandwidth: Literal["radius", "fixed"] = "radius"
         """Bandwidth sigma of the bias: `sigma0` times the anchor's radius ("radius"), or `sigma0`
         for all anchors ("fixed")."""
@@ -63,14 +62,11 @@ class RayBiasedCrossAttention(CrossAttention):
         gamma_init: float = -2.25
         """Initial value of the learned g of each layer. The bias is multiplied by
         gamma = softplus(g)."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Number that every LayerNorm adds to the variance."""
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
         # Stored before softplus: training can weaken the bias, but never turn it into a repulsion.
         self.raw_gamma = nn.Parameter(torch.tensor(config.gamma_init))
 

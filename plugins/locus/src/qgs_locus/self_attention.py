@@ -5,11 +5,11 @@ from typing import Literal
 
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
-from qgs.contracts import AttentionWeights, ComponentConfig, ModelDims, SelfAttention
+from qgs.contracts import AttentionWeights, ModelDims
 from qgs.precision import full_precision
-from qgs.tokengs import NORM_EPS, Mlp, SelfAttentionCore
+from qgs.tokengs import ContentSelfAttention, Mlp
 from qgs.types import QueryState
 from qgs_locus.fields import CENTER, CENTER_FIELD
 
@@ -31,7 +31,7 @@ def sine_embedding(
     return torch.stack([angle.sin(), angle.cos()], -1).flatten(-3)
 
 
-class AnchorAwareSelfAttention(SelfAttention):
+class AnchorAwareSelfAttention(ContentSelfAttention):
     """Self-attention over x + p, with p = MLP(sine embedding of the anchor centre).
 
     x are the query's features. Queries, keys and values are computed from x + p, but p is not added
@@ -41,7 +41,7 @@ class AnchorAwareSelfAttention(SelfAttention):
     name = "anchor_aware"
     reads = CENTER_FIELD
 
-    class Config(ComponentConfig):
+    class Config(ContentSelfAttention.Config):
         position: Literal["tanh", "raw"] = "tanh"
         """Embed tanh of the centre ("tanh", LocusGS release) or the centre itself ("raw",
         paper)."""
@@ -51,34 +51,27 @@ class AnchorAwareSelfAttention(SelfAttention):
         """Approximate ratio of the longest to the shortest wavelength of the sines."""
         divisor_eps: float = Field(default=1e-6, ge=0)
         """Small number that is added to the divisor of each sine's argument (LocusGS release)."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Number that every LayerNorm adds to the variance."""
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
-        self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
         self.position_mlp = Mlp(3 * config.features, dims.width, dims.width)
 
-    def position_embedding(self, state: QueryState) -> Tensor:
-        """Return the embedding p (B, N, D) of the anchor centres."""
+    def placed(self, state: QueryState) -> QueryState:
+        """Return the state with features x + p, with p the embedding of the anchor centres."""
         position_BN3 = state[CENTER]
         c = self.config
         # The sines expect [-1, 1], but centres are unbounded.
         if c.position == "tanh":
             position_BN3 = torch.tanh(position_BN3)
-        return self.position_mlp(
-            sine_embedding(position_BN3, c.features, c.temperature, c.divisor_eps)
-        )
+        sines = sine_embedding(position_BN3, c.features, c.temperature, c.divisor_eps)
+        return state.replace(features=state.features + self.position_mlp(sines))
 
     def forward(self, state: QueryState) -> Tensor:
         """Return the update (B, N, D) of the queries' features."""
-        x_BND = self.norm(state.features + self.position_embedding(state))
-        return self.attention(x_BND, state.mask)
+        return super().forward(self.placed(state))
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
         """Return the attention of the queries with indices `queries` to all queries."""
-        x_BND = self.norm(state.features + self.position_embedding(state))
-        return self.attention.explain(x_BND, queries, state.mask)
+        return super().explain(self.placed(state), queries)

@@ -5,9 +5,9 @@ from pydantic import Field
 from qgs_locus.fields import CENTER, CENTER_FIELD
 from torch import Tensor, nn
 
-from qgs.contracts import AttentionWeights, ComponentConfig, ModelDims, SelfAttention
+from qgs.contracts import AttentionWeights, ModelDims
 from qgs.precision import at_least_float32, full_precision
-from qgs.tokengs import NORM_EPS, Mlp, SelfAttentionCore
+from qgs.tokengs import ContentSelfAttention, Mlp
 from qgs.tokengs.blocks import attention_weights, merge_heads
 from qgs.types import QueryState
 
@@ -18,7 +18,7 @@ PLACE = 5
 EPS = 1e-6
 
 
-class NeighbourAttention(SelfAttention):
+class NeighbourAttention(ContentSelfAttention):
     """Self-attention of each query i to the queries j with the k nearest anchors, i included.
 
     The weights are softmax_j(q_i k_j / sqrt(d) + MLP(p_ij)). The result averages the values v_j and
@@ -33,21 +33,17 @@ class NeighbourAttention(SelfAttention):
     # This bias adds the same number to all logits of an anchor.
     unlearned = ("place_mlp.fc2.bias",)
 
-    class Config(ComponentConfig):
+    class Config(ContentSelfAttention.Config):
         count: int = Field(default=16, ge=1)
         """k, the number of nearest anchors that each query reads. If there are fewer anchors, it
         reads all."""
         hidden: int = Field(default=32, ge=1)
         """Hidden width of the MLP that maps a relative position to one logit per head."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Number that every LayerNorm adds to the variance."""
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
-        self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
         self.place_mlp = Mlp(PLACE, config.hidden, dims.heads)
         self.place_proj = nn.Linear(PLACE * dims.heads, dims.width, bias=False)
 
