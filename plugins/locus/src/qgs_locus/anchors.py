@@ -1,5 +1,6 @@
 """`locus/anchored`: queries with a 3D anchor, which is a centre with a support radius."""
 
+from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Annotated, Literal
 
@@ -11,12 +12,12 @@ from qgs.contracts import (
     Ascending,
     ComponentConfig,
     Fields,
-    LearnedQueries,
     ModelDims,
     Problem,
     RecipeContext,
     without_effect,
 )
+from qgs.tokengs import LatentQueries
 from qgs.types import QueryState, SpatialSupport
 from qgs_locus.fields import (
     CENTER,
@@ -65,24 +66,10 @@ class FrustumCenters(ComponentConfig):
         return torch.cat([(2 * torch.rand(count, 2) - 1) * self.slope * z, z], -1)
 
 
-class AnchoredQueries(LearnedQueries):
-    """N learned queries: features, anchor centres mu and raw radii rho (before softplus).
+class CentredQueries(LatentQueries):
+    """Base of N learned queries with features and anchor centres, the same in every scene."""
 
-    Every scene starts with the same N queries.
-    """
-
-    name = "anchored"
-
-    class Config(RadiusOptions):
-        count: int = Field(default=4096, ge=1)
-        """N, the number of queries."""
-        std: float = Field(default=0.01, ge=0)
-        """Standard deviation of the initial features, which are normally distributed."""
-        radius: bool = True
-        """Give anchors a support radius. With false, they have a centre only."""
-        init_radius: float = Field(default=1.0, gt=0)
-        """Initial radius of each anchor, world units. `radius_bound` tells whether `radius_min` is
-        its lower bound or is added to it."""
+    class Config(RadiusOptions, LatentQueries.Config):
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
@@ -92,9 +79,39 @@ class AnchoredQueries(LearnedQueries):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
         # Centres are learned, as features are: every scene starts with the same anchors.
         self.center = nn.Parameter(config.center_init.sample(config.count))
+
+    def start(self, batch_size: int) -> QueryState:
+        """Return initial queries: features (B, N, D), and the fields of their anchors."""
+        own = {CENTER: self.center, **self.shapes()}
+        fields = {name: x.expand(batch_size, -1, -1) for name, x in own.items()}
+        return super().start(batch_size).replace(fields=fields)
+
+    @abstractmethod
+    def shapes(self) -> dict[str, Tensor]:
+        """Return the fields of anchors besides their centres, as (N, ...) by name."""
+
+
+class AnchoredQueries(CentredQueries):
+    """N learned queries: features, anchor centres mu and raw radii rho (before softplus).
+
+    Every scene starts with the same N queries.
+    """
+
+    name = "anchored"
+
+    class Config(CentredQueries.Config):
+        radius: bool = True
+        """Give anchors a support radius. With false, they have a centre only."""
+        init_radius: float = Field(default=1.0, gt=0)
+        """Initial radius of each anchor, world units. `radius_bound` tells whether `radius_min` is
+        its lower bound or is added to it."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
         if config.radius:
             # Stored before softplus, so that no optimiser step can make a radius negative.
             raw = raw_radius_of(config.init_radius)
@@ -111,13 +128,9 @@ class AnchoredQueries(LearnedQueries):
             idle = ("init_radius", "radius_bound", "radius_min")
             yield from without_effect(config, idle, "`radius` is false")
 
-    def start(self, batch_size: int) -> QueryState:
-        """Return initial queries: features (B, N, D), centres (B, N, 3), raw radii (B, N, 1)."""
-        fields = {CENTER: self.center.expand(batch_size, -1, -1)}
-        if self.config.radius:
-            fields[RAW_RADIUS] = self.raw_radius.expand(batch_size, -1, -1)
-        features = self.features.expand(batch_size, -1, -1)
-        return QueryState(features=features, fields=fields)
+    def shapes(self) -> dict[str, Tensor]:
+        """Return the raw radii (N, 1), or nothing if anchors have no radius."""
+        return {RAW_RADIUS: self.raw_radius} if self.config.radius else {}
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Return each anchor as a ball of its support radius, or as a point if it has no radius."""

@@ -9,41 +9,31 @@ from typing import Annotated
 import torch
 import torch.nn.functional as F
 from pydantic import Field
-from qgs_locus.anchors import FrustumCenters, NormalCenters
-from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, raw_radius_of
+from qgs_locus.anchors import CentredQueries
+from qgs_locus.fields import CENTER, CENTER_FIELD, raw_radius_of
 from torch import Tensor, nn
 
-from qgs.contracts import Fields, LearnedQueries, ModelDims
+from qgs.contracts import Fields, ModelDims
 from qgs.types import QueryState, SpatialSupport
 from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
 
 Radius = Annotated[float, Field(gt=0)]
 
 
-class EllipsoidQueries(LearnedQueries):
+class EllipsoidQueries(CentredQueries):
     """N learned queries for all scenes: features, anchor centres, rotations, three raw radii."""
 
     name = "anchored"
 
-    class Config(RadiusOptions):
-        count: int = Field(default=4096, ge=1)
-        """N, the number of queries."""
-        std: float = Field(default=0.01, ge=0)
-        """Standard deviation of the initial features, which are normally distributed."""
+    class Config(CentredQueries.Config):
         init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
         """Initial radii of each anchor along the axes of the world frame, world units.
         `radius_bound` tells whether `radius_min` is their lower bound or is added to them."""
-        center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
-            NormalCenters()
-        )
-        """Distribution of the initial anchor centres."""
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
-        self.center = nn.Parameter(config.center_init.sample(config.count))
         # No rotation at first: with equal radii the model starts as LocusGS does.
         identity = [torch.ones(config.count, 1), torch.zeros(config.count, 3)]
         self.rotation = nn.Parameter(torch.cat(identity, -1))
@@ -62,17 +52,10 @@ class EllipsoidQueries(LearnedQueries):
         """
         return name != "rotation" and super().decays(name, parameter)
 
-    def start(self, batch_size: int) -> QueryState:
-        """Return initial queries: features (B, N, D), and the fields of their anchors.
-
-        The fields are centres (B, N, 3), unit quaternions (B, N, 4) and raw radii (B, N, 3).
-        """
+    def shapes(self) -> dict[str, Tensor]:
+        """Return unit quaternions (N, 4) and raw radii (N, 3)."""
         # The optimiser changes the meaningless lengths; components get unit quaternions.
-        quats = F.normalize(self.rotation, dim=-1)
-        fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
-        fields = {name: x.expand(batch_size, -1, -1) for name, x in fields.items()}
-        features = self.features.expand(batch_size, -1, -1)
-        return QueryState(features=features, fields=fields)
+        return {ROTATION: F.normalize(self.rotation, dim=-1), RAW_RADII: self.raw_radii}
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Return the ellipsoid of each anchor."""
