@@ -10,10 +10,10 @@ from einops import rearrange
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.contracts import ComponentConfig, DecoderLayer, Head, LayerParts, ModelDims, memory_fields
+from qgs.contracts import DecoderLayer, Head, LayerParts, ModelDims, memory_fields
 from qgs.geometry.harmonics import SH_C0
 from qgs.precision import at_least_float32
-from qgs.tokengs import NORM_EPS, Mlp
+from qgs.tokengs import Mlp, NormConfig
 from qgs.types import GaussianAttributes, ImageMemory, QueryState
 from qgs_zoo.parts import self_attention
 
@@ -30,11 +30,9 @@ class JointLayer(DecoderLayer):
     reads = memory_fields("features")
     reads_layer_scale = False
 
-    class Config(ComponentConfig):
+    class Config(NormConfig):
         mlp_ratio: float = Field(default=2.0, ge=1)
         """Hidden width of the MLP, as a multiple of the model's width (rounded down)."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Number that every LayerNorm adds to the variance."""
 
     config: Config
 
@@ -89,7 +87,7 @@ class C3GHead(Head):
 
     name = "head"
 
-    class Config(ComponentConfig):
+    class Config(NormConfig):
         gaussians_per_query: int = Field(default=1, ge=1)
         """K, the number of Gaussians decoded from each query."""
         scale_unit: float = Field(default=0.001, gt=0)
@@ -97,8 +95,6 @@ class C3GHead(Head):
         scale)."""
         quat_eps: float = Field(default=1e-8, gt=0)
         """Lower bound of the length by which a raw quaternion is divided when it is normalised."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Number that the LayerNorm adds to the variance."""
 
     config: Config
 
