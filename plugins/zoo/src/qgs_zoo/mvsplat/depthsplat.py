@@ -19,7 +19,7 @@ from qgs.types import Cameras
 from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS, Stages
 from qgs_zoo.mvsplat.dpt import LEVELS, DptHead
-from qgs_zoo.mvsplat.mvsplat import Sweep, expected_disparity
+from qgs_zoo.mvsplat.mvsplat import Sweep, bounds, expected_disparity
 from qgs_zoo.mvsplat.sweep import (
     cost_volume,
     cyclic_neighbours,
@@ -153,12 +153,6 @@ def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
     return order_BVV[..., 1 : count + 1]
 
 
-def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
-    """Return the least and the largest inverse depth of a sweep, two tensors (B V, 1, 1)."""
-    least, most = (1 / x.flatten()[:, None, None] for x in (sweep.far, sweep.near))
-    return least, most
-
-
 @full_precision
 def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) -> Tensor:
     """Return inverse depths (B V, D, 2h, 2w) for a second sweep, around those of the first.
@@ -169,7 +163,7 @@ def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) 
     height, width = coarse_N1hw.shape[-2:]
     # No gradient: the first scale learns from its own depth.
     centre_N1hw = resized(coarse_N1hw.detach(), (2 * height, 2 * width))
-    least, most = (x[:, None] for x in bounds(sweep))
+    least, most = bounds(sweep)
     step = (most - least) / (first - 1) / 2
     low_N1hw = (centre_N1hw - count // 2 * step).clamp(least, most)
     high_N1hw = (centre_N1hw + (count // 2 - 1) * step).clamp(least, most)
@@ -240,7 +234,7 @@ class DepthPredictor(nn.Module):
         # Half precision cannot resolve the inverse depths of distant surfaces.
         correction_N1HW = at_least_float32(self.upsampler(maps, joined))
         full = [resized(x, size) for x in coarse]
-        full[-1] = (full[-1] + correction_N1HW).clamp(*(x[:, None] for x in bounds(sweep)))
+        full[-1] = (full[-1] + correction_N1HW).clamp(*bounds(sweep))
         depths = [(1 / x[:, 0]).unflatten(0, shape) for x in full]
         confidence_N1HW = F.interpolate(confidence_N1hw, size, mode="nearest")
         return Depths(depths, confidence_N1HW, maps, self.beside(cnn, multi))

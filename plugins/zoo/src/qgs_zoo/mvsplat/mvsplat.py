@@ -172,7 +172,7 @@ class DepthPredictor(nn.Module):
         refined = self.refine_unet(seen, views)
         raw = self.to_gaussians(torch.cat([refined, images_N3HW, full_NDHW], 1))
         change_N1HW, logit_N1HW = self.to_disparity(refined).split(1, 1)
-        log_depth = refined_log_depth(disparity_N1HW, change_N1HW, sweep.near, sweep.far)
+        log_depth = refined_log_depth(disparity_N1HW, change_N1HW, sweep)
         return torch.cat([log_depth, logit_N1HW, raw], 1).unflatten(0, (-1, views))
 
     def match(self, features_BVDhw: Tensor, sweep: Sweep) -> tuple[Tensor, Tensor]:
@@ -212,15 +212,18 @@ def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Te
     return disparity, probability.amax(1, keepdim=True)
 
 
+def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
+    """Return the least and the largest inverse depth of a sweep, two tensors (B V, 1, 1, 1)."""
+    # Inverse depth grows towards the camera.
+    least, most = (1 / x.flatten()[:, None, None, None] for x in (sweep.far, sweep.near))
+    return least, most
+
+
 @full_precision
-def refined_log_depth(
-    disparity_N1HW: Tensor, change_N1HW: Tensor, near_BV: Tensor, far_BV: Tensor
-) -> Tensor:
-    """Return logarithms of depths (B V, 1, H, W), with depths clamped to [near, far].
+def refined_log_depth(disparity_N1HW: Tensor, change_N1HW: Tensor, sweep: Sweep) -> Tensor:
+    """Return logarithms of depths (B V, 1, H, W), clamped to the depths of the sweep.
 
     disparity: inverse depth. change: correction to add to the inverse depth.
     """
-    # Inverse depth grows towards the camera.
-    least, most = (1 / x.flatten()[:, None, None, None] for x in (far_BV, near_BV))
-    fine = (disparity_N1HW + change_N1HW).clamp(least, most)
+    fine = (disparity_N1HW + change_N1HW).clamp(*bounds(sweep))
     return -fine.log()
