@@ -20,7 +20,7 @@ from photo_formats import (
 )
 from PIL import Image
 from pydantic import ValidationError
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from upath import UPath
 
 from qgs.data import PhotosSource
@@ -42,7 +42,7 @@ def assert_same(read, photos):
     for i, file in enumerate(photos.files):
         assert Path(read.frame_name(i)).stem == file.stem
         pixels = read.images([i])[0].mul(255).round().byte().permute(1, 2, 0)
-        assert np.array_equal(pixels, Image.open(file))
+        assert_equal(pixels, Image.open(file))
 
 
 def test_the_same_photos_in_every_format(tmp_path):
@@ -164,4 +164,4 @@ def test_photos_in_memory_and_in_archives(tmp_path):
     expected = scene(tmp_path / "a").images(range(6))
     for url in ("memory://photos/a", f"zip://a::file://{tmp_path}/a.zip"):
         assert_allclose(scene(url).cameras.c2w, photos.c2w, atol=1e-6)
-        assert torch.equal(scene(url).images(range(6)), expected)
+        assert_equal(scene(url).images(range(6)), expected)

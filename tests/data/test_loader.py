@@ -9,7 +9,7 @@ import pytest
 import torch
 from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from training_runs import batches, same, tiny
 
 from qgs.containers import named_tensors
@@ -67,7 +67,7 @@ def test_worker_processes_change_nothing_and_end_with_an_error_that_names_the_fi
     state = torch.get_rng_state()
     assert len(here) > 3
     assert_same(here[2:], until_broken(2, 2))
-    assert torch.equal(torch.get_rng_state(), state)
+    assert_equal(torch.get_rng_state(), state)
 
 
 def test_reading_ahead_leaves_the_autocast_of_training_alone():
@@ -98,8 +98,8 @@ def test_processes_share_what_one_would_see():
         place = slice(2 * rank, 2 * rank + 2)
         for whole, ours in zip(alone, part, strict=True):
             assert ours.scenes == whole.scenes[place]
-            assert torch.equal(ours.inputs.images, whole.inputs.images[place])
-            assert torch.equal(ours.targets.cameras.c2w, whole.targets.cameras.c2w[place])
+            assert_equal(ours.inputs.images, whole.inputs.images[place])
+            assert_equal(ours.targets.cameras.c2w, whole.targets.cameras.c2w[place])
         assert_same(batches(ROOMS, 1, 2, **own, start=2), part[2:])
 
 

@@ -10,7 +10,7 @@ import yaml
 from photo_formats import scene as read
 from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 
 from qgs.data.photos.nerfstudio import image_name
 
@@ -35,7 +35,7 @@ def test_masks_are_read_at_the_delivered_size(folder):
     Image.fromarray(mask).save(folder / "left.png")
     masks = read(folder, (15, 20)).masks([1, 2])
     assert masks[0, 0, 7, [2, 17]].tolist() == [1, 0]
-    assert torch.equal(masks[1], torch.ones(1, 15, 20))
+    assert_equal(masks[1], torch.ones(1, 15, 20))
 
 
 def test_depth_maps(folder):
@@ -124,7 +124,7 @@ def test_doubtful_intrinsics_are_read_and_told(folder, caplog):
 def test_the_world_is_that_of_the_poses(folder):
     before = read(folder).cameras.c2w
     change(folder, applied_transform=[[0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]], applied_scale=3)
-    assert torch.equal(read(folder).cameras.c2w, before)
+    assert_equal(read(folder).cameras.c2w, before)
 
 
 def test_images_of_another_size_are_told_when_decoded(folder):
@@ -139,7 +139,7 @@ def test_a_matrix_of_intrinsics_and_numbers_as_text_are_read(folder):
     for frame, key in enumerate(("K", "intrinsic_matrix")):
         change(folder, frame, **{key: [["50", 0, 19], [0, 52, 16], [0, 0, 1]]})
     changed = read(folder).cameras
-    assert torch.equal(changed.intrinsics[:2], expected.intrinsics[:2])
+    assert_equal(changed.intrinsics[:2], expected.intrinsics[:2])
     assert changed.intrinsics[2].tolist() == [50, 50, 20, 15]
     change(folder, 2, transform_matrix=None)
     assert len(read(folder)) == 5

@@ -2,9 +2,8 @@ import threading
 import zipfile
 from functools import partialmethod
 
-import torch
 from photo_formats import opened, scene, synthetic, uploaded, write_nerfstudio
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from upath import UPath
 
 from qgs.contracts import ViewsConfig
@@ -39,7 +38,7 @@ def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
         return whole(self, path, *given, **options)
 
     monkeypatch.setattr(store, "_open", partialmethod(waiting))
-    assert torch.equal(photos.images([0, 2, 1]), expected)
+    assert_equal(photos.images([0, 2, 1]), expected)
 
 
 def test_files_that_are_read_whole_have_a_limit(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from line_scenes import DOWN, Line, Lines, circle, drawn, samples_of, values
 from odd_views import odd_views
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from torch.testing import assert_close
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
@@ -73,18 +73,18 @@ def test_normalised_poses():
         return torch.cat([both.inputs.cameras.c2w[0], both.targets.cameras.c2w[0]])
 
     constant = made(scale_factor=0.4)
-    assert torch.equal(constant[0], torch.eye(4))
+    assert_equal(constant[0], torch.eye(4))
     assert constant[1:, 0, 3].tolist() == pytest.approx([4 * 0.5 * 0.4, 2 * 0.5 * 0.4])
     config = {"scale": "distance", "scale_factor": 1.0, "frame": "mean_cam"}
     assert made(**config)[:2, 0, 3].tolist() == pytest.approx([-0.5, 0.5])
     must_refuse("one point", sample, Line(5, step=0.0), **config)
-    assert torch.equal(made(scale_factor=1.0, frame="given"), scene.cameras.c2w[[2, 6, 4]])
+    assert_equal(made(scale_factor=1.0, frame="given"), scene.cameras.c2w[[2, 6, 4]])
 
 
 def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_pixel():
     plain = odd_views(2, 8, 8)
     flipped = mirrored_views(plain)
-    assert torch.equal(flipped.images, plain.images.flip(-1))
+    assert_equal(flipped.images, plain.images.flip(-1))
     assert_close(torch.linalg.det(flipped.cameras.c2w), torch.ones(2, 2))
     point = torch.tensor([0.7, -0.2, 4.0]).expand(2, 1, 3)
     expected = to_camera(point, plain.cameras)
@@ -101,8 +101,8 @@ def test_masks_follow_their_frames_into_mirrors_and_batches():
     bare = sample(Line(6), targets=(3, 2))
     assert collate([bare, bare]).inputs.masks is None
     mixed = collate([plain, bare]).inputs.masks
-    assert torch.equal(mixed[0], plain.inputs.masks[0])
-    assert torch.equal(mixed[1], torch.ones(2, 1, 8, 8))
+    assert_equal(mixed[0], plain.inputs.masks[0])
+    assert_equal(mixed[1], torch.ones(2, 1, 8, 8))
 
 
 def test_poses_far_from_the_origin_keep_their_digits():
@@ -190,7 +190,7 @@ def test_pose_noise_moves_inputs_but_the_first_and_nothing_else():
     poses = torch.stack([sample.inputs.cameras.c2w[0] for sample in noisy])
     exact = plain.inputs.cameras.c2w[0]
     assert all(torch.equal(s.targets.cameras.c2w, plain.targets.cameras.c2w) for s in noisy)
-    assert torch.equal(poses[:, 0], exact[:1].expand(400, 4, 4))
+    assert_equal(poses[:, 0], exact[:1].expand(400, 4, 4))
     turned = exact[1:, :3, :3].mT @ poses[:, 1:, :3, :3]
     assert torch.allclose(turned @ turned.mT, torch.eye(3), atol=1e-5)
     angles = torch.stack([turned[..., 2, 1], turned[..., 0, 2], turned[..., 1, 0]], -1)
@@ -207,7 +207,7 @@ def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol()
 
     exact = resolve("recipes/tiny/tokengs.yaml", ["evaluation.scenes=1"])
     noisy = resolve(exact.tree, ["views.pose_noise=3"])
-    assert torch.equal(first_inputs(noisy), first_inputs(noisy))
+    assert_equal(first_inputs(noisy), first_inputs(noisy))
     assert not torch.equal(first_inputs(noisy), first_inputs(exact))
     assert protocol_of(noisy).content["poses"]["noise"] == [3.0, 0]
     assert "noise" not in protocol_of(exact).content["poses"]
@@ -218,7 +218,7 @@ def test_times_of_photos_are_kept():
     timed = replace(plain, times=torch.rand(1, 2), target_time=torch.rand(1, 1))
     both = stack_views([mirrored_views(timed), timed])
     for name in ("times", "target_time"):
-        assert torch.equal(getattr(both, name), getattr(timed, name).repeat(2, 1))
+        assert_equal(getattr(both, name), getattr(timed, name).repeat(2, 1))
     must_refuse("target_time, times", stack_views, [timed, plain])
 
 

@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 from line_scenes import samples_of
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from training_runs import same, tiny
 
 from qgs.containers import map_tensors
@@ -73,11 +73,11 @@ def test_every_floating_field_is_tuned_and_no_other(monkeypatch):
 
     monkeypatch.setattr(model, "predict", recorded)
     tune(model, inputs, recipe)
-    assert torch.equal(seen[0].features, start.features)
+    assert_equal(seen[0].features, start.features)
     assert not torch.equal(seen[-1].features, start.features)
     for name in ("anchor.center", "anchor.raw_radius"):
         assert not torch.equal(seen[-1][name], start[name])
-    assert torch.equal(seen[-1]["stranger.label"], numbers)
+    assert_equal(seen[-1]["stranger.label"], numbers)
 
 
 def test_a_forward_pass_starts_from_the_given_state():
@@ -88,7 +88,7 @@ def test_a_forward_pass_starts_from_the_given_state():
         plain, given, moved = (
             model(inputs, state=s).gaussians.means for s in (None, start, shifted)
         )
-    assert torch.equal(plain, given)
+    assert_equal(plain, given)
     assert not torch.allclose(plain, moved)
     reason = "the memory has 1 scenes, but the initial state has 2"
     must_refuse(reason, model, inputs, state=model.queries.start(2))

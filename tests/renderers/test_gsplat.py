@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 from renderers.scenes import make_scene
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from torch.testing import assert_close
 
 import qgs.renderers as auto_module
@@ -41,7 +41,7 @@ def test_arguments_are_what_gsplat_expects(calls):
     bare = render(gaussians.replace(sh=None, features=None), cameras)
     found, of_bare = (call.kwargs for call in calls)
     fx, fy, cx, cy = cameras.intrinsics[1, 2]
-    assert torch.equal(found.pop("Ks")[1, 2], torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    assert_equal(found.pop("Ks")[1, 2], torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     assert found.pop("render_mode") == "RGB+ED"
     features = gaussians.features[:, None].expand(2, 3, 7, 2)
     backdrop = torch.tensor([0.1, 0.2, 0.3, 0, 0]).expand(2, 3, 5)
@@ -58,11 +58,11 @@ def test_arguments_are_what_gsplat_expects(calls):
         "backgrounds": backdrop,
     }
     assert_close(found, expected)
-    assert torch.equal(of_bare["colors"], gaussians.colors[:, None].expand(2, 3, 7, 3))
-    assert torch.equal(of_bare["backgrounds"], backdrop[..., :3])
+    assert_equal(of_bare["colors"], gaussians.colors[:, None].expand(2, 3, 7, 3))
+    assert_equal(of_bare["backgrounds"], backdrop[..., :3])
     channels = torch.tensor([0, 1, 2, 3, 4, 5, 0.25, 3])[:, None, None].expand(2, 3, 8, 12, 20)
     images = [rendering.rgb, rendering.features, rendering.depth, rendering.alpha, bare.depth]
-    assert torch.equal(torch.cat(images, 2), channels)
+    assert_equal(torch.cat(images, 2), channels)
     render(gaussians[:, :0], cameras)
     assert len(calls) == 2, "kernels divide by the number of Gaussians"
 
@@ -94,7 +94,7 @@ def test_tensors_elsewhere_and_intrinsics_that_want_a_gradient_are_refused():
 def test_auto_goes_by_where_the_gaussians_are(monkeypatch):
     scene = make_scene()
     auto = AutoRenderer(RendererConfig())
-    assert torch.equal(auto(*scene).rgb, CpuRenderer(RendererConfig())(*scene).rgb)
+    assert_equal(auto(*scene).rgb, CpuRenderer(RendererConfig())(*scene).rgb)
     gsplat = Mock()
     monkeypatch.setattr(auto_module, "GsplatRenderer", gsplat)
     assert AutoRenderer(RendererConfig())(ON_CUDA, scene[1]) is gsplat.return_value.return_value

@@ -6,6 +6,7 @@ import pytest
 import torch
 from rich.console import Console
 from safetensors.torch import load_file
+from tables import assert_equal
 from torch.testing import assert_close
 from training_runs import tiny
 
@@ -44,10 +45,10 @@ def test_old_queries_stay_and_new_ones_are_noisy_copies(learned):
         for parameter, now in model.state_dict().items():
             before = old[parameter]
             if not parameter.startswith("queries."):
-                assert torch.equal(now, before)
+                assert_equal(now, before)
                 continue
             assert len(now) == count
-            assert torch.equal(now[:COUNT], before[:count])
+            assert_equal(now[:COUNT], before[:count])
             shapes = f"{tuple(before.shape)} -> {tuple(now.shape)}"
             change = f"{parameter}: {shapes}: the first queries are kept"
             assert any(line.startswith(change) for line in told)
@@ -72,7 +73,7 @@ def test_the_recipes_seed_decides_the_noise(learned):
         model, _ = started(learned("tokengs", "model.queries.count=30", f"seed={seed}"))
         return model.queries.features
 
-    assert torch.equal(features(1), features(1))
+    assert_equal(features(1), features(1))
     assert not torch.equal(features(1), features(2))
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-import torch
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.shapes import packed
 from qgs_worlds.rooms.source import RoomScene, RoomsConfig, RoomsSource
 from qgs_worlds.worlds.places import PLACES
 from qgs_worlds.worlds.source import WorldsSource
+from tables import assert_equal
 from test_intervals import met
 from torch.testing import assert_close
 
@@ -53,7 +53,7 @@ def test_scenes_are_scaled_to_their_depth(scenes):
         moved = scene.cameras.c2w[:, :3, 3]
         own = drawn[index].depths(range(8)), drawn[index].cameras.c2w[:, :3, 3]
         assert_close((depths, moved), tuple(x * factor for x in own))
-        assert torch.equal(scene.images([1]), drawn[index].images([1]))
+        assert_equal(scene.images([1]), drawn[index].images([1]))
 
 
 def test_a_share_of_scenes_are_rooms():
@@ -61,7 +61,7 @@ def test_a_share_of_scenes_are_rooms():
     rooms = RoomsSource(RoomsConfig(image_size=SIZE)).scenes("train")
     drawn = [index for index in range(200) if isinstance(mixed[index], RoomScene)]
     assert 35 < len(drawn) < 65
-    assert torch.equal(mixed[drawn[0]].images([3]), rooms[drawn[0]].images([3]))
+    assert_equal(mixed[drawn[0]].images([3]), rooms[drawn[0]].images([3]))
 
 
 def test_what_is_drawn_is_spread(scenes):

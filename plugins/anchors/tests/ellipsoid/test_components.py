@@ -16,6 +16,7 @@ from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS
 from refusals import wrong_refusals
 from small_parts import made, shaken
+from tables import assert_equal
 from torch.testing import assert_close
 
 from qgs import compose
@@ -61,7 +62,7 @@ def test_queries_give_what_they_learned_in_the_form_that_they_promise():
     assert decaying == ["features", "center", "raw_radii"]
     state = shaken(queries, 1.0).start(2)
     assert_close(state[ROTATION][1], F.normalize(queries.rotation, dim=-1))
-    assert torch.equal(state[CENTER][1], queries.center)
+    assert_equal(state[CENTER][1], queries.center)
     axes = quat_to_matrix(state[ROTATION]) * (F.softplus(state[RAW_RADII]) + 0.05)[:, :, None]
     assert_close(queries.support(state).axes, axes)
 
@@ -110,7 +111,7 @@ def test_gaussians_turn_and_grow_with_their_anchor():
     radii = F.softplus(state[RAW_RADII])
     assert_close(placed.scales, local.scales * radii_along(radii, local.quats))
     for name in ("offsets", "opacities", "colors"):
-        assert torch.equal(getattr(placed, name), getattr(local, name))
+        assert_equal(getattr(placed, name), getattr(local, name))
 
 
 REFUSED = """
@@ -183,7 +184,7 @@ def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined, bound):
         seen = ours.layers[number]
         assert_close(_shared(seen), _shared(expected))
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(2, 40, 4)
-        assert torch.equal(seen.state[ROTATION], identity)
+        assert_equal(seen.state[ROTATION], identity)
     moved = theirs.state[CENTER] - models[0].queries.center
     assert moved.abs().max() > 0.01, "the anchors must move for this to say anything"
 

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from qgs_photos.datasets.chunk_files import load_chunk
 from qgs_photos.datasets.chunks import ChunksSource
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from upath import UPath
 
 
@@ -142,7 +142,7 @@ def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
     assert len(data) < 3000
     source, scene = pickle.loads(data)  # noqa: S301
     for copy in (scene, source.scenes("train")[0]):
-        assert torch.equal(copy.images([1]), before)
+        assert_equal(copy.images([1]), before)
 
 
 def test_masks_names_sizes_and_backgrounds(tmp_path):
@@ -157,7 +157,7 @@ def test_masks_names_sizes_and_backgrounds(tmp_path):
     scene = first(tmp_path, background=(0.2, 0.4, 0.6))
     masks = scene.masks([0, 1])
     assert masks[0, 0, [0, 15], 3].tolist() == [0, 1]
-    assert torch.equal(masks[1], torch.ones(1, 16, 16))
+    assert_equal(masks[1], torch.ones(1, 16, 16))
     assert scene.frame_name(0) == "a/0.jpg"
     assert scene.cameras.intrinsics[1].tolist() == pytest.approx([8, 14.4, 7.2, 8.8])
     assert scene.images([0])[0, :, 0, 0].tolist() == pytest.approx([0.2, 0.4, 0.6])

@@ -10,7 +10,7 @@ import pytest
 import torch
 from photo_formats import row_of_frames
 from qgs_photos.datasets.dl3dv import Dl3dvSource, read_scene_list
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from upath import UPath
 
 
@@ -75,7 +75,7 @@ def is_read_as_written(root):
     assert len(scene) == 4
     opengl = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
     opengl[0, 3] = 2
-    assert torch.equal(scene.cameras.c2w[2], opengl)
+    assert_equal(scene.cameras.c2w[2], opengl)
     # an eighth of the listed 128 x 72, whatever the size of the photos
     assert scene.cameras.intrinsics[0].tolist() == pytest.approx([12.5, 12.625, 7.5, 4.625])
     assert scene.images([3, 1])[:, 0, 4, 4].mul(255).round().tolist() == [30, 10]
@@ -171,8 +171,8 @@ def test_other_processes_and_threads_read_one_archive(tmp_path):
     first = scene(tmp_path)
     before = first.images([1])
     other, first = pickle.loads(pickle.dumps((source, first)))  # noqa: S301
-    assert torch.equal(first.images([1]), before)
-    assert torch.equal(other.scenes("train")[0].images([1]), before)
+    assert_equal(first.images([1]), before)
+    assert_equal(other.scenes("train")[0].images([1]), before)
     scenes = source.scenes("train")
     with ThreadPoolExecutor(4) as threads:
         red = list(threads.map(lambda k: scenes[k % 4].images([k % 3])[0, 0, 0, 0], range(24)))

@@ -18,7 +18,7 @@ from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
 from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from textured_room import INTRINSICS, SIZE, walk
 
 from qgs.containers import map_tensors
@@ -105,8 +105,8 @@ def test_photos_that_are_not_optimised_on_are_met_better(scene):
     before = start.means.clone()
     result, again = (refine(start, views, 100) for _ in range(2))
     refined = result.gaussians
-    assert torch.equal(refined.means, again.gaussians.means)
-    assert torch.equal(start.means, before)
+    assert_equal(refined.means, again.gaussians.means)
+    assert_equal(start.means, before)
     assert result.steps == 100  # the first, in which kernels compile, is not counted; the sweep is
     assert mean_psnr(refined, compared) > mean_psnr(start, compared) + 6
     assert not refined.means.requires_grad
@@ -148,7 +148,7 @@ def test_a_coarser_level_shows_the_same_scene():
     given = replace(fine, masks=masks, times=torch.rand(1, 3), target_time=torch.rand(1, 1))
     coarse = resized(given, 2)
     assert coarse.images.shape[-2:] == (32, 32)
-    assert torch.equal(coarse.masks, coarse.images[:, :, :1])
+    assert_equal(coarse.masks, coarse.images[:, :, :1])
     assert coarse.times is given.times
     assert coarse.target_time is given.target_time
     assert mean_psnr(cloud(20), coarse) > 32
@@ -175,7 +175,7 @@ def test_colors_beside_harmonics_may_have_any_value():
     colors = torch.linspace(-0.7, 1.6, 60).reshape(1, 20, 3)
     given = free(replace(cloud(20), colors=colors, sh=torch.zeros(1, 20, 3, 3)))
     given.grow(24, generator())
-    assert torch.equal(given.gaussians().colors[:, :20], colors)
+    assert_equal(given.gaussians().colors[:, :20], colors)
     learn(given, "colors")
     assert (given.gaussians().colors[:, :20] < colors).all()
 
@@ -207,7 +207,7 @@ def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay():
     def found(seconds, poses):
         return refined(posed(wrong), seconds, poses=poses).cameras.c2w
 
-    assert torch.equal(found(3, poses=False), wrong)
+    assert_equal(found(3, poses=False), wrong)
     better = found(200, poses=True)
     before, after = (mean_psnr(cloud(60), posed(c2w).select([2])) for c2w in (wrong, better))
     assert after > before + 3
@@ -251,7 +251,7 @@ def test_what_masks_leave_out_is_black():
     masks = torch.zeros(1, 2, 1, 24, 24)
     masks[..., :12] = 1
     found = masked(replace(views, masks=masks)).images
-    assert torch.equal(found[..., :12], views.images[..., :12])
+    assert_equal(found[..., :12], views.images[..., :12])
     assert not found[..., 12:].any()
     must_refuse("--masks", masked, views)
 
@@ -260,7 +260,7 @@ def test_surroundings_hide_what_is_behind_them():
     views = photos(2)
     color = edge_color(views)
     found = surrounded(coloured(), views, color)
-    assert torch.equal(found.means[:, -60:], cloud(60).means)
+    assert_equal(found.means[:, -60:], cloud(60).means)
     black, white = (
         AutoRenderer(AutoRenderer.Config(background=(b, b, b), far=1e4))(found, views.cameras)
         for b in (0, 1)

@@ -58,7 +58,7 @@ def test_an_imported_checkpoint_is_like_any_other(tmp_path):
     imported(tmp_path, LOCUS)
     path = tmp_path / "made.safetensors"
     model = qgs.load(path)
-    assert torch.equal(model.queries.get_parameter("center"), LOCUS["gs_anchor_xyz_raw"])
+    assert_equal(model.queries.get_parameter("center"), LOCUS["gs_anchor_xyz_raw"])
     assert CheckpointFile(path).extra == {"imported": "LocusGS weights w.safetensors"}
     text = path.with_suffix(".yaml").read_text()
     assert model.recipe == resolve(path.with_suffix(".yaml")).tree
@@ -129,7 +129,7 @@ def test_other_precisions_are_converted_and_told(tmp_path):
         out = tmp_path / f"made_{kind}/x.safetensors"
         words = ("import", tmp_path / f"{kind}.safetensors", "--recipe", "auto", "--out", out)
         assert f"converted to float32: 109 of 109 are {kind}" in run_qgs(*words).output
-        assert torch.equal(load_file(out)["queries.center"], weights["gs_anchor_xyz_raw"].float())
+        assert_equal(load_file(out)["queries.center"], weights["gs_anchor_xyz_raw"].float())
 
 
 def test_parameters_that_share_memory_or_lie_in_strides(tmp_path):

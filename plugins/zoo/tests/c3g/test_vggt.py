@@ -65,11 +65,11 @@ def test_it_gives_the_patch_tokens_of_the_last_layer(weights):
         made = encoder(weights, **told)
         memory = made(given)
         expected = made.aggregator(images)[0][-1][:, :, 5:]
-        assert torch.equal(memory.features, expected.flatten(1, 2))
+        assert_equal(memory.features, expected.flatten(1, 2))
         assert memory.grid == (3, 2, 3)
         assert memory.keys is memory.values is memory.patch_rays is None
         blind = given.replace(cameras=given.cameras.replace(c2w=given.cameras.c2w + 1))
-        assert torch.equal(made(blind).features, memory.features)
+        assert_equal(made(blind).features, memory.features)
 
 
 def test_a_model_of_another_width_has_a_linear_layer(weights):
@@ -119,7 +119,7 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
     weights.unlink()
     loaded = qgs.load(tmp_path / "checkpoint.safetensors")
     given = odd_views(3, 28, 42)
-    assert torch.equal(loaded(given).gaussians.means, model(given).gaussians.means)
+    assert_equal(loaded(given).gaussians.means, model(given).gaussians.means)
     must_refuse("cannot read weights", recipe.build_model, kind=MissingExtraError)
 
 

@@ -8,6 +8,7 @@ from odd_views import odd_views
 from qgs_zoo.globalsplat.encoder import PosedPatches
 from qgs_zoo.globalsplat.streams import TEXTURE, Round, SlotQueries
 from small_parts import DIMS, attended, made, shaken
+from tables import assert_equal
 from torch.nn.functional import gelu
 from torch.testing import assert_close
 
@@ -22,7 +23,7 @@ def test_a_token_is_its_colours_beside_its_rays_and_its_camera():
     memory = encoder(given)
     assert memory.features.shape == (2, 2 * 4 * 6 + 4, 11)
     assert memory.grid is memory.keys is memory.patch_rays is None
-    assert torch.equal(memory.features[0, -4:], encoder.registers)
+    assert_equal(memory.features[0, -4:], encoder.registers)
     # scene 1, view 1, row 2, column 3
     token = memory.features[1, 24 + 2 * 6 + 3]
     patch = (1, 1, slice(None), slice(8, 12), slice(12, 16))
@@ -43,7 +44,7 @@ def test_two_streams_of_one_token():
     tokens = torch.cat([queries.slots, queries.extra])
     for stream, seen in ((queries.geometry, state.features), (queries.texture, state[TEXTURE])):
         assert_close(seen, stream(tokens).expand(3, -1, -1))
-    assert torch.equal(state.mask, torch.arange(400).expand(3, -1) < 396)
+    assert_equal(state.mask, torch.arange(400).expand(3, -1) < 396)
     assert made(SlotQueries, count=4, extra=0).start(2).mask is None
 
 

@@ -8,7 +8,7 @@ import torch
 from qgs_zoo.lpips import Lpips, LpipsLoss
 from refusals import refused
 from safetensors.torch import load_file, save_file
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from torch import nn
 from torch.testing import assert_close
 
@@ -89,15 +89,15 @@ def test_lpips_is_the_published_formula(vgg, package):
         values = lpips.distance(image, truth)
         assert values.shape == (2, 2)
         assert float(values[1, 0]) == pytest.approx(expected, rel=1e-5)
-        assert torch.equal(lpips.distance(truth, truth), torch.zeros(2, 2))
-        assert torch.equal(lpips.distance(image[0, :1], truth[0, :1]), values[0, :1])
+        assert_equal(lpips.distance(truth, truth), torch.zeros(2, 2))
+        assert_equal(lpips.distance(image[0, :1], truth[0, :1]), values[0, :1])
         assert not any(parameter.requires_grad for parameter in lpips.parameters())
 
 
 def test_images_are_clipped_and_small_ones_refused(vgg):
     lpips = lpips_of(vgg).distance
     image, truth = torch.rand(2, 1, 3, 16, 16)
-    assert torch.equal(lpips(image * 3 - 1, truth), lpips((image * 3 - 1).clamp(0, 1), truth))
+    assert_equal(lpips(image * 3 - 1, truth), lpips((image * 3 - 1).clamp(0, 1), truth))
     must_refuse(
         "at least 16 pixels a side, got 15x16", lpips, image[..., :15, :], truth[..., :15, :]
     )
