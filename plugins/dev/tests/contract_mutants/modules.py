@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import torch
 from contract_mutants.mutant import mutant
-from contract_mutants.slots import ChangedEncoder, Loss
+from contract_mutants.slots import ChangedEncoder, ChangedSquares
 from contract_mutants.spatial import AtPlaces, Extended, PlacesByALayer
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
-from torch import nn
+from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig
 from qgs.losses import Opacity
@@ -192,7 +192,7 @@ class ClampsItsInputInPlace(FreeCenters):
 @mutant("forward_keeps_no_state", "_cache: changed by")
 class CachesByShape(ExtendedMlp):
     def add(self, dims):
-        self._cache: dict[tuple[int, ...], torch.Tensor] = {}
+        self._cache: dict[tuple[int, ...], Tensor] = {}
 
     def forward(self, features):
         zeros = self._cache.setdefault(tuple(features.shape), torch.zeros_like(features))
@@ -206,7 +206,7 @@ class ScalesByItsFirstInput(ExtendedMlp):
     def add(self, dims):
         kept: list[float] = []
 
-        def first(x: torch.Tensor) -> float:
+        def first(x: Tensor) -> float:
             if not kept and x.device.type != "meta":
                 kept.append(x.detach().mean().item())
             return kept[0] if kept else 0.0
@@ -232,11 +232,9 @@ class DetachesTheImages(ContentCrossAttention):
 
 
 @mutant("terms_have_gradients", "no gradient comes from this term")
-class DetachedLoss(Loss):
-    renderings = "each"
-
-    def term(self, prediction, rendering, target, inputs):
-        return (rendering.rgb.detach() - target.images.detach()).square().mean()
+class DetachedLoss(ChangedSquares):
+    def mean(self, error: Tensor) -> Tensor:
+        return error.detach().mean()
 
 
 @mutant("coincident_queries_stay_finite", "with coincident queries")

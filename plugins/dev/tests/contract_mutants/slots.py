@@ -120,20 +120,25 @@ class HoldsOutTooMuch(DrawsItsImages):
         return [scene]
 
 
-@mutant("loss_is_a_mean_over_scenes", "compared with the mean over scenes")
-class SumsOverScenes(Loss):
+class ChangedSquares(Loss):
+    """A squared error (B, V, 3, H, W), of which mutants take a wrong mean."""
+
     renderings = "each"
 
     def term(self, prediction, rendering, target, inputs):
-        return (rendering.rgb - target.images).square().mean((1, 2, 3, 4)).sum()
+        return self.mean((rendering.rgb - target.images).square())
+
+
+@mutant("loss_is_a_mean_over_scenes", "compared with the mean over scenes")
+class SumsOverScenes(ChangedSquares):
+    def mean(self, error: Tensor) -> Tensor:
+        return error.mean((1, 2, 3, 4)).sum()
 
 
 @mutant("renderings_as_declared", "compared with the mean over views")
-class TakesTheWorstView(Loss):
-    renderings = "each"
-
-    def term(self, prediction, rendering, target, inputs):
-        return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
+class TakesTheWorstView(ChangedSquares):
+    def mean(self, error: Tensor) -> Tensor:
+        return error.mean((2, 3, 4)).amax(1).mean()
 
 
 @mutant("metric_gives_its_columns", "its values are ['', 'lost'], its columns are ['']")

@@ -180,8 +180,7 @@ class ExplainsNoBias(BiasesInHalf):
         apart = state["place.center"][:, :, None] - memory.patch_rays[:, None, :, 3:]
         return -apart.square().sum(-1)
 
-    def explain(self, state, memory, queries):
-        return self.core.explain(state.features, memory.keys, queries)
+    explain = ContentCrossAttention.explain
 
 
 @mutant("forward_keeps_no_state", "in training changes a parameter or buffer")
