@@ -1,8 +1,7 @@
 """`qgs` as a user types it, a model of one layer, and overrides that make recipes small."""
 
-import json
-
 import yaml
+from tables import read_json
 from typer.testing import CliRunner
 
 import qgs
@@ -50,7 +49,7 @@ def saved(file, kind, **data):
 
 def record_of(folder):
     """What `qgs reconstruct` and `qgs refine` say of a result."""
-    return json.loads((folder / "cameras.json").read_text())
+    return read_json(folder / "cameras.json")
 
 
 def sets(*overrides):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from tables import write_json
 
 from qgs.data import PhotosSource
 
@@ -128,7 +129,7 @@ def write_blender(folder, photos, train, val=0, times=()):
     for part, frames in parts.items():
         if frames:
             content = {"camera_angle_x": angle, "frames": frames}
-            (folder / f"transforms_{part}.json").write_text(json.dumps(content))
+            write_json(folder / f"transforms_{part}.json", content)
     return folder
 
 
@@ -187,5 +188,5 @@ def noisy_photos(folder, count=7, step=0.1):
         pixels = random.integers(0, 256, (20, 24, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(folder / f"images/{index}.png")
     camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
-    (folder / "transforms.json").write_text(json.dumps(row_of_frames(count, step=step, **camera)))
+    write_json(folder / "transforms.json", row_of_frames(count, step=step, **camera))
     return folder

@@ -1,5 +1,6 @@
-"""What tests demand in one line: a refusal, the same bits, files as they were; tables as rows."""
+"""What tests demand in one line: a refusal, the same bits, files as they were; tables, JSON."""
 
+import json
 from functools import partial
 from pathlib import Path
 
@@ -25,3 +26,12 @@ def contents(folder):
     """Path to bytes and time of change of every file."""
     files = filter(Path.is_file, folder.rglob("*"))
     return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+
+
+def read_json(path):
+    """The content of a JSON file."""
+    return json.loads(path.read_text())
+
+
+def write_json(path, content):
+    path.write_text(json.dumps(content))

@@ -1,7 +1,6 @@
 """`qgs eval` as a user types it: indices, tuning, other weights, other settings, remarks."""
 
 import csv
-import json
 import shutil
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from commands import MODEL, done, run_qgs
 from photo_formats import noisy_photos
 from PIL import Image
-from tables import contents, must_refuse
+from tables import contents, must_refuse, read_json, write_json
 from training_runs import resume
 
 import qgs
@@ -19,7 +18,7 @@ from qgs.recipe import resolve
 
 
 def summary(folder):
-    return json.loads((folder / "summary.json").read_text())
+    return read_json(folder / "summary.json")
 
 
 @pytest.fixture
@@ -34,15 +33,15 @@ def test_an_index_becomes_a_protocol_and_strict_evaluations_that_lack_a_scene_fa
     index = tmp_path / "two: rooms.json"
     out = tmp_path / "out"
     entry = {"context": [0, 3], "target": [1, 2]}
-    index.write_text(json.dumps({"test/000001": entry, "absent": entry}))
+    write_json(index, {"test/000001": entry, "absent": entry})
     words = ("eval", trained[1], "--index", index, "--out", out)
     done(*words)
     assert summary(out)["protocol"]["name"] == "two: rooms"
-    content = json.loads((out / "protocol.json").read_text())
+    content = read_json(out / "protocol.json")
     assert content["views"]["index"].keys() == {"test/000001", "absent"}
     assert str(tmp_path) not in (out / "summary.json").read_text()
     assert run_qgs(*words, "--strict").exit_code == 1
-    index.write_text(json.dumps({"test/000001": entry}))
+    write_json(index, {"test/000001": entry})
     done(*words, "--strict")
 
 

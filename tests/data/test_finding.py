@@ -1,11 +1,10 @@
 """Photos that lie elsewhere, or are called otherwise, than their listing says."""
 
-import json
-
 import pytest
 from photo_formats import row_of_frames
 from photo_formats import scene as read
 from PIL import Image
+from tables import write_json
 
 from qgs.wording import warn_once
 
@@ -56,7 +55,7 @@ def spoon(tmp_path):
         for number, frame in enumerate(content["frames"]):
             frame["file_path"] = listed.replace("N", str(number))
             frame.update({key: text.replace("N", str(number)) for key, text in more.items()})
-        (folder / "transforms.json").write_text(json.dumps(content))
+        write_json(folder / "transforms.json", content)
         return folder
 
     return made

@@ -1,12 +1,10 @@
 """Evaluation indices: what is read, what is refused, which samples they name."""
 
-import json
-
 import pytest
 import torch
 from line_scenes import Line, Lines, plan_of, samples_of
 from photo_formats import opened, synthetic, write_nerfstudio
-from tables import must_refuse, rows
+from tables import must_refuse, rows, write_json
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.evaluate.plan import read_index
@@ -39,7 +37,7 @@ def entry(context, target):
 def indexed(folder, index, **options):
     """Settings of an evaluation on the views of an index."""
     file = folder / "index.json"
-    file.write_text(json.dumps(index))
+    write_json(file, index)
     return EvaluationConfig(index=str(file), **options)
 
 

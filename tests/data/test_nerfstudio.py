@@ -1,6 +1,5 @@
 """nerfstudio's masks, depth maps, splits and scaled copies."""
 
-import json
 import re
 
 import numpy as np
@@ -10,7 +9,7 @@ import yaml
 from photo_formats import scene as read
 from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
-from tables import assert_equal, must_refuse
+from tables import assert_equal, must_refuse, read_json, write_json
 
 from qgs.data.photos.nerfstudio import image_name
 
@@ -22,9 +21,9 @@ def folder(tmp_path):
 
 def change(folder, frame=None, **values):
     file = folder / "transforms.json"
-    content = json.loads(file.read_text())
+    content = read_json(file)
     (content if frame is None else content["frames"][frame]).update(values)
-    file.write_text(json.dumps(content))
+    write_json(file, content)
 
 
 def test_masks_are_read_at_the_delivered_size(folder):
@@ -147,7 +146,7 @@ def test_a_matrix_of_intrinsics_and_numbers_as_text_are_read(folder):
 
 def test_a_scale_of_rotations_is_divided_out_and_a_stray_camera_left_out(folder, caplog):
     expected = read(folder).cameras.c2w
-    scaled = json.loads((folder / "transforms.json").read_text())["frames"]
+    scaled = read_json(folder / "transforms.json")["frames"]
     for number, frame in enumerate(scaled):
         pose = np.array(frame["transform_matrix"])
         pose[:3, :3] *= 2.5

@@ -6,7 +6,7 @@ import photo_formats
 import pytest
 from photo_formats import row_of_frames
 from PIL import Image
-from tables import must_refuse
+from tables import must_refuse, write_json
 
 GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
 
@@ -18,7 +18,7 @@ def folder(path, count=10, size=(64, 48), frame=None, **top):
         Image.new("RGB", size, (10 * i, 50, 200)).save(path / f"images/{i}.png")
     content = row_of_frames(count, **GLOBAL | top)
     content["frames"][1].update(frame or {})
-    (path / "transforms.json").write_text(json.dumps(content))
+    write_json(path / "transforms.json", content)
     return path
 
 

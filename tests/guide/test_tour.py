@@ -5,6 +5,7 @@ import re
 
 import pytest
 from guide_pages import DOCS
+from tables import read_json
 
 FILE = DOCS / "tour.ipynb"
 
@@ -27,7 +28,7 @@ def test_what_the_notebook_shows_is_stored():
 @pytest.mark.slow
 def test_the_notebook_runs():
     names = {"display": print}
-    for cell in json.loads(FILE.read_text())["cells"]:
+    for cell in read_json(FILE)["cells"]:
         if cell["cell_type"] == "code":
             exec("".join(cell["source"]), names)
     assert names["done"].steps > 1

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from qgs_dev import CaseRun, runs_of
 from qgs_dev.running import without_case
+from tables import read_json
 
 from qgs.recipe.registry import load_plugin
 
-PINNED = json.loads((Path(__file__).parent / "state_dicts.json").read_text())
+PINNED = read_json(Path(__file__).parent / "state_dicts.json")
 """Plugin -> label of a case -> name -> shape of a weight, so that saved weights stay loadable."""
 
 WITHOUT_CASE = {"vggt_features"}

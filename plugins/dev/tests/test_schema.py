@@ -8,6 +8,7 @@ import pytest
 import yaml
 from commands import done
 from qgs_dev.schema import recipe_schema
+from tables import read_json
 
 from qgs.recipe.registry import load_registry
 
@@ -51,7 +52,7 @@ def schema():
 
 
 def test_the_committed_schema_is_fresh_and_a_schema(schema):
-    assert json.loads(COMMITTED.read_text()) == schema, f"run `qgs schema --out {COMMITTED.name}`"
+    assert read_json(COMMITTED) == schema, f"run `qgs schema --out {COMMITTED.name}`"
     jsonschema.Draft202012Validator.check_schema(schema)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from photo_formats import copied, scene, synthetic
-from tables import must_refuse
+from tables import must_refuse, write_json
 from torch.testing import assert_close
 
 from qgs.data.photos import formats_of
@@ -74,7 +74,7 @@ def test_what_is_read(tmp_path, photos, caplog):
     for form, content in forms(names, photos.c2w).items():
         folder = tmp_path / form
         copied(photos, folder / ("images" if "images" in form else ""))
-        (folder / "cameras.json").write_text(json.dumps(content))
+        write_json(folder / "cameras.json", content)
         caplog.clear()
         read = scene(folder)
         assert_close(read.cameras.c2w, torch.from_numpy(photos.c2w))
@@ -98,7 +98,7 @@ def test_what_is_refused_names_the_file(photos, file):
         rows({"image": names, "extrinsics": c2w}, K=K),
         rows({"image": names, "location": c2w}, K=K),
     ):
-        file.write_text(json.dumps(content))
+        write_json(file, content)
         must_refuse(r"cameras\.json", scene, file.parent, format="cameras")
 
 
@@ -106,13 +106,13 @@ def test_four_numbers_a_camera_are_those_of_each(photos, file):
     for count in (5, 4, 3):
         sorted(file.parent.glob("*.png"))[count].unlink()
         lenses = [[50.0 + i, 51.0, 16.0, 12.0] for i in range(count)]
-        file.write_text(json.dumps({"K": lenses, "c2w": photos.c2w[:count].tolist()}))
+        write_json(file, {"K": lenses, "c2w": photos.c2w[:count].tolist()})
         assert scene(file.parent).cameras.intrinsics.tolist() == lenses
 
 
 def test_no_more_of_a_listing_is_read_than_tells_what_it_is(photos, file):
     c2w = photos.c2w.tolist()
-    file.write_text(json.dumps({"c2w": c2w, "more": "x" * 200_000, "K": K}))
+    write_json(file, {"c2w": c2w, "more": "x" * 200_000, "K": K})
     assert formats_of(file.parent) == ["cameras"]
     with file.open("w") as opened:
         opened.write(json.dumps(rows({"c2w": c2w}, K=K)))
@@ -121,7 +121,7 @@ def test_no_more_of_a_listing_is_read_than_tells_what_it_is(photos, file):
 
 
 def test_a_file_of_that_name_without_poses_is_named_where_photos_lie_beside_it(file):
-    file.write_text(json.dumps([{"id": 0, "position": [0, 0, 0]}] * 6))
+    write_json(file, [{"id": 0, "position": [0, 0, 0]}] * 6)
     must_refuse(r"cameras\.json", scene, file.parent)
     for photo in file.parent.glob("*.png"):
         photo.unlink()

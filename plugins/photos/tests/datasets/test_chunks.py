@@ -1,4 +1,3 @@
-import json
 import math
 import os
 import pickle  # noqa: TID251  as multiprocessing does
@@ -12,7 +11,7 @@ import torch
 from PIL import Image
 from qgs_photos.datasets.chunk_files import load_chunk
 from qgs_photos.datasets.chunks import ChunksSource
-from tables import assert_equal, must_refuse
+from tables import assert_equal, must_refuse, write_json
 from upath import UPath
 
 
@@ -52,7 +51,7 @@ def write(folder, index=True, **chunks):
             torch.save(records, file)
         keys |= {entry["key"]: f"{name}.torch" for entry in records if index}
     if index:
-        (folder / "index.json").write_text(json.dumps(keys))
+        write_json(folder / "index.json", keys)
 
 
 def data_set(path):
@@ -231,7 +230,7 @@ def test_an_index_does_not_lead_outside(tmp_path):
     data_set(tmp_path)
     outside = ("../test/a.torch", str(tmp_path / "test/a.torch"), "c:\\a.torch", "a/../../b", "")
     for name in (*outside, "\\a", "a\\..\\..\\b", "C:a"):
-        (tmp_path / "train/index.json").write_text(json.dumps({"s0": name}))
+        write_json(tmp_path / "train/index.json", {"s0": name})
         must_refuse("outside the folder", opened, tmp_path)
     (tmp_path / "train/index.json").write_text("[1]")
     must_refuse("must map each scene's key", opened, tmp_path)

@@ -1,6 +1,5 @@
 """Lenses of nerfstudio's listings, and photos without their distortion."""
 
-import json
 import math
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 from photo_formats import row_of_frames, scene
 from PIL import Image
 from qgs_photos.datasets.lenses import bending
+from tables import write_json
 
 from qgs.data.photos.nerfstudio import read_transforms
 from qgs.paths import opened_path
@@ -23,7 +23,7 @@ def folder(path, cameras=({},), **top):
         frame.update(own)
     for i in range(3):
         Image.new("RGB", (64, 48), (10 * i, 50, 200)).save(path / f"images/{i}.png")
-    (path / "transforms.json").write_text(json.dumps(content))
+    write_json(path / "transforms.json", content)
     return path
 
 

@@ -1,7 +1,6 @@
 """Kinds of image files: read to known pixels or refused, in reading as in `qgs data check`."""
 
 import io
-import json
 import re
 
 import av
@@ -10,7 +9,7 @@ import pytest
 from photo_formats import encoded, row_of_frames, scene
 from PIL import Image
 from qgs_photos.datatools.check import Options, check
-from tables import must_refuse
+from tables import must_refuse, write_json
 from upath import UPath
 
 SIZE = (4, 6)
@@ -30,7 +29,7 @@ def photos(folder, files, key="file_path"):
         (folder / frame["file_path"]).write_bytes(encoded(RGB))
         (folder / name).write_bytes(data)
         frame[key] = name
-    (folder / "transforms.json").write_text(json.dumps(listing))
+    write_json(folder / "transforms.json", listing)
     return scene(folder, SIZE), check(UPath(folder), Options(geometry=0)).findings
 
 

@@ -1,7 +1,6 @@
 """Chunks read as their source does, however they were packed and interrupted."""
 
 import io
-import json
 from functools import partial
 
 import numpy as np
@@ -13,7 +12,7 @@ from photo_formats import row_of_frames
 from PIL import Image
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools import packing
-from tables import must_refuse
+from tables import must_refuse, write_json
 from torch.testing import assert_close
 from upath import UPath
 
@@ -58,7 +57,7 @@ def photos(path, frames=4, suffix="png", convert="RGB", mask=False, times=None, 
             noise(100 + i, "L").save(path / entry["mask_path"])
         if times:
             entry["time"] = times[i]
-    (path / "transforms.json").write_text(json.dumps(listing))
+    write_json(path / "transforms.json", listing)
 
 
 source = partial(photo_formats.opened, size=SIZE, holdout=3)

@@ -1,6 +1,5 @@
 """Poses of a textured room, and photos without cameras wherever a command takes photos."""
 
-import json
 import re
 import shutil
 import time
@@ -15,7 +14,7 @@ from qgs_photos.poses import door, making
 from qgs_photos.poses.making import Options, make_poses
 from qgs_photos.poses.photos import PosesError
 from qgs_photos.poses.worker import likely
-from tables import must_refuse
+from tables import must_refuse, read_json
 from upath import UPath
 from walked import PHOTOS, QUIET, SCALE, write_photos, write_video
 
@@ -39,7 +38,7 @@ def assert_close(folder, shots):
 
 
 def record_in(folder):
-    return json.loads((folder / "poses.json").read_text())
+    return read_json(folder / "poses.json")
 
 
 def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):

@@ -1,6 +1,5 @@
 """Camera paths, what they are filmed of, and the files that come of it."""
 
-import json
 import math
 
 import av
@@ -12,7 +11,7 @@ from photo_formats import noisy_photos, row_of_frames
 from PIL import Image, ImageSequence
 from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, seen_depth, write_film
 from qgs_photos.poses.paths import path_of, read_path, walk
-from tables import must_refuse
+from tables import must_refuse, write_json
 from training_runs import tiny
 from walk import pinhole
 from walked import frames
@@ -172,7 +171,7 @@ def test_a_film_shows_what_the_reconstruction_renders_of_the_photos_world(tmp_pa
     listed = row_of_frames(2, 0.2, fl_x=20, w=24, h=20)
     for frame in listed["frames"]:
         frame["transform_matrix"][2][3] = -0.38
-    path.write_text(json.dumps(listed))
+    write_json(path, listed)
     film = tmp_path / "film.mp4"
     made = tmp_path / "made"
     done("reconstruct", checkpoint, photos, "--out", made, "--inputs", 2, "--scale", 2)

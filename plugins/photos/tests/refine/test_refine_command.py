@@ -1,12 +1,12 @@
 """`qgs refine` on what `qgs reconstruct` wrote: photos that are used, files, what is refused."""
 
-import json
 import shutil
 
 import pytest
 from commands import done, record_of, run_qgs, saved
 from photo_formats import noisy_photos
 from plyfile import PlyData
+from tables import read_json, write_json
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
 
@@ -87,12 +87,12 @@ def test_an_earlier_result_stays_and_a_single_file_is_written(reconstruction, ph
 
 def test_what_makes_no_sense_is_refused_in_a_sentence(reconstruction, photos, tmp_path):
     moved = shutil.copytree(photos, tmp_path / "moved")
-    listing = json.loads((moved / "transforms.json").read_text())
+    listing = read_json(moved / "transforms.json")
     listing["frames"][2]["transform_matrix"][0][3] += 0.05
-    (moved / "transforms.json").write_text(json.dumps(listing))
+    write_json(moved / "transforms.json", listing)
     by_hand = shutil.copytree(reconstruction, tmp_path / "by hand")
     damaged = shutil.copytree(reconstruction, tmp_path / "damaged")
-    (by_hand / "cameras.json").write_text(json.dumps({**record_of(by_hand), "model": ""}))
+    write_json(by_hand / "cameras.json", {**record_of(by_hand), "model": ""})
     (damaged / "cameras.json").write_text("{}")
     out = tmp_path / "out"
     for source, given, options, message in (

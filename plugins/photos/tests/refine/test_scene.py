@@ -1,7 +1,6 @@
 """`qgs scene` on a tiny folder: its files, what it chooses, and the points that it starts from."""
 
 import io
-import json
 import re
 import shutil
 import struct
@@ -30,6 +29,7 @@ from qgs_photos.refine.scene_photos import (
     sized,
 )
 from rich.console import Console
+from tables import read_json
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
 from torch.testing import assert_close
@@ -67,7 +67,7 @@ def made(command, out):
     """The output and metrics.json of a `qgs scene` that writes into `out`."""
     result = run_qgs(*f"{command} --out {out}".split())
     assert result.exception is None, result.output
-    return result.output, json.loads((out / "metrics.json").read_text())
+    return result.output, read_json(out / "metrics.json")
 
 
 def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(photos, tmp_path):

@@ -1,12 +1,12 @@
 """`qgs bench` as a user types it."""
 
-import json
 import re
 
 import yaml
 from commands import typed
 from qgs_research.bench import run
 from qgs_research.bench.work import Peak
+from tables import read_json
 
 TOKENGS = "tiny/tokengs.yaml"
 LOCUS = "tiny/locus.yaml"
@@ -24,7 +24,7 @@ def test_recipes_are_compared_with_the_first(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "peak_memory", lambda *_: Peak(2**20 * next(peaks), 2**20))
     everything = f"--step --memory --renderer --views 3 --json {tmp_path}/reports/bench.json"
     told = bench(f"{TOKENGS} {LOCUS} {GSLRM} {everything}").output
-    report = json.loads((tmp_path / "reports/bench.json").read_text())
+    report = read_json(tmp_path / "reports/bench.json")
     assert report["machine"].keys() >= {"device", "processor", "threads", "torch"}
     assert (report["overrides"], report["rounds"], report["warmup"]) == (SETTINGS, 3, 0)
     recipes = report["recipes"]

@@ -1,6 +1,5 @@
 """Paired comparisons of results, and their intervals."""
 
-import json
 from dataclasses import replace
 from itertools import product
 
@@ -11,7 +10,7 @@ from qgs_research.studies.comparison import compare, summary
 from qgs_research.studies.estimates import crossed_error, interval
 from qgs_research.studies.stored import StoredResults
 from scipy import stats
-from tables import must_refuse
+from tables import must_refuse, read_json
 
 from qgs.contracts import Column
 from qgs.evaluate.protocol import Protocol
@@ -87,9 +86,9 @@ def test_two_runs_compare_scene_by_scene(tmp_path):
     for run in runs:
         folder = run / "evaluation"
         done("eval", f"rooms/{run.name}", "--set", "evaluation.scenes=2", "--out", folder)
-        means.append(json.loads((folder / "summary.json").read_text())["model"]["psnr"])
+        means.append(read_json(folder / "summary.json")["model"]["psnr"])
     assert "95 % interval" in done("compare", *runs, "--out", tmp_path).output
-    table = json.loads((tmp_path / "comparison.json").read_text())["table"]
+    table = read_json(tmp_path / "comparison.json")["table"]
     apart = next(row["difference"] for row in table if row["variant"] == str(runs[1]))
     assert apart["mean"] == pytest.approx(means[1] - means[0])
     low, high = apart["interval"]

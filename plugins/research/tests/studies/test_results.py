@@ -1,6 +1,5 @@
 """Tables and verdicts of made-up scores, held against numbers made by hand."""
 
-import json
 import re
 import shutil
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ from qgs_research.studies.estimates import interval
 from qgs_research.studies.results import Results, answer, notes, record, study_summary, write_files
 from qgs_research.studies.runs import Plan, run_of
 from qgs_research.studies.study import read_study
+from tables import read_json, write_json
 
 STUDY = """study: 1
 variants: {full: tiny/locus.yaml, less: tiny/locus.yaml, other: tiny/locus.yaml}
@@ -48,8 +48,8 @@ def write_run(folder, values, views):
     head = "scene,input_frames,target_frames,model_psnr,nearest_input_psnr,problem"
     (folder / "scenes.csv").write_text("\n".join([head, *rows]) + "\n")
     summary = yaml.safe_load(SUMMARY) | {"scenes_in_protocol": len(values)}
-    (folder / "summary.json").write_text(json.dumps(summary))
-    (folder / "protocol.json").write_text(json.dumps({"views": {"drawn": views}}))
+    write_json(folder / "summary.json", summary)
+    write_json(folder / "protocol.json", {"views": {"drawn": views}})
 
 
 def results(folder, lead=(0, 0, 0), views=lambda variant, evaluation: evaluation, text=STUDY):
@@ -144,7 +144,7 @@ def test_one_seed_leaves_it_open_however_sure_the_scenes_are(tmp_path):
 
 def test_files_hold_the_same_numbers(plain, tmp_path):
     write_files(plain)
-    table = json.loads((tmp_path / "results.json").read_text())["table"]
+    table = read_json(tmp_path / "results.json")["table"]
     assert len(table) == 6
     text = (tmp_path / "table.md").read_text()
     for row in table:
@@ -179,7 +179,7 @@ def test_a_variant_without_the_metric_is_a_row_of_dashes(plain, tmp_path):
     row = next(row for row in table_of(found) if row[0] == "less")
     assert row[1:5] == ["–"] * 4
     write_files(found)
-    table = json.loads((tmp_path / "results.json").read_text())["table"]
+    table = read_json(tmp_path / "results.json")["table"]
     assert not any(row["variant"] == "less" and not row["evaluation"] for row in table)
 
 

@@ -13,7 +13,7 @@ from qgs_research.studies.hypotheses import parsed
 from qgs_research.studies.plan import composed, planned
 from qgs_research.studies.runs import recipe_file, run_of, write_plan
 from qgs_research.studies.study import read_study
-from tables import must_refuse
+from tables import must_refuse, read_json, write_json
 
 from qgs.contracts import OptionError
 from qgs.recipe import RecipeError, resolve
@@ -119,8 +119,8 @@ def test_a_study_that_was_moved_knows_its_runs_by_what_the_index_holds(tmp_path)
     for name in plan.evaluations:
         results = run_of(out, "flat", 0).evaluation(name)
         results.mkdir(parents=True)
-        index = json.loads((old / f"{3 if name else 2}views.json").read_text())
-        (results / "protocol.json").write_text(json.dumps({"views": {"index": index}}))
+        index = read_json(old / f"{3 if name else 2}views.json")
+        write_json(results / "protocol.json", {"views": {"index": index}})
     shutil.rmtree(old)
     study = study_with_indices(new)
     write_plan(planned(study, out))
@@ -130,7 +130,7 @@ def test_a_study_that_was_moved_knows_its_runs_by_what_the_index_holds(tmp_path)
         text = (new / file).read_text()
         index = json.loads(text)
         index.popitem()
-        (new / file).write_text(json.dumps(index))
+        write_json(new / file, index)
         must_refuse(f"{file}.*{remedy}", planned, study, out)
         (new / file).write_text(text)
 
