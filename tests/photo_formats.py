@@ -180,6 +180,20 @@ def world_to_camera(c2w):
     return w, x, y, z, *w2c[:3, 3]
 
 
+def numbered_photos(path, count=10, size=(64, 48), cameras=({},), **top):
+    """Photos whose red channel is 10 times their number; `cameras` are what the first ones have
+    of their own."""
+    (path / "images").mkdir(exist_ok=True)
+    given = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
+    content = row_of_frames(count, **given | top)
+    for frame, own in zip(content["frames"], cameras, strict=False):
+        frame.update(own)
+    for i in range(count):
+        Image.new("RGB", size, (10 * i, 50, 200)).save(path / f"images/{i}.png")
+    write_json(path / "transforms.json", content)
+    return path
+
+
 def noisy_photos(folder, count=7, step=0.1):
     """Nerfstudio photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
     (folder / "images").mkdir(parents=True)

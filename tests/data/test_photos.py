@@ -4,22 +4,14 @@ from functools import partial
 
 import photo_formats
 import pytest
-from photo_formats import row_of_frames
+from photo_formats import numbered_photos
 from PIL import Image
-from tables import must_refuse, write_json
-
-GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
+from tables import must_refuse
 
 
-def folder(path, count=10, size=(64, 48), frame=None, **top):
-    """Photos whose red channel is the frame's number; `frame` changes entries of frame 1."""
-    (path / "images").mkdir(exist_ok=True)
-    for i in range(count):
-        Image.new("RGB", size, (10 * i, 50, 200)).save(path / f"images/{i}.png")
-    content = row_of_frames(count, **GLOBAL | top)
-    content["frames"][1].update(frame or {})
-    write_json(path / "transforms.json", content)
-    return path
+def folder(path, frame=None, **options):
+    """Photos of which frame 1 has entries of its own."""
+    return numbered_photos(path, cameras=({}, frame or {}), **options)
 
 
 opened = partial(photo_formats.opened, size=(24, 24))

@@ -4,33 +4,18 @@ import math
 
 import numpy as np
 import pytest
-from photo_formats import row_of_frames, scene
+from photo_formats import numbered_photos, scene
 from PIL import Image
 from qgs_photos.datasets.lenses import bending
-from tables import write_json
 
 from qgs.data.photos.nerfstudio import read_transforms
 from qgs.paths import opened_path
-
-GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
-
-
-def folder(path, cameras=({},), **top):
-    """Three photos; `cameras` are what the first of them have of their own."""
-    (path / "images").mkdir(exist_ok=True)
-    content = row_of_frames(3, **GLOBAL | top)
-    for frame, own in zip(content["frames"], cameras, strict=False):
-        frame.update(own)
-    for i in range(3):
-        Image.new("RGB", (64, 48), (10 * i, 50, 200)).save(path / f"images/{i}.png")
-    write_json(path / "transforms.json", content)
-    return path
 
 
 def test_lenses_of_nerfstudio(tmp_path):
     fisheye = {"camera_model": "OPENCV_FISHEYE", "k3": 0.0, "k4": 0.3}
     cameras = ({}, fisheye, {"k1": 0, "p2": 0, "k3": None})
-    folder(tmp_path, cameras, k1=0.1, p2=0.01, k3=0.002)
+    numbered_photos(tmp_path, 3, cameras=cameras, k1=0.1, p2=0.01, k3=0.002)
     frames = read_transforms(opened_path(tmp_path) / "transforms.json")
     lenses = [frame.lens for frame in frames]
     plain = bending("FULL_OPENCV", {"k1": 0.1, "p2": 0.01, "k3": 0.002})
@@ -50,12 +35,12 @@ def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path):
         reach = math.ceil(30 * turn - 0.5)
         assert not image[24, 32 + reach :].any()
         assert image[24, 32 : 32 + reach].all()
-        path = folder(tmp_path, camera_model=model, k1=-0.6, **wide)
+        path = numbered_photos(tmp_path, 3, camera_model=model, k1=-0.6, **wide)
         assert (scene(path, size=(48, 64)).images([2])[0, 2] > 0).all()
 
 
 def test_black_edges_of_undistorted_photos_are_cut_off(tmp_path):
-    distorted = folder(tmp_path, k1=0.9, cx=36.0, cy=24.0)
+    distorted = numbered_photos(tmp_path, 3, k1=0.9, cx=36.0, cy=24.0)
     pixels = np.full((48, 64, 3), 255, np.uint8)
     pixels[:, :, 0] = np.arange(64) * 3 + 9
     Image.fromarray(pixels).save(tmp_path / "images/0.png")
