@@ -1,5 +1,6 @@
 """Samplers of views: gaps and inputs that follow the training, and photos in any order."""
 
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -18,14 +19,17 @@ TWO = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
 SIX = ViewsConfig(inputs=6, targets=8)
 
 
-def bounded(**options):
-    plain = {"min_gap": 6, "max_gap": 12, "initial_min_gap": 4, "initial_max_gap": 6, "margin": 1}
-    return Bounded(Bounded.Config(**(plain | {"warm_up_steps": 100} | options)))
+def made(sampler, **options):
+    return sampler(sampler.Config(**options))
 
 
-def farthest(**options):
-    plain = {"min_gap": 20, "max_gap": 50, "initial_min_gap": 15, "initial_max_gap": 30}
-    return Farthest(Farthest.Config(**(plain | {"warm_up_steps": 100} | options)))
+warming = partial(made, warm_up_steps=100)
+bounded = partial(
+    warming, Bounded, min_gap=6, max_gap=12, initial_min_gap=4, initial_max_gap=6, margin=1
+)
+farthest = partial(
+    warming, Farthest, min_gap=20, max_gap=50, initial_min_gap=15, initial_max_gap=30
+)
 
 
 def seeded(seed=0):
@@ -150,7 +154,7 @@ def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
 
 DEPTH = 10.0
 VIEWS = ViewsConfig(inputs=2, targets=3)
-SAMPLER = Overlapping(Overlapping.Config())
+SAMPLER = made(Overlapping)
 SHUFFLED = torch.randperm(40, generator=torch.Generator().manual_seed(0))
 
 
@@ -164,7 +168,7 @@ class Arc(Line):
 
 
 def draws(count, views=VIEWS, **options):
-    sampler = Overlapping(Overlapping.Config(**options))
+    sampler = made(Overlapping, **options)
     scene = Arc(40, held_out=(0, 8, 16))
     return [sampler.draw(scene, views, seeded(k), 0) for k in range(count)]
 
