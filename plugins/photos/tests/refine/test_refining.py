@@ -261,14 +261,12 @@ def test_surroundings_hide_what_is_behind_them():
     color = edge_color(views)
     found = surrounded(coloured(), views, color)
     assert_equal(found.means[:, -60:], cloud(60).means)
-    black, white = (
-        AutoRenderer(AutoRenderer.Config(background=(b, b, b), far=1e4))(found, views.cameras)
-        for b in (0, 1)
-    )
+    render = AutoRenderer(AutoRenderer.Config(far=1e4))
+    black, white = (render(found, views.cameras, torch.full((3,), level)) for level in (0.0, 1.0))
     assert black.alpha.min() > 0.99
     assert torch.allclose(black.rgb, white.rgb, 0, 0.01)
     empty = surrounded(replace(cloud(60), opacities=torch.zeros(1, 60)), views, color)
-    seen = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0), far=1e4))(empty, views.cameras)
+    seen = render(empty, views.cameras, torch.zeros(3))
     assert torch.allclose(seen.rgb[0, 0, :, 12, 12], torch.tensor(color), 0, 0.01)
 
 
