@@ -13,11 +13,8 @@ from commands import run_qgs
 from PIL import Image
 from qgs_photos.poses import making
 from qgs_photos.poses.photos import PosesError
+from tables import contents
 from walked import cut, write_photos, write_video
-
-
-def state(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
@@ -48,14 +45,14 @@ def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
         sound.setparams((1, 2, 8000, 0, "NONE", ""))
         sound.writeframes(bytes(9000))
 
-    before = state(tmp_path)
+    before = contents(tmp_path)
     wrong = {}
     for source in given.iterdir():
         error = run_qgs("poses", source, "--out", tmp_path / "out").exception
         if type(error) is not PosesError or "\n" in str(error) or (tmp_path / "out").exists():
             wrong[source.name] = error
     assert not wrong
-    assert state(tmp_path) == before
+    assert contents(tmp_path) == before
 
 
 def test_what_cannot_be_written_is_named(walk, tmp_path, monkeypatch):
