@@ -6,7 +6,6 @@ The writers share no code with the readers: they follow the descriptions of the 
 import io
 import json
 import math
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,17 +78,20 @@ def copied(photos, folder, names=None):
     """Copy the files into `folder`; the names that they have there."""
     names = names or [file.name for file in photos.files]
     for file, name in zip(photos.files, names, strict=True):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, folder / name)
+        put(folder / name, file.read_bytes())
     return names
+
+
+def put(path, content):
+    """Write a file of these bytes, and the folders that it lies in."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
 
 
 def uploaded(folder, place):
     """Copy the files in `folder` to a place of another file system."""
     for file in filter(Path.is_file, folder.rglob("*")):
-        copy = place / file.relative_to(folder).as_posix()
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        copy.write_bytes(file.read_bytes())
+        put(place / file.relative_to(folder).as_posix(), file.read_bytes())
 
 
 def opengl(c2w):

@@ -8,7 +8,7 @@ import numpy as np
 import photo_formats
 import pytest
 import torch
-from photo_formats import row_of_frames
+from photo_formats import put, row_of_frames
 from qgs_photos.datasets.dl3dv import Dl3dvSource, read_scene_list
 from tables import assert_equal, must_refuse
 from upath import UPath
@@ -36,8 +36,7 @@ def write(path, files):
     """An archive or a folder, by the suffix of `path`."""
     if path.suffix != ".zip":
         for name, data in files.items():
-            (path / name).parent.mkdir(parents=True, exist_ok=True)
-            (path / name).write_bytes(data)
+            put(path / name, data)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file, zipfile.ZipFile(file, "w") as zipped:

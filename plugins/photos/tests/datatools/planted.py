@@ -5,7 +5,7 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 import torch
-from photo_formats import encoded, opengl
+from photo_formats import encoded, opengl, put
 from qgs_photos.datatools.check import Options, check
 from textured_room import INTRINSICS, SIZE
 from upath import UPath
@@ -34,8 +34,7 @@ class Room:
             frame["transform_matrix"] = pose
         listing = json.dumps({**self.camera, "frames": self.frames})
         for name, data in {**self.files, "transforms.json": listing.encode()}.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(data)
+            put(folder / name, data)
 
 
 class Planted:
