@@ -28,6 +28,10 @@ def contents(folder):
     return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
 
 
+def names_in(folder):
+    return {path.name for path in folder.iterdir()}
+
+
 def read_json(path):
     """The content of a JSON file."""
     return json.loads(path.read_text())

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from commands import MODEL, done, sets
-from tables import contents, must_refuse
+from tables import contents, must_refuse, names_in
 
 from qgs.cli.train import with_absolute_path
 from qgs.recipe import resolve
@@ -20,7 +20,7 @@ def test_training_names_its_budgets_and_ends_with_an_evaluation(trained):
     output, run = trained
     assert re.search(r"77 s.* 2 steps", output)
     files = {"checkpoint.safetensors", "history.jsonl", "recipe.yaml", "state.safetensors"}
-    assert {path.name for path in run.iterdir()} == {"evaluation", *files}
+    assert names_in(run) == {"evaluation", *files}
 
 
 def test_a_finished_run_is_left_as_it_is(training, trained):

@@ -7,7 +7,7 @@ from unittest.mock import DEFAULT, Mock
 import pytest
 import torch
 from safetensors import SafetensorError, safe_open
-from tables import contents, must_refuse
+from tables import contents, must_refuse, names_in
 from training_runs import (
     TRAINED,
     assert_equal_runs,
@@ -174,7 +174,7 @@ def test_a_folder_in_use_is_refused_untouched(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     must_refuse("never overwrites", run, tiny("tokengs"), tmp_path, kind=FileExistsError)
     must_refuse("is a file", run, tiny("tokengs"), tmp_path / "notes.txt", kind=FileExistsError)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert names_in(tmp_path) == {"notes.txt"}
 
 
 def test_a_start_that_fails_leaves_no_folder(tmp_path):

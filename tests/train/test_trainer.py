@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 from qgs_viewer.curves import curves_of
-from tables import must_refuse
+from tables import must_refuse, names_in
 from training_runs import (
     TRAINED,
     change_samples,
@@ -63,7 +63,7 @@ def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path
         assert same(parts[name], watched[name])
     assert losses(tmp_path) == losses(folder.path)
     files = {"recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"}
-    assert {path.name for path in tmp_path.iterdir()} == files
+    assert names_in(tmp_path) == files
     start, average, last = (
         model.queries.features
         for model in (tiny("locus").build_model(), qgs.load(folder.checkpoint_ema), plain.model)
@@ -82,7 +82,7 @@ def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run
     assert [record["scores"] for record in records[2:]] == scores
     assert scores[0]["psnr"] != scores[1]["psnr"]
     pictures = folder.path / "pictures"
-    assert {path.name for path in pictures.iterdir()} == {"step-2.png", "step-3.png"}
+    assert names_in(pictures) == {"step-2.png", "step-3.png"}
     with Image.open(pictures / "step-3.png") as picture:
         assert picture.size == (56, 32)  # two rows of three, 4 apart
 

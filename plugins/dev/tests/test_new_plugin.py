@@ -12,6 +12,7 @@ import pytest
 import torch
 from commands import done, run_qgs
 from qgs_dev.new_command import check_name, rendered
+from tables import names_in
 
 from qgs.contracts import ModelDims
 from qgs.recipe.errors import Problems
@@ -43,7 +44,7 @@ def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     assert project["name"] == "qgs-far-sighted"
     assert project["entry-points"]["qgs.plugins"] == {"far-sighted": "qgs_far_sighted:plugin"}
-    assert [path.name for path in tmp_path.iterdir()] == ["qgs-far-sighted"], "nothing is left over"
+    assert names_in(tmp_path) == {"qgs-far-sighted"}, "nothing is left over"
 
 
 def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:

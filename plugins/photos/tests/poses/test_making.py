@@ -14,7 +14,7 @@ from qgs_photos.poses import door, making
 from qgs_photos.poses.making import Options, make_poses
 from qgs_photos.poses.photos import PosesError
 from qgs_photos.poses.worker import likely
-from tables import must_refuse, read_json
+from tables import must_refuse, names_in, read_json
 from upath import UPath
 from walked import PHOTOS, QUIET, SCALE, write_photos, write_video
 
@@ -54,7 +54,7 @@ def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):
     assert "a.DNG" in remark
     assert "other.png; to get more" in advice
     assert "3.tif" in record_in(folder)["source"]
-    assert {file.name for file in folder.iterdir()} == {"images", "poses.json", "sparse"}
+    assert names_in(folder) == {"images", "poses.json", "sparse"}
     # points of the model lie on the photos as they are kept, not on the copies that COLMAP saw
     size = shots[0].image.shape[:2]
     frames = read_listing(UPath(folder)).frames

@@ -29,7 +29,7 @@ from qgs_photos.refine.scene_photos import (
     sized,
 )
 from rich.console import Console
-from tables import read_json
+from tables import names_in, read_json
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
 from torch.testing import assert_close
@@ -76,7 +76,7 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     few = "--minutes 0.003 --size 32x48 --gaussians 300"
     output, record = made(f"scene {photos} {few}", out)
     names = {"scene.ply", "scene.splat", "index.html", "metrics.json", "held_out.png"}
-    assert {path.name for path in out.iterdir()} == names
+    assert names_in(out) == names
     assert [row["photo"] for row in record["held_out"]] == ["images/4.png"]
     assert record["refined_on"] == [f"images/{number}.png" for number in range(9) if number != 4]
     assert record["gaussians"] == len(PlyData.read(out / "scene.ply")["vertex"]) > 300

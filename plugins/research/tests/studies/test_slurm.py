@@ -6,7 +6,7 @@ import time
 
 import pytest
 from commands import done, run_qgs, sets
-from tables import must_refuse
+from tables import must_refuse, names_in
 
 RECIPE = "tiny/locus.yaml"
 
@@ -31,7 +31,7 @@ def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(tmp_path,
         kind=FileNotFoundError,
     )
     assert run_qgs(*words, "--out", "b", "--gpu", 2).exit_code == 2
-    assert [path.name for path in tmp_path.iterdir()] == ["my runs"]
+    assert names_in(tmp_path) == {"my runs"}
 
 
 @pytest.mark.slow
