@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from walk import pinhole
 
 from qgs.contracts import (
-    MEMORY_FIELDS,
     AttentionWeights,
     Column,
     CrossAttention,
@@ -19,6 +18,7 @@ from qgs.contracts import (
     Outcome,
     Scene,
     SceneSource,
+    memory_fields,
 )
 from qgs.metrics.images import Psnr
 from qgs.tokengs import (
@@ -227,9 +227,7 @@ class SharesItsProjection(Extended, CrossAttention):
         self.core = CrossAttentionCore(dims.width, dims.heads)
         self.kv = nn.Linear(dims.width, 2 * dims.width)
 
-    @classmethod
-    def fields_read(cls, config):
-        return {"memory.features": MEMORY_FIELDS["memory.features"]}
+    reads = memory_fields("features")
 
     def forward(self, state, memory):
         both = memory.once("mutants.kv", lambda: self.kv(memory.features))

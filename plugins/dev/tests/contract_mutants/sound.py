@@ -12,7 +12,7 @@ from contract_mutants.spatial import BiasedAttention, Extended, PlacesByALayer
 from einops import rearrange
 from torch import nn
 
-from qgs.contracts import MEMORY_FIELDS, PatchEncoder
+from qgs.contracts import PatchEncoder, memory_fields
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.tokengs import ContentCrossAttention, MlpFeedForward, MultiViewViT
 from qgs.tokengs.blocks import merge_heads
@@ -120,12 +120,7 @@ class RefusesIntrinsics(RefusesWhatItDeclares):
 class EachHeadSeesASide(BiasedAttention):
     """A bias for each head that hides what lies left, or right, of the camera's axis."""
 
-    @classmethod
-    def fields_read(cls, config):
-        return {
-            **super().fields_read(config),
-            "memory.patch_rays": MEMORY_FIELDS["memory.patch_rays"],
-        }
+    reads = memory_fields("keys", "values", "patch_rays")
 
     def bias(self, state, memory):
         side_B1M = memory.patch_rays[:, None, :, 3]

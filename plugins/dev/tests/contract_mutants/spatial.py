@@ -7,7 +7,7 @@ from contract_mutants.mutant import mutant
 from contract_mutants.renderers import ChangedRenderer
 from torch import Tensor, nn
 
-from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, Loss, Refinement
+from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, Loss, Refinement, memory_fields
 from qgs.tokengs import (
     ContentCrossAttention,
     ContentSelfAttention,
@@ -36,9 +36,7 @@ class Extended:
 class AtPlaces:
     """A component that reads centres."""
 
-    @classmethod
-    def fields_read(cls, config):
-        return PLACE
+    reads = PLACE
 
 
 class PlacesByALayer(Extended, AtPlaces, ContentSelfAttention):
@@ -56,9 +54,7 @@ class Steps(Extended, AtPlaces, Refinement):
     def add(self, dims):
         self.step = nn.Linear(dims.width, 3)
 
-    @classmethod
-    def fields_written(cls, config):
-        return PLACE
+    writes = PLACE
 
     def moved(self, center: Tensor, step: Tensor) -> dict[str, Tensor]:
         return {"place.center": center + step.to(center)}
@@ -97,9 +93,7 @@ class ReadsAnUndeclaredRendering(Loss):
 
 @mutant("declared_reads_are_used", "requires memory.features, but")
 class RequiresTooMuch(ContentCrossAttention):
-    @classmethod
-    def fields_read(cls, config):
-        return MEMORY_FIELDS
+    reads = MEMORY_FIELDS
 
 
 @mutant("writes_are_declared", "place.center: written in")
@@ -162,10 +156,7 @@ class BiasedAttention(ContentCrossAttention):
 
 @mutant(CHECK, "explain.geometry")
 class BiasesInHalf(BiasedAttention):
-    @classmethod
-    def fields_read(cls, config):
-        memory = ("memory.keys", "memory.values", "memory.patch_rays")
-        return {**PLACE, **{name: MEMORY_FIELDS[name] for name in memory}}
+    reads = PLACE | memory_fields("keys", "values", "patch_rays")
 
     def bias(self, state, memory):
         center = state["place.center"]
