@@ -4,7 +4,7 @@ import pytest
 from photo_formats import row_of_frames
 from photo_formats import scene as read
 from PIL import Image
-from tables import write_json
+from tables import must_refuse, write_json
 
 from qgs.wording import warn_once
 
@@ -78,13 +78,12 @@ def test_what_may_be_meant_by_two_names_or_none_is_refused(spoon):
     for number, line in enumerate(REFUSED.strip().splitlines()):
         told, listed, files = line.split(": ")
         folder = spoon(str(number), listed, *files.split())
-        with pytest.raises((FileNotFoundError, ValueError), match=told):
-            read(folder)
+        must_refuse(told, read, folder, kind=(FileNotFoundError, ValueError))
 
 
 def test_masks_are_found_and_are_no_photos(spoon):
     names = ("images/N.jpg", "images/N.jpg", "masks/N.png")
     scene = read(spoon("a", *names, mask_path="C:/b/Masks/N.jpg"))
     assert [photo.mask.parent.name for photo in scene.photos] == ["masks"] * 3
-    with pytest.raises(FileNotFoundError, match="masks"):
-        read(spoon("b", *names[:2], mask_path="N.png"))
+    absent = spoon("b", *names[:2], mask_path="N.png")
+    must_refuse("masks", read, absent, kind=FileNotFoundError)

@@ -63,8 +63,7 @@ def test_what_triton_cannot_compute_goes_through_blocks(chosen):
         {"learnt": True},
     ):
         assert chosen(**options) == "blocks"
-        with pytest.raises(ValueError, match="triton"):
-            chosen("triton", **options)
+        must_refuse("triton", chosen, "triton", **options)
 
 
 @torch.no_grad()

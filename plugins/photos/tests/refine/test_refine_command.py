@@ -3,10 +3,10 @@
 import shutil
 
 import pytest
-from commands import done, record_of, run_qgs, saved
+from commands import done, record_of, saved
 from photo_formats import noisy_photos
 from plyfile import PlyData
-from tables import read_json, write_json
+from tables import must_refuse, read_json, write_json
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
 
@@ -79,10 +79,10 @@ def test_photos_of_the_training_are_not_called_novel_and_those_held_out_never_re
 
 def test_an_earlier_result_stays_and_a_single_file_is_written(reconstruction, photos, tmp_path):
     file = tmp_path / "refined.ply"
-    done("refine", reconstruction, photos, "--seconds", 0.01, "--out", file)
+    words = ("refine", reconstruction, photos, "--seconds", 0.01, "--out", file)
+    done(*words)
     assert refined_in(file) == 32
-    again = run_qgs("refine", reconstruction, photos, "--seconds", 0.01, "--out", file)
-    assert isinstance(again.exception, FileExistsError)
+    must_refuse("refined.ply", done, *words, kind=FileExistsError)
 
 
 def test_what_makes_no_sense_is_refused_in_a_sentence(reconstruction, photos, tmp_path):
@@ -102,7 +102,6 @@ def test_what_makes_no_sense_is_refused_in_a_sentence(reconstruction, photos, tm
         (reconstruction, moved, ("--scene", "moved"), "or their poses have changed"),
         (reconstruction, photos, ("--seconds", 0), "--seconds must be a finite time above 0"),
     ):
-        result = run_qgs("refine", source, given, *options, "--out", out)
-        assert isinstance(result.exception, ValueError | OSError), (options, result.output)
-        assert message in str(result.exception)
+        words = ("refine", source, given, *options, "--out", out)
+        must_refuse(message, done, *words, kind=(ValueError, OSError))
         assert not out.exists()

@@ -12,7 +12,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import torch
-from commands import run_qgs
+from commands import done, run_qgs
 from photo_formats import PhotoSet, synthetic, write_colmap, write_nerfstudio
 from PIL import Image
 from plyfile import PlyData
@@ -29,7 +29,7 @@ from qgs_photos.refine.scene_photos import (
     sized,
 )
 from rich.console import Console
-from tables import names_in, read_json
+from tables import must_refuse, names_in, read_json
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
 from torch.testing import assert_close
@@ -65,8 +65,7 @@ def photos_of_scene(photos):
 
 def made(command, out):
     """The output and metrics.json of a `qgs scene` that writes into `out`."""
-    result = run_qgs(*f"{command} --out {out}".split())
-    assert result.exception is None, result.output
+    result = done(*f"{command} --out {out}".split())
     return result.output, read_json(out / "metrics.json")
 
 
@@ -145,9 +144,7 @@ def test_options_that_cannot_be_used_are_refused(photos, tmp_path):
         ("--holdout 1", "--holdout"),
         ("--size big", "HxW"),
     ):
-        error = run_qgs(*f"scene {photos} --out {out} {options}".split()).exception
-        assert isinstance(error, ValueError)
-        assert message in str(error)
+        must_refuse(message, done, *f"scene {photos} --out {out} {options}".split())
     assert not out.exists()
     # nor is a folder with something in it written into
     assert isinstance(run_qgs("scene", photos, "--out", photos).exception, FileExistsError)
@@ -220,8 +217,7 @@ def test_points_of_a_model(tmp_path):
     assert sparse_points(folder) is None
     for cut in (4, 40, -3):
         file.write_bytes(BINARY[:cut])
-        with pytest.raises(ValueError, match=r"points3D\.bin"):
-            sparse_points(folder)
+        must_refuse(r"points3D\.bin", sparse_points, folder)
 
 
 def test_gaussians_are_as_large_as_the_gaps_between_points():
