@@ -17,6 +17,9 @@ def must_refuse(match, function, *given, kind=ValueError, **options):
     return caught.value
 
 
+must_not_find = partial(must_refuse, kind=FileNotFoundError)
+
+
 def rows(table, mark=" | "):
     """The cells of each line."""
     return [line.split(mark) for line in table.strip().splitlines()]

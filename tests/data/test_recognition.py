@@ -2,7 +2,7 @@
 
 import yaml
 from qgs_photos.datasets import plugin as datasets
-from tables import must_refuse
+from tables import must_not_find
 from tape_source import TapeSource, plugin, write_tape
 from upath import UPath
 
@@ -53,7 +53,7 @@ def test_files_and_nothing(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"")
     assert recognised(UPath(tmp_path / "a.zip"), SOURCES) == "datasets/dl3dv"
     absent = UPath(tmp_path / "b")
-    must_refuse("does not exist", recognised, absent, SOURCES, kind=FileNotFoundError)
+    must_not_find("does not exist", recognised, absent, SOURCES)
 
 
 def test_a_plugin_is_asked_before_qgs_and_both_are_named(tmp_path, caplog):
