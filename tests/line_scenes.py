@@ -38,11 +38,14 @@ class Line(Scene):
         self.count = count
         self.step = step
 
-    @property
-    def cameras(self):
+    def poses(self):
         c2w = torch.eye(4).repeat(self.count, 1, 1)
         c2w[:, 0, 3] = self.step * torch.arange(self.count) + 3
-        return Cameras(c2w, torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
+        return c2w
+
+    @property
+    def cameras(self):
+        return Cameras(self.poses(), torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
 
     def images(self, frames):
         return values(frames) + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)

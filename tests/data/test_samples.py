@@ -18,7 +18,6 @@ from qgs.geometry.poses import look_at, look_at_depth
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.recipe import resolve
 from qgs.tokengs.schedules import Linear
-from qgs.types import Cameras
 
 
 class MaskedLine(Line):
@@ -151,10 +150,8 @@ def test_evaluation_is_deterministic_novel_and_never_mirrored():
 class Around(Line):
     """Cameras on a circle about the origin, at a distance of 4, that look at it."""
 
-    @property
-    def cameras(self):
-        c2w = circle(torch.linspace(0, 3, self.count).double(), 4)
-        return Cameras(c2w, super().cameras.intrinsics, (8, 8))
+    def poses(self):
+        return circle(torch.linspace(0, 3, self.count).double(), 4)
 
 
 def test_auto_brings_what_all_cameras_look_at_to_depth_1(caplog):

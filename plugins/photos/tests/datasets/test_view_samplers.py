@@ -13,7 +13,6 @@ from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
 from qgs.data.stream import SampleStream, trained_domain, training_batches
 from qgs.recipe import RecipeError, resolve
-from qgs.types import Cameras
 
 TWO = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
 SIX = ViewsConfig(inputs=6, targets=8)
@@ -118,11 +117,10 @@ def test_numbers_of_inputs_and_gaps_as_in_depthsplat():
 class Bend(Line):
     """Cameras that wait at the origin and go away at the end."""
 
-    @property
-    def cameras(self):
-        cameras = super().cameras
-        cameras.c2w[:, 0, 3] = torch.arange(self.count).clamp_min(self.count - 4).float()
-        return cameras
+    def poses(self):
+        c2w = super().poses()
+        c2w[:, 0, 3] = torch.arange(self.count).clamp_min(self.count - 4)
+        return c2w
 
 
 def test_inputs_stand_where_cameras_move():
@@ -161,10 +159,8 @@ SHUFFLED = torch.randperm(40, generator=torch.Generator().manual_seed(0))
 class Arc(Line):
     """40 cameras .5 apart around what they look at, DEPTH away; files in an order of chance."""
 
-    @property
-    def cameras(self):
-        c2w = circle(0.5 / DEPTH * (SHUFFLED - 20).double(), DEPTH)
-        return Cameras(c2w, super().cameras.intrinsics, (8, 8))
+    def poses(self):
+        return circle(0.5 / DEPTH * (SHUFFLED - 20).double(), DEPTH)
 
 
 def draws(count, views=VIEWS, **options):
