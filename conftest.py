@@ -38,6 +38,13 @@ def few_samples_measured(monkeypatch):
 
 
 @pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Make an empty folder the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def short_orbit(monkeypatch):
     monkeypatch.setattr("qgs.reconstruction.saving.ORBIT_FRAMES", 2)
     monkeypatch.setattr("qgs.reconstruction.saving.ORBIT_SIDE", 16)

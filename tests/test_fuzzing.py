@@ -8,7 +8,6 @@ from fuzzing import cases
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["data", "recipes"])
-def test_damaged_input_is_read_or_refused(kind, monkeypatch, capsys, tmp_path):
+def test_damaged_input_is_read_or_refused(kind, capsys, here):
     module = import_module(f"fuzzing.{kind}")
-    monkeypatch.chdir(tmp_path)
-    assert cases.fuzz(module, tmp_path, seed=0, count=200) == 0, capsys.readouterr().out
+    assert cases.fuzz(module, here, seed=0, count=200) == 0, capsys.readouterr().out

@@ -27,10 +27,9 @@ def test_the_readme_shows_the_overlay_and_paths_that_exist():
     assert all((ROOT / path).exists() for path in paths), paths
 
 
-def test_the_code_of_the_readme_works_on_as_few_photos_as_it_says(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_code_of_the_readme_works_on_as_few_photos_as_it_says(here):
     (count,) = re.findall(r"(\d+) photos are enough", README)
-    write_nerfstudio(tmp_path / "photos", centred(synthetic(tmp_path / "noise", int(count))))
+    write_nerfstudio(here / "photos", centred(synthetic(here / "noise", int(count))))
     names = {}
     exec("".join(re.findall(r"```python\n(.*?)```", README, re.DOTALL)), names)
     assert Path("scene.ply").is_file()

@@ -26,13 +26,12 @@ plugin = Plugin("box", 1, (), models={
 
 
 @pytest.fixture
-def shipped(install, tmp_path, monkeypatch):
+def shipped(install, here):
     """The file of the model box/small; the working directory is empty."""
     install("qgs-box", "box", PLUGIN)
     file = Path(sys.path[0]) / "models/small.safetensors"
     save(tiny("tokengs").build_model(), file, extra={"step": "7"})
     file.with_suffix(".md").write_text("# Small\n\nTiny [rooms],\nin a box.\n\n- Seed: 0\n")
-    monkeypatch.chdir(tmp_path)
     return file
 
 

@@ -25,10 +25,9 @@ model:
 
 
 @pytest.fixture(autouse=True)
-def _in_a_folder_with_a_recipe(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def _in_a_folder_with_a_recipe(here, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    (tmp_path / "a.yaml").write_text(SMALL)
+    (here / "a.yaml").write_text(SMALL)
 
 
 def test_compose_prints_a_recipe_that_composes_again(tmp_path):

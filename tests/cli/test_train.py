@@ -54,8 +54,7 @@ def test_a_collapse_is_told_without_a_traceback(training, tmp_path):
     assert (tmp_path / "run/checkpoint.safetensors").is_file()
 
 
-def test_what_is_missing_is_told_before_training(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_what_is_missing_is_told_before_training(here):
     cases = (
         ((), "no evaluation index at .*datasets/dl3dv/evaluation_2views.json"),
         (("evaluation.index=null", "init_from=null"), "datasets/dl3dv"),
@@ -64,18 +63,17 @@ def test_what_is_missing_is_told_before_training(tmp_path, monkeypatch):
     for overrides, message in cases:
         words = ("train", FINETUNE, "--out", "run", "--device", "cpu", *sets(*overrides))
         must_not_find(message, done, *words)
-        assert not list(tmp_path.iterdir())
+        assert not list(here.iterdir())
 
 
-def test_paths_become_absolute_and_urls_stay(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_paths_become_absolute_and_urls_stay(here):
     zipfile.ZipFile("photos.zip", "w").close()
     recipe = {"recipe": 1, "model": MODEL, "plugins": ["rooms"]}
     for path, absolute in (
-        ("../photos", f"{tmp_path.parent}/photos"),
+        ("../photos", f"{here.parent}/photos"),
         ("~/photos", f"{Path.home()}/photos"),
         ("memory://bucket/photos", "memory://bucket/photos"),
-        (archive := f"zip://a::file://{tmp_path}/photos.zip", archive),
+        (archive := f"zip://a::file://{here}/photos.zip", archive),
     ):
         photos = resolve(recipe, [f"data={{type: qgs/photos, path: '{path}', image_size: [8, 8]}}"])
         assert with_absolute_path(photos).tree["data"]["path"] == absolute

@@ -16,10 +16,7 @@ from qgs.recipe import RecipeError, resolve
 from qgs.recipe.slots import SLOTS
 from qgs.types import QueryState
 
-
-@pytest.fixture(autouse=True)
-def _in_a_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_quick_start_runs():

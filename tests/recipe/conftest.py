@@ -120,9 +120,8 @@ def installed(install):
 
 
 @pytest.fixture
-def write(tmp_path, monkeypatch):
+def write(here):
     """Write a recipe into the working directory: write(text)."""
-    monkeypatch.chdir(tmp_path)
 
     file = Path("recipe.yaml")
 

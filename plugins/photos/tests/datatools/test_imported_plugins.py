@@ -28,13 +28,12 @@ SOME = (
 )
 
 
-def test_commands_import_the_plugins_that_are_asked_for(install, tmp_path, monkeypatch):
+def test_commands_import_the_plugins_that_are_asked_for(install, here):
     source = "from qgs.contracts import Plugin\nplugin = Plugin('marked', 1, ())"
     install("marked", "marked", source)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "recipe.yaml").write_text("recipe: 1\nmodel: {}")
-    (tmp_path / "photos/other").mkdir(parents=True)
-    (tmp_path / "photos/transforms.json").write_text("{}")
+    (here / "recipe.yaml").write_text("recipe: 1\nmodel: {}")
+    (here / "photos/other").mkdir(parents=True)
+    (here / "photos/transforms.json").write_text("{}")
     imported = []
     for words in (*ALL, *SOME):
         sources._imported.cache_clear()

@@ -55,9 +55,8 @@ COMMANDS = (
 
 
 @pytest.fixture
-def printed(install, tmp_path, monkeypatch):
+def printed(install, here, monkeypatch):
     """What a command prints where all is called NAME."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "400")
     Path(f"{NAME}.yaml").write_text(RECIPE)
     Path(NAME).mkdir()

@@ -11,14 +11,13 @@ from tables import must_not_find, must_refuse, names_in
 RECIPE = "tiny/locus.yaml"
 
 
-def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(here):
     words = ("slurm", "train", RECIPE, *sets("training.workers=3", "training.batch_size=8"))
     done(*words, "--gpus", 2, "--out", "my runs/a", "--threads", 2)
-    script = (tmp_path / "my runs/a.slurm.sh").read_text()
+    script = (here / "my runs/a.slurm.sh").read_text()
     assert "--cpus-per-task=10\n#SBATCH --gpus-per-node=2\n" in script
-    assert f"cd {tmp_path} || exit\n" in script
-    assert f"--output='{tmp_path}/my runs/a.slurm-%j.log'\n" in script
+    assert f"cd {here} || exit\n" in script
+    assert f"--output='{here}/my runs/a.slurm-%j.log'\n" in script
     assert "training.batch_size=8 --out 'my runs/a' --threads 2 --resume & job=$!\n" in script
     must_refuse(r"training\.batch_size", done, *words, "--out", "b", "--gpus", 3)
     must_not_find(
@@ -30,7 +29,7 @@ def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(tmp_path,
         *sets("data={type: qgs/photos, path: nowhere}"),
     )
     assert run_qgs(*words, "--out", "b", "--gpu", 2).exit_code == 2
-    assert names_in(tmp_path) == {"my runs"}
+    assert names_in(here) == {"my runs"}
 
 
 @pytest.mark.slow
