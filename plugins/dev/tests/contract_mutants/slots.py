@@ -271,7 +271,7 @@ class JudgesWhatIsMasked(Loss):
         return prediction.gaussians.scales.mean()
 
 
-@mutant("head_gives_gaussians", "returns {'features'}, not None")
+@mutant("head_gives_gaussians", "gives {'features'}, not None")
 class GivesFeaturesUntold(GaussianHead):
     def activate(self, raw):
         return replace(super().activate(raw), features=1 * raw[..., :2])
