@@ -1,10 +1,8 @@
 """The built-in renderers, and `qgs/auto`, which chooses one of them by device."""
 
-from collections.abc import Iterable
-
 from torch import Tensor
 
-from qgs.contracts import Component, ComponentConfig, Problem, RecipeContext, Renderer
+from qgs.contracts import Component, Renderer
 from qgs.renderers.cpu import CpuRenderer
 from qgs.renderers.gsplat import GsplatRenderer
 from qgs.renderers.reference import TorchRenderer
@@ -18,14 +16,8 @@ class AutoRenderer(Renderer):
 
     name = "auto"
     camera_gradients = GsplatRenderer.camera_gradients
-
-    @classmethod
-    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Return a problem for each option that gsplat does not support.
-
-        Such options are refused on the CPU too, so that results do not depend on the device.
-        """
-        return GsplatRenderer.problems(config, context)
+    # Refused on the CPU too, so that results do not depend on the device.
+    problems = GsplatRenderer.problems
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
