@@ -5,6 +5,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.contracts import (
+    SUBLAYER_SLOTS,
     AttentionWeights,
     ComponentConfig,
     CrossAttention,
@@ -49,7 +50,7 @@ class CrossSelfMlp(DecoderLayer):
     """
 
     name = "cross_self_mlp"
-    sublayers = ("cross_attention", "self_attention", "feed_forward")
+    sublayers = SUBLAYER_SLOTS
 
     def __init__(self, config: ComponentConfig, parts: LayerParts) -> None:
         super().__init__(config, parts)
