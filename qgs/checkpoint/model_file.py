@@ -89,7 +89,7 @@ class CheckpointFile(TensorFile):
         try:
             return self.stored_recipe()
         except RecipeError as error:
-            names = {**self.mapping(_DISTRIBUTIONS), "qgs": "query-gaussians"}
+            names = self.mapping(_DISTRIBUTIONS)
             versions = self.mapping(_PLUGINS).items()
             releases = listed(
                 f"{names.get(plugin, plugin)} {version}" for plugin, version in versions
