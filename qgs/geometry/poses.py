@@ -49,9 +49,9 @@ def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
     down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
     # Down is made orthogonal first, so that the view direction stays exact.
     right = torch.linalg.cross(down, forward)
-    top = torch.stack([right, down, forward, eye], -1)
-    bottom = constant([0.0, 0.0, 0.0, 1.0], top).expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, bottom], -2)
+    pose = F.pad(torch.stack([right, down, forward, eye], -1), (0, 0, 0, 1))
+    pose[..., 3, 3] = 1
+    return pose
 
 
 @full_precision
@@ -64,9 +64,9 @@ def relative_to(reference: Tensor, c2w: Tensor) -> Tensor:
 def scaled(c2w: Tensor, scale: Tensor | float) -> Tensor:
     """Return poses with translations multiplied by `scale`, a number or one for each pose."""
     factor = torch.as_tensor(scale, dtype=c2w.dtype, device=c2w.device)
-    translation = c2w[..., :3, 3] * factor[..., None]
-    top = torch.cat([c2w[..., :3, :3], translation[..., None]], -1)
-    return torch.cat([top, c2w[..., 3:, :]], -2)
+    result = c2w.clone()
+    result[..., :3, 3] = c2w[..., :3, 3] * factor[..., None]
+    return result
 
 
 @full_precision
