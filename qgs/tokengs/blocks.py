@@ -99,7 +99,7 @@ class SelfAttentionCore(nn.Module):
         """
         q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
         if mask is not None:
-            mask = _by_head(mask if mask.ndim == 3 else mask[:, None])
+            mask = _by_head(mask)
         read_BhTd = F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask)
         return self.proj(merge_heads(read_BhTd))
 
@@ -114,8 +114,8 @@ class SelfAttentionCore(nn.Module):
         bias_B1QT = None
         if mask is not None:
             # As a bias, because pictures show the bias on the logits.
-            each = mask[:, None].expand(-1, x_BTD.shape[1], -1) if mask.ndim == 2 else mask
-            bias_B1QT = torch.where(each[:, None, queries], 0.0, -torch.inf)
+            each = _by_head(mask).expand(-1, -1, x_BTD.shape[1], -1)
+            bias_B1QT = torch.where(each[:, :, queries], 0.0, -torch.inf)
         return attention_weights(q_BhTd[:, :, queries], k_BhTd, bias_B1QT)
 
 
@@ -167,5 +167,7 @@ class CrossAttentionCore(nn.Module):
 
 
 def _by_head(bias: Tensor) -> Tensor:
-    """Add a head axis to a bias, (B, N, M) -> (B, 1, N, M); return (B, h, N, M) unchanged."""
-    return bias if bias.ndim == 4 else bias[:, None]
+    """Add missing axes after B to a bias (B, h, N, M), as in (B, N, M) -> (B, 1, N, M)."""
+    while bias.ndim < 4:
+        bias = bias[:, None]
+    return bias
