@@ -12,20 +12,20 @@ from qgs.containers import map_tensors
 from qgs.contracts import (
     CONTRACT_VERSION,
     GAUSSIAN_FIELDS,
-    LAYER_SLOTS,
     MEMORY_FIELDS,
     Fields,
     Plugin,
 )
 from qgs.recipe import RecipeError
 from qgs.recipe.recipe import Recipe, resolve
-from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
+from qgs.recipe.slots import SECTIONS
 from qgs.recipe.yaml_text import inline
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
 from qgs.types import QueryState
 from qgs_dev.case import Case, ContractError
 from qgs_dev.inputs import FACTS, Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
 from qgs_dev.modules import seeded
+from qgs_dev.tables import recipe_path
 from qgs_dev.vocabulary import (
     Trial,
     described,
@@ -213,9 +213,9 @@ def resolved(case: Case, given: Fields) -> Recipe:
     of_encoder = case.writes if slot == "encoder" else MEMORY_FIELDS
     # The default layers read keys and values.
     depth = case.dims.depth if {"memory.keys", "memory.values"} <= of_encoder.keys() else 0
-    place = f"{slot}.case" if slot in SECTIONS and SECTIONS[slot].defaults else slot
-    place = f"model.{slot}" if slot in MODEL_SLOTS else place
-    place = f"model.decoder.{slot}" if slot in LAYER_SLOTS else place
+    place = recipe_path(slot)
+    if slot in SECTIONS and SECTIONS[slot].defaults:
+        place = f"{place}.case"
     changes = [
         f"model.width={case.dims.width}",
         f"model.heads={case.dims.heads}",
