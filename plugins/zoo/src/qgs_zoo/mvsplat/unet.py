@@ -3,6 +3,7 @@
 The U-Net is the one of latent diffusion, without the embedding of time.
 """
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias
 
@@ -107,28 +108,6 @@ class ViewAttention(nn.Module):
         return x_NCHW + out_NCT.view_as(x_NCHW)
 
 
-class Downsample(nn.Module):
-    """3 x 3 convolution with stride 2."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.op = nn.Conv2d(width, width, 3, 2, padding=1)
-
-    def forward(self, x_NCHW: Tensor) -> Tensor:
-        return self.op(x_NCHW)
-
-
-class Upsample(nn.Module):
-    """Upsampling to twice the size by nearest neighbours, then a 3 x 3 convolution."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.conv = conv3(width, width)
-
-    def forward(self, x_NCHW: Tensor) -> Tensor:
-        return self.conv(F.interpolate(x_NCHW, scale_factor=2, mode="nearest"))
-
-
 class UNet(nn.Module):
     """U-Net with one residual block per level on the way down and two on the way up.
 
@@ -143,15 +122,19 @@ class UNet(nn.Module):
             attention = [ViewAttention(width, pre_norm)] if lowest else []
             return [ResidualBlock(inputs, width, pre_norm), *attention]
 
+        def named(**layers: nn.Module) -> nn.Sequential:
+            return nn.Sequential(OrderedDict(layers))
+
         down: list[list[nn.Module]] = [[conv3(width, width)]]
         up: list[list[nn.Module]] = []
         for level in range(levels):
             down.append(block(width, lowest=level == levels - 1))
             if level < levels - 1:
-                down.append([Downsample(width)])
+                down.append([named(op=nn.Conv2d(width, width, 3, 2, padding=1))])
         for level in reversed(range(levels)):
             up += [block(2 * width, lowest=level == levels - 1) for _ in range(2)]
-            up[-1] += [Upsample(width)] if level else []
+            finer = named(twice=nn.Upsample(scale_factor=2), conv=conv3(width, width))
+            up[-1] += [finer] if level else []
         self.input_blocks = nn.ModuleList(OverViews(*modules) for modules in down)
         blocks = (ResidualBlock(width, width, pre_norm) for _ in range(2))
         # the identity keeps the number of the second block, so that parameter names match
