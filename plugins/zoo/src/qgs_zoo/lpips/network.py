@@ -102,21 +102,17 @@ class PerceptualDistance(nn.Module):
         for numbers in _BLOCKS:
             block = nn.Sequential()
             for number in numbers:
-                block.extend(_layers(vgg, number))
+                weight = vgg[f"features.{number}.weight"]
+                bias = vgg[f"features.{number}.bias"]
+                convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
+                convolution.load_state_dict({"weight": weight, "bias": bias})
+                block.extend([convolution, nn.ReLU(inplace=True)])
             self.blocks.append(block)
 
     def _fill_linear(self, factors: Mapping[str, Tensor]) -> None:
         # number 0 in the files is a dropout, which has no weights
         names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
         self.linear = nn.ParameterList([factors[name].float() for name in names])
-
-
-def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]:
-    weight = vgg[f"features.{number}.weight"]
-    bias = vgg[f"features.{number}.bias"]
-    convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
-    convolution.load_state_dict({"weight": weight, "bias": bias})
-    return convolution, nn.ReLU(inplace=True)
 
 
 class LpipsLoss(Loss):
