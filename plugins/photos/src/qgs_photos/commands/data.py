@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from qgs.terminal import print_lines
 from qgs.wording import counted
-from qgs_photos.printing import say
 
 if TYPE_CHECKING:
     from qgs.contracts import SceneSource
@@ -129,12 +129,13 @@ def check(
         result = check(opened_path(path), options, indices, progress)
     if result.scenes:
         console.print(_table(result.scenes), markup=False)
-    for line in (*result.findings, *(f"note: {note}" for note in result.notes)):
-        say(console, str(line))
+    print_lines(console, map(str, result.findings))
+    print_lines(console, [f"note: {note}" for note in result.notes])
     errors = len(errors_of(result.findings))
     warnings = len(result.findings) - errors
     counts = {"scene": len(result.scenes), "error": errors, "warning": warnings}
-    say(console, f"{path}: {', '.join(counted(count, what) for what, count in counts.items())}")
+    totals = ", ".join(counted(count, what) for what, count in counts.items())
+    print_lines(console, [f"{path}: {totals}"])
     if errors:
         raise typer.Exit(1)
 
@@ -226,8 +227,7 @@ def _opened(
 
     recipe: Any = path
     if Path(path).suffix not in {".yaml", ".yml"}:
-        for note in left_out():
-            say(Console(), note)
+        print_lines(Console(), left_out())
         kind = recognised(opened_path(path), sources())
         plugin = kind.partition("/")[0]
         recipe = {"recipe": 1, "data": {"type": kind, "path": path}}
@@ -242,14 +242,13 @@ def _opened(
 def _print_packed(console: Console, packed: Packed, out: str) -> None:
     scenes = ", ".join(f"{count} {split}" for split, count in packed.scenes.items())
     again = f", {packed.resumed} of them by an earlier run" if packed.resumed else ""
-    say(
-        console,
+    lines = [
         f"{out}: packed scenes: {scenes}{again}; images of this run: {packed.frames}, of which "
-        f"{packed.kept} copied unchanged and {packed.frames - packed.kept} encoded again",
-    )
+        f"{packed.kept} copied unchanged and {packed.frames - packed.kept} encoded again"
+    ]
     if not packed.scenes["test"]:
-        say(console, "there are no test scenes: evaluations will use held-out photos of scenes")
+        lines.append("there are no test scenes: evaluations will use held-out photos of scenes")
     if packed.left_out:
-        say(console, f"scenes left out since they cannot be read: {len(packed.left_out)}")
-        for name, reason in packed.left_out.items():
-            say(console, f"  {name}: {reason}")
+        lines.append(f"scenes left out since they cannot be read: {len(packed.left_out)}")
+        lines += [f"  {name}: {reason}" for name, reason in packed.left_out.items()]
+    print_lines(console, lines)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 import typer
 
 from qgs.cli.options import Threads
-from qgs_photos.printing import say
+from qgs.terminal import print_lines
 
 app = typer.Typer(help="Find camera poses of photos or a video.")
 
@@ -80,12 +80,10 @@ def poses(
     console = Console()
     options = Options(frames, side, matching, features, threads or os.cpu_count() or 1, seed)
     folder = out or beside(source)
-    for line in make_poses(source, folder, options, console).summary:
-        say(console, line)
+    print_lines(console, make_poses(source, folder, options, console).summary)
     with console.status("checking"):
         report = check.check(opened_path(folder), check.Options())
-    for finding in report.findings:
-        say(console, str(finding))
+    print_lines(console, map(str, report.findings))
     (scene,) = report.scenes
-    say(console, f"median distance of matches from epipolar lines, pixels: {scene.epipolar}")
-    say(console, f"wrote {folder}; next: qgs demo {folder}")
+    distance = f"median distance of matches from epipolar lines, pixels: {scene.epipolar}"
+    print_lines(console, [distance, f"wrote {folder}; next: qgs demo {folder}"])

@@ -7,8 +7,8 @@ import typer
 
 from qgs.cli.options import Device, SceneName, parse_size
 from qgs.files import refuse_filled
+from qgs.terminal import print_lines
 from qgs_photos.commands import refuse_no_time
-from qgs_photos.printing import say
 
 app = typer.Typer(help="Fit a reconstruction to the photos of its scene.")
 
@@ -83,5 +83,4 @@ def refine(
     show(start, console)
     result = refine_reconstruction(start, scene, seen, seconds, gaussians, inputs_only, console)
     show(result, console)
-    for file in result.save(target):
-        say(console, f"wrote {file}")
+    print_lines(console, [f"wrote {file}" for file in result.save(target)])

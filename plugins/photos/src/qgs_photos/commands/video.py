@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from qgs.cli.options import SceneName, Threads, parse_size, use_threads
-from qgs_photos.printing import say
+from qgs.terminal import print_lines
 
 app = typer.Typer(help="Render a camera path through Gaussians as a video.")
 
@@ -70,4 +70,4 @@ def video(
     opened = open_film_scene(source, photos, scene)
     cameras = cameras_of(opened, path, pixels, round(seconds * rate), fov)
     film(opened, cameras, out, rate, console)
-    say(console, f"wrote {out}")
+    print_lines(console, [f"wrote {out}"])

@@ -8,12 +8,12 @@ from filelock import FileLock
 from rich.console import Console
 from upath import UPath
 
+from qgs.terminal import print_lines
 from qgs.wording import listed
 from qgs_photos.datasets.colmap import Colmap, models
 from qgs_photos.image_files import image_files
 from qgs_photos.poses.making import RECORD, Options, fingerprint, make_poses
 from qgs_photos.poses.photos import PosesError, photo_files
-from qgs_photos.printing import say
 
 SECONDS_OF_PHOTO = 1.8
 """Estimated CPU time, in seconds, to compute the pose of one large photo."""
@@ -61,9 +61,8 @@ def posed_folder(source: Path) -> Path:
             with FileLock(lock):
                 if not is_made(source, out):
                     text = "has no camera poses: computing them once, into"
-                    say(console, f"{source} {text} {out}{_duration(source)}")
-                    for line in make_poses(source, out, Options(), console).summary:
-                        say(console, line)
+                    print_lines(console, [f"{source} {text} {out}{_duration(source)}"])
+                    print_lines(console, make_poses(source, out, Options(), console).summary)
                 # Windows keeps it
                 with suppress(OSError):
                     lock.unlink()

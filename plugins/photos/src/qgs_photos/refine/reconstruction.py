@@ -14,9 +14,9 @@ from qgs.data.view_samplers import training_frames
 from qgs.recipe import resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
 from qgs.reconstruction.scenes import Size, chosen_scene
+from qgs.terminal import print_lines
 from qgs.types import Views
 from qgs.wording import listed
-from qgs_photos.printing import say
 from qgs_photos.record import Record, has_record, read_record
 from qgs_photos.refine.refining import RefinedScene, refine
 from qgs_photos.refine.surroundings import edge_color, surrounded
@@ -175,9 +175,9 @@ def _chosen_frames(
 def _tell(start: Reconstruction, refined: RefinedScene, photos: Views, console: Console) -> None:
     height, width = photos.cameras.size
     ended = f", ended by {refined.stopped_by}" if refined.stopped_by else ""
-    say(
-        console,
+    line = (
         f"refined for {refined.seconds:.1f} s{ended}: {refined.steps} steps on "
         f"{photos.images.shape[1]} photos of {width} x {height} pixels, "
-        f"{start.gaussians.count:,} -> {refined.gaussians.count:,} Gaussians",
+        f"{start.gaussians.count:,} -> {refined.gaussians.count:,} Gaussians"
     )
+    print_lines(console, [line])

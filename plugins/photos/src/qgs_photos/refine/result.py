@@ -21,8 +21,8 @@ from qgs.geometry.transforms import moved, to_camera, to_pixels
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.reconstruction.scene_formats import load_ply, save_ply, save_splat
+from qgs.terminal import print_lines
 from qgs.types import Cameras, Gaussians, Rendering, Views
-from qgs_photos.printing import say
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.viewing import VIEWER, in_own_world
@@ -98,26 +98,22 @@ def write_scene(
         write_text(fresh / "metrics.json", json.dumps(record, indent=1))
         names = sorted(entry.name for entry in fresh.iterdir())
     ended = f", ended by {refined.stopped_by}" if refined.stopped_by else ""
-    say(
-        console,
+    lines = [
         f"{refined.gaussians.count:,} Gaussians after {refined.steps:,} steps in "
-        f"{refined.seconds:.0f} s on {len(result.photos.frames)} photos{ended}",
-    )
+        f"{refined.seconds:.0f} s on {len(result.photos.frames)} photos{ended}"
+    ]
     if mean := record["mean"]:
-        say(
-            console,
+        lines.append(
             f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
             f"{mean['ssim']:.3f}, alpha {mean['alpha']:.3f}; a copy of the nearest photo: PSNR "
-            f"{mean['nearest_input']:.2f} dB",
+            f"{mean['nearest_input']:.2f} dB"
         )
         if mean["psnr"] < mean["nearest_input"]:
-            say(
-                console,
+            lines.append(
                 "the scene is worse than the nearest photo: the poses are wrong, or the time is "
-                "too short; run `qgs data check` on the photos",
+                "too short; run `qgs data check` on the photos"
             )
-    for name in names:
-        say(console, f"wrote {out / name}")
+    print_lines(console, [*lines, *(f"wrote {out / name}" for name in names)])
 
 
 def scores(result: Result) -> dict[str, Any]:
@@ -176,10 +172,8 @@ def page_writer(console: Console) -> PageWriter | None:
     try:
         from qgs_viewer.page import gaussians_html
     except ImportError:
-        say(
-            console,
-            f"index.html is not written, it needs query-gaussians-viewer: {INSTALL_ALL}",
-        )
+        lacking = f"index.html is not written, it needs query-gaussians-viewer: {INSTALL_ALL}"
+        print_lines(console, [lacking])
         return None
     return gaussians_html
 

@@ -15,10 +15,10 @@ from qgs.data.samples import views_in
 from qgs.paths import opened_path
 from qgs.reconstruction.scenes import Size
 from qgs.renderers import AutoRenderer
+from qgs.terminal import print_lines
 from qgs.types import Gaussians, Views
 from qgs_photos.datatools.check import faults_of_poses
 from qgs_photos.datatools.findings import Finding
-from qgs_photos.printing import say
 from qgs_photos.refine.initial import Initialisation, chosen_initialisation, photos_start
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import refine, seconds_of_step
@@ -55,8 +55,7 @@ def make_scene(
 
     photos = ScenePhotos(path, options)
     with console.status("choosing a size for the time"):
-        for finding in faults_of_given_poses(photos)[:1]:
-            say(console, str(finding))
+        print_lines(console, map(str, faults_of_given_poses(photos)[:1]))
         start = chosen_initialisation(photos, options)
         small = views_in(start.world, photos.small, photos.frames).to(options.device)
         # What masks leave out is empty, and black in viewers.
@@ -72,10 +71,10 @@ def make_scene(
     budget = left()
     chosen = replace(options, size=size, gaussians=count, seconds=budget)
     command = with_start(chosen, start).command(path, str(out))
-    # before the optimisation: an interrupted one can be repeated
-    say(console, command)
     plan = f"{budget:.0f} s of optimisation, on photos of {size[0]} x {size[1]} pixels"
-    say(console, f"{perf_counter() - began:.0f} s so far; {plan}; about {end:.0f} s for files")
+    times = f"{perf_counter() - began:.0f} s so far; {plan}; about {end:.0f} s for files"
+    # before the optimisation: an interrupted one can be repeated
+    print_lines(console, [command, times])
     gaussians = start.gaussians
     if gaussians is None:
         most = int(SWEEP * budget / seconds_of_pixel)
