@@ -15,6 +15,7 @@ from qgs.contracts import (
     Scene,
     ViewSampler,
     ViewsConfig,
+    Window,
 )
 from qgs.contracts.component import ComponentConfig
 from qgs.contracts.schedule import END
@@ -76,9 +77,7 @@ class Bounded(ViewSampler):
             if getattr(config, low) > getattr(config, high):
                 yield Problem(low, f"it is larger than `{high}`", f"raise `{high}`")
 
-    def draw(
-        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
-    ) -> tuple[Frames, Frames]:
+    def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
         """Return random input frames, in ascending order, and target frames from the gap.
 
         step: number of optimiser steps before the sample is used, or END in evaluation. The bounds
@@ -178,9 +177,7 @@ class Farthest(Bounded):
             reason = f"it is larger than `views.inputs`, {context.inputs}"
             yield Problem("fewest", reason, "lower `fewest`, or raise `views.inputs`")
 
-    def draw(
-        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
-    ) -> tuple[Frames, Frames]:
+    def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
         """Return input frames that are far apart, in ascending order, and target frames.
 
         step: number of optimiser steps before the sample is used, on which the gap and the number
@@ -241,9 +238,7 @@ class Overlapping(ViewSampler):
         # by the names of scenes; a sweep takes a third second
         self._depths: dict[str, float] = {}
 
-    def draw(
-        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
-    ) -> tuple[Frames, Frames]:
+    def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
         """Return overlapping input frames, in ascending order, and target frames near them.
 
         step: has no effect. Raises ValueError for a scene that moves or has too few photos.
@@ -265,7 +260,7 @@ class Overlapping(ViewSampler):
         near = sorted({*usable} - {*inputs}, key=lambda frame: frusta.far[frame, target])
         return tuple(sorted(inputs)), tuple(near[i % len(near)] for i in range(views.targets))
 
-    def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
+    def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
         """Return inputs and target of each evaluation window, one window for each target photo.
 
         Returns [] for a scene with times. Evaluation then chooses windows by `views.gap`.
@@ -275,7 +270,7 @@ class Overlapping(ViewSampler):
         # without held-out photos the target is one of those that inputs are chosen from
         usable = _enough(scene, views.inputs if scene.held_out else views.inputs + 1)
         frusta = self._frusta(scene)
-        found = list[tuple[Frames, Frames]]()
+        found = list[Window]()
         for target in sorted(scene.held_out) or evenly(usable, _JUDGED):
             _, inputs = frusta.window(target, usable, views.inputs)
             found.append((tuple(sorted(inputs)), (target,)))
