@@ -40,7 +40,7 @@ def _recipe(model: dict[str, Any]) -> dict[str, Any]:
 
 def _stages(shapes: Shapes, cnn: str) -> list[int]:
     """Return the channels of the three stages of a CNN. cnn: prefix of its parameter names."""
-    return [size_at(shapes, f"{cnn}layer{n}.0.conv1.weight", 0) for n in (1, 2, 3)]
+    return [size_at(shapes, f"{cnn}layer{n}.0.conv1.weight") for n in (1, 2, 3)]
 
 
 def _unet_levels(shapes: Shapes, name: str) -> int:
@@ -58,16 +58,16 @@ def _unet_levels(shapes: Shapes, name: str) -> int:
 
 def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
     backbone = "encoder.backbone.backbone."
-    raw = size_at(shapes, _PREDICTOR + "to_gaussians.2.weight", 0)
+    raw = size_at(shapes, _PREDICTOR + "to_gaussians.2.weight")
     encoder = {
         "type": "mvsplat/mvsplat",
         "near": 1.0,
         "far": 100.0,
-        "features": size_at(shapes, backbone + "conv2.weight", 0),
-        "candidates": size_at(shapes, _PREDICTOR + "regressor_residual.weight", 0),
-        "cost_width": size_at(shapes, _PREDICTOR + "corr_refine_net.0.weight", 0),
+        "features": size_at(shapes, backbone + "conv2.weight"),
+        "candidates": size_at(shapes, _PREDICTOR + "regressor_residual.weight"),
+        "cost_width": size_at(shapes, _PREDICTOR + "corr_refine_net.0.weight"),
         "cost_levels": _unet_levels(shapes, _PREDICTOR + "corr_refine_net.3."),
-        "depth_width": size_at(shapes, _PREDICTOR + "refine_unet.0.weight", 0),
+        "depth_width": size_at(shapes, _PREDICTOR + "refine_unet.0.weight"),
         "depth_levels": _unet_levels(shapes, _PREDICTOR + "refine_unet.3."),
     }
     stages = _stages(shapes, backbone)
@@ -92,20 +92,20 @@ def depthsplat_encoder(shapes: Shapes) -> dict[str, Any]:
     Raises LayoutError for a number of scales or blocks that no published model has.
     """
     scales = layer_count(shapes, _PREDICTOR + "regressor.")
-    width = size_at(shapes, _VIT + "norm.weight", 0)
+    width = size_at(shapes, _VIT + "norm.weight")
     depth = layer_count(shapes, _VIT + "blocks.")
     if scales not in (1, 2) or depth not in _BLOCKS:
         raise LayoutError(f"no published model has {scales} scales and a ViT of {depth} blocks")
-    dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight", 0) for n in range(4)]
+    dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight") for n in range(4)]
     joined = size_at(shapes, _UPSAMPLER + "concat_projects.2.weight", 1)
     # Sizes come from the weights, because releases differ only in sizes.
     return {
         "type": "mvsplat/depthsplat",
         "near": 0.5,
         "far": 100.0,
-        "features": size_at(shapes, _PREDICTOR + "backbone.conv2.weight", 0),
+        "features": size_at(shapes, _PREDICTOR + "backbone.conv2.weight"),
         "cnn": _stages(shapes, _PREDICTOR + "backbone."),
-        "candidates": size_at(shapes, _PREDICTOR + "depth_head.0.2.weight", 0),
+        "candidates": size_at(shapes, _PREDICTOR + "depth_head.0.2.weight"),
         "scales": scales,
         # Other features join at 1/8 only if the CNN reaches that resolution.
         "stride": 4 if joined == dpt[2] else 8,
@@ -116,15 +116,15 @@ def depthsplat_encoder(shapes: Shapes) -> dict[str, Any]:
         },
         "blocks": _BLOCKS[depth],
         "dpt": dpt,
-        "full_features": size_at(shapes, _UPSAMPLER + "scratch.layer1_rn.weight", 0),
-        "regressor": size_at(shapes, "encoder.gaussian_regressor.0.weight", 0),
+        "full_features": size_at(shapes, _UPSAMPLER + "scratch.layer1_rn.weight"),
+        "regressor": size_at(shapes, "encoder.gaussian_regressor.0.weight"),
         "coarse_depth": scales == 2,
     }
 
 
 def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
     encoder = depthsplat_encoder(shapes)
-    raw = size_at(shapes, _HEAD, 0)
+    raw = size_at(shapes, _HEAD)
     two = encoder["scales"] == 2
     if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
         raise LayoutError(

@@ -21,19 +21,19 @@ def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
 
     queries: component type of `model.queries`. Raises LayoutError for shapes that do not fit.
     """
-    count = size_at(shapes, "gs_tokens", 0)
+    count = size_at(shapes, "gs_tokens")
     width = size_at(shapes, "gs_tokens", 1)
-    head_width = size_at(shapes, "enc_dec_backbone.k_proj_norm.weight", 0)
-    channels = size_at(shapes, "activation_head.deconv.weight", 0)
+    head_width = size_at(shapes, "enc_dec_backbone.k_proj_norm.weight")
+    channels = size_at(shapes, "activation_head.deconv.weight")
     encoder = {
         "type": "qgs/multiview_vit",
         "patch_size": size_at(shapes, "patch_embed.proj.weight", -1),
         "depth": layer_count(shapes, ENCODER),
     }
     if encoder["depth"]:
-        hidden = size_at(shapes, ENCODER + "0.mlp.fc1.weight", 0)
+        hidden = size_at(shapes, ENCODER + "0.mlp.fc1.weight")
         encoder["mlp_ratio"] = real_ratio(hidden, width, "hidden width of the encoder's MLP")
-    hidden = size_at(shapes, DECODER + "0.mlp.mlp.fc1.weight", 0)
+    hidden = size_at(shapes, DECODER + "0.mlp.mlp.fc1.weight")
     ratio = real_ratio(hidden, width, "hidden width of the decoder's MLP")
     gaussians = whole_ratio(channels, sum(CHANNELS), "channels of the head")
     return {

@@ -22,7 +22,7 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     if dynamic:
         model["decoder"]["self_attention"] = {"type": "tokengs2026/block_causal"}
     if dynamic or timed:
-        moving = size_at(shapes, DYNAMIC, 0) if dynamic else 0
+        moving = size_at(shapes, DYNAMIC) if dynamic else 0
         model["queries"] = {
             "type": "tokengs2026/dynamic",
             "count": model["queries"]["count"] + moving,
@@ -55,7 +55,7 @@ def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
     if LATENTS not in shapes:
         return {"type": "tokengs2026/multiscale_vit", **found}
     blocks = layer_count(shapes, LATENT_BLOCK)
-    found |= {"latents": size_at(shapes, LATENTS, 0), "latent_depth": blocks}
+    found |= {"latents": size_at(shapes, LATENTS), "latent_depth": blocks}
     return {"type": "tokengs2026/latent_bottleneck", **found}
 
 

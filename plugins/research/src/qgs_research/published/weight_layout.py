@@ -88,8 +88,8 @@ def layer_count(shapes: Shapes, prefix: str) -> int:
     return max((int(match[1]) + 1 for name in shapes if (match := pattern.match(name))), default=0)
 
 
-def size_at(shapes: Shapes, name: str, axis: int) -> int:
-    """Return the size of an axis of a published parameter.
+def size_at(shapes: Shapes, name: str, axis: int = 0) -> int:
+    """Return the size of an axis of a published parameter, by default of its first axis.
 
     Raises LayoutError if the parameter or the axis is missing.
     """
