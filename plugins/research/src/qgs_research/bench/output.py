@@ -47,7 +47,15 @@ def show(report: Mapping[str, Any], console: Console) -> None:
     for operation in base["memory"]:
         peaks = [entry["memory"][operation] for entry in entries]
         headers = ("peak, MiB", "before the model", "ratio")
-        table(f"memory: {TITLES[operation]}", headers, map(_memory_cells, peaks))
+        rows = [
+            (
+                f"{peak['peak_bytes'] / MEBIBYTE:,.1f}",
+                f"{peak['idle_bytes'] / MEBIBYTE:,.1f}",
+                f"{peak['ratio']:.3f}",
+            )
+            for peak in peaks
+        ]
+        table(f"memory: {TITLES[operation]}", headers, rows)
 
 
 def _size_cells(entry: Mapping[str, Any]) -> tuple[str, ...]:
@@ -58,14 +66,6 @@ def _size_cells(entry: Mapping[str, Any]) -> tuple[str, ...]:
         f"{parameters['count']:,}",
         f"{parameters['ratio']:.3f}",
         f"{parameters['weight_bytes'] / MEBIBYTE:,.2f}",
-    )
-
-
-def _memory_cells(peak: Mapping[str, float]) -> tuple[str, ...]:
-    return (
-        f"{peak['peak_bytes'] / MEBIBYTE:,.1f}",
-        f"{peak['idle_bytes'] / MEBIBYTE:,.1f}",
-        f"{peak['ratio']:.3f}",
     )
 
 
