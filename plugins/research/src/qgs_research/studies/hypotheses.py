@@ -24,7 +24,6 @@ class Contrast(NamedTuple):
     hypothesis is true, 1 for `>` and -1 for `<`.
     """
 
-    text: str
     terms: Mapping[tuple[str, str], int]
     sign: int
 
@@ -60,7 +59,7 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     terms = {term: coefficient for term, coefficient in terms.items() if coefficient}
     if not terms:
         raise OptionError(f"both sides of `{text}` are equal, so nothing is compared", _FORM)
-    return Contrast(text, terms, -1 if comparison == "<" else 1)
+    return Contrast(terms, -1 if comparison == "<" else 1)
 
 
 def _check_known(noun: str, name: str, known: Collection[str], text: str) -> None:
