@@ -89,17 +89,6 @@ class Block(nn.Module):
         return x_XTC + self.ls2(self.mlp(self.norm2(x_XTC)))
 
 
-class PatchEmbed(nn.Module):
-    """Embedding of h x w patches of 14 x 14 pixels of X images: (X, 3, 14h, 14w) -> (X, h w, C)."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.proj = nn.Conv2d(3, width, PATCH, PATCH)
-
-    def forward(self, images_X3HW: Tensor) -> Tensor:
-        return self.proj(images_X3HW).flatten(2).mT
-
-
 class DinoV2(nn.Module):
     """Transformer from X images (X, 3, 14 h, 14 w) to tokens of their h x w patches, (X, h w, C).
 
@@ -111,7 +100,7 @@ class DinoV2(nn.Module):
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + GRID**2, width))
-        self.patch_embed = PatchEmbed(width)
+        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, width, PATCH, PATCH)})
         self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(width, EPS)
         nn.init.normal_(self.cls_token, std=1e-6)
@@ -129,7 +118,7 @@ class DinoV2(nn.Module):
         the tokens of every block (DINOv2 release). Blocks after the largest index are not run.
         """
         grid = images.shape[-2] // PATCH, images.shape[-1] // PATCH
-        x_XPC = self.patch_embed(images)
+        x_XPC = self.patch_embed["proj"](images).flatten(2).mT
         x_XTC = torch.cat([self.cls_token.expand(len(images), -1, -1), x_XPC], 1)
         x_XTC = x_XTC + self.positions(*grid)
         found = []
