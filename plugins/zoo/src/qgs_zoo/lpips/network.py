@@ -115,27 +115,38 @@ class PerceptualDistance(nn.Module):
         self.linear = nn.ParameterList([factors[name].float() for name in names])
 
 
-class LpipsLoss(Loss):
-    """Loss: mean LPIPS of rendered views with VGG-16 (TokenGS 2026.6). Nothing is downloaded."""
+class VggOptions(ComponentConfig):
+    """Option of components that compute LPIPS."""
 
-    name = "vgg16"
-    renderings = "each"
+    weights: str | None = None
+    """File of VGG-16 weights: safetensors, or torchvision's vgg16-397923af.pth. Null uses
+    torchvision's file in torch's cache."""
 
-    class Config(Loss.Config):
-        weight: float = Field(default=0.5, ge=0)
-        """Weight of the loss in the objective."""
-        weights: str | None = None
-        """File of VGG-16 weights: safetensors, or torchvision's vgg16-397923af.pth. Null uses
-        torchvision's file in torch's cache."""
 
-    config: Config
+class _WithNetwork(nn.Module):
+    """Part of a component that has the network of LPIPS, with its pretrained weights."""
 
-    def __init__(self, config: Config) -> None:
+    config: VggOptions
+
+    def __init__(self, config: VggOptions) -> None:
         super().__init__(config)
         self.network = PerceptualDistance()
 
     def load_pretrained(self) -> None:
         self.network.load(self.config.weights)
+
+
+class LpipsLoss(_WithNetwork, Loss):
+    """Loss: mean LPIPS of rendered views with VGG-16 (TokenGS 2026.6). Nothing is downloaded."""
+
+    name = "vgg16"
+    renderings = "each"
+
+    class Config(VggOptions, Loss.Config):
+        weight: float = Field(default=0.5, ge=0)
+        """Weight of the loss in the objective."""
+
+    config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
@@ -150,7 +161,7 @@ class LpipsLoss(Loss):
         return self.network(images, truth).mean()
 
 
-class Lpips(Metric):
+class Lpips(_WithNetwork, Metric):
     """LPIPS: distance of each rendered view from the true image in VGG-16 features.
 
     Nothing is downloaded.
@@ -161,21 +172,10 @@ class Lpips(Metric):
     not_in_protocol = frozenset({"weights"})
     column = Column("LPIPS", "lower")
 
-    class Config(ComponentConfig):
+    class Config(VggOptions):
         """Options of the metric LPIPS."""
 
-        weights: str | None = None
-        """File of VGG-16 weights: safetensors, or torchvision's vgg16-397923af.pth. Null uses
-        torchvision's file in torch's cache."""
-
     config: Config
-
-    def __init__(self, config: Config) -> None:
-        super().__init__(config)
-        self.network = PerceptualDistance()
-
-    def load_pretrained(self) -> None:
-        self.network.load(self.config.weights)
 
     def forward(self, given: MetricInput) -> Tensor:
         """Return the LPIPS (1, T) of T views. Raises ValueError for image sides below 16 pixels."""
