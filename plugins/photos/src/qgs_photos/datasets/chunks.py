@@ -36,7 +36,16 @@ from qgs_photos.datasets.encoded import EncodedFrame
 _OPEN = 4
 
 
-class ChunksConfig(SceneSource.Config):
+class ManyScenesConfig(SceneSource.Config):
+    """Options of data sets with many scenes."""
+
+    max_scenes: int = Field(default=0, ge=0)
+    """Use only the first scenes of each split, at most this number. 0 uses all."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1] behind transparent pixels."""
+
+
+class ChunksConfig(ManyScenesConfig):
     """Options of `datasets/chunks`."""
 
     path: str
@@ -47,13 +56,9 @@ class ChunksConfig(SceneSource.Config):
     """A number N above 0 holds out every Nth frame of a scene for evaluation, from frame N // 2
     on. 0 holds out the frames that the chunk lists as held out. Only chunks of `qgs data pack`
     can have such a list; without it, 0 holds out none."""
-    max_scenes: int = Field(default=0, ge=0)
-    """Use only the first scenes of each split, at most this number. 0 uses all."""
     min_frames: int = Field(default=0, ge=0)
     """Leave out scenes with fewer frames than this number. To count frames, every chunk is opened
     at the start. 0 keeps all scenes and opens none."""
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """RGB in [0, 1] behind transparent pixels."""
 
 
 class ChunkScene(Scene):

@@ -9,13 +9,12 @@ from typing import Any, ClassVar
 from pydantic import Field
 from upath import UPath
 
-from qgs.contracts import SceneSource
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotosConfig
 from qgs.data.scenes import BoundedCache, LazySource
 from qgs.paths import opened_path, read_file, read_json
 from qgs.wording import listed, warn_once
-from qgs_photos.datasets.chunks import first_scenes
+from qgs_photos.datasets.chunks import ManyScenesConfig, first_scenes
 
 LISTING = "transforms.json"
 # Folders of a scene that may hold the listing.
@@ -25,7 +24,7 @@ _DEPTH = 2
 _HASH = re.compile(r"[0-9a-f]{64}")
 
 
-class Dl3dvConfig(SceneSource.Config):
+class Dl3dvConfig(ManyScenesConfig):
     """Options of `datasets/dl3dv`."""
 
     path: str
@@ -41,10 +40,6 @@ class Dl3dvConfig(SceneSource.Config):
     holdout: int = Field(default=0, ge=0)
     """A number N above 0 holds out every Nth frame of a scene for evaluation, from frame N // 2
     on. 0 holds out none."""
-    max_scenes: int = Field(default=0, ge=0)
-    """Use only the first scenes of each split, at most this number. 0 uses all."""
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """RGB in [0, 1] behind transparent pixels."""
 
 
 class Dl3dvSource(LazySource):
