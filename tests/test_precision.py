@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import torch
 from odd_views import odd_views
+from tables import assert_equal
 from torch import Tensor, nn
-from torch.testing import assert_close
 
 from qgs.containers import named_tensors
 from qgs.precision import full_precision
@@ -34,7 +34,7 @@ def test_half_precision_is_raised_wherever_it_is_held():
     given = state(torch.bfloat16)
     bare, held, named = same(half(3), given, key=Pair(half(2), torch.ones(2)))
     assert bare.dtype == held.features.dtype == named.left.dtype == torch.float32
-    assert torch.equal(held.features, given.features.float())
+    assert_equal(held.features, given.features.float())
     assert held["place"] is given["place"]
     assert isinstance(named, Pair)
     (listed,), (within,) = same([half(2)], (half(2),))
@@ -66,4 +66,4 @@ def test_a_method_leaves_autocast_for_a_state_and_compiles_without_a_break():
         found = layer(given), compiled(given)
         assert torch.is_autocast_enabled("cpu")
     assert found[0].dtype == torch.float32
-    assert_close(found, (expected, expected), rtol=0, atol=0)
+    assert_equal(found, (expected, expected))

@@ -42,7 +42,7 @@ def test_depth_is_that_of_the_nearest_shape(scenes):
             assert depth[i, j] == pytest.approx(true, rel=2e-3)
 
 
-def test_scenes_are_scaled_to_their_depth(scenes):
+def test_scenes_are_scaled_to_their_depth():
     scaled = source(depth=(2.0, 2.0), image_size=(10, 10)).scenes("train")
     drawn = source(depth=None, image_size=(10, 10)).scenes("train")
     for index in range(3):

@@ -5,7 +5,7 @@ import yaml
 from commands import done
 from odd_views import odd_views
 from refusals import wrong_refusals
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from torch.testing import assert_close
 
 import qgs
@@ -170,7 +170,8 @@ def test_a_model_without_rounds_starts_one_with_rounds(tmp_path):
     assert "feedback.marker: none -> (32,)" in said
     assert "trained with model.feedback.type: qgs/none (here landmark/rendered)" in said
     weights = model.state_dict()
-    assert all(torch.equal(weights[name], values) for name, values in plain.state_dict().items())
+    kept = plain.state_dict()
+    assert_equal({name: weights[name] for name in kept}, kept)
     memory = model.encoder(given)
     state, _ = run(model, (0, 1, 2, 1, 2, 1, 2), model.queries(memory, given), memory)
     assert_close(model(given).state.features, state.features)
@@ -187,7 +188,7 @@ def test_rounds_start_from_rounds_of_their_kind(tmp_path):
         return model
 
     more = started("model.feedback.rounds=3").state_dict()
-    assert all(map(torch.equal, more.values(), learned.state_dict().values()))
+    assert_equal(more, learned.state_dict())
     for other in (NO_ROUNDS, "model.feedback.cells=1"):
         must_refuse(r"feedback\.embedding\.weight", started, other, kind=CheckpointError)
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from photo_formats import encoded, scene
 from PIL import Image
 from planted import Room
@@ -83,13 +83,13 @@ def test_a_lens_turns_with_its_photo(written, shots):
 
 def test_packed_photos_are_upright(written, shots, tmp_path):
     (frame, kept), *_ = encoded_frames(scene(written(8, "stored"), SIZE), Encoding())
-    np.testing.assert_array_equal(frame.mask, 255 * (shots[0].image[..., 0] > 128))
+    assert_array_equal(frame.mask, 255 * (shots[0].image[..., 0] > 128))
     assert frame.size == SIZE
     assert_allclose(frame.c2w, shots[0].c2w, atol=1e-12)
     path = tmp_path / "packed.png"
     path.write_bytes(frame.data)
     image = Image.open(path)
-    np.testing.assert_array_equal(image, shots[0].image)
+    assert_array_equal(image, shots[0].image)
     assert kept == (not image.getexif().get(0x0112))
 
 

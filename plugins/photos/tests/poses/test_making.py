@@ -41,7 +41,7 @@ def record_in(folder):
     return read_json(folder / "poses.json")
 
 
-def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):
+def test_photos_get_the_poses_they_were_taken_with(made, shots):
     folder, poses = made
     names = ["0 Fo’to #{} %20 'ä'.JPG", "1.jpg", "2.png", "3.tif.png", "4.avif.png", "5.png"]
     assert poses.posed == names
