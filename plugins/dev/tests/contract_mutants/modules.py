@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from contract_mutants.mutant import mutant
 from contract_mutants.slots import ChangedEncoder, ChangedSquares
-from contract_mutants.spatial import AtPlaces, Extended, PlacesByALayer
+from contract_mutants.spatial import AtPlaces, BiasedAttention, Extended, PlacesByALayer
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 from torch import Tensor, nn
 
@@ -172,15 +172,14 @@ class HasAnUnusedLayer(ExtendedMlp):
 
 
 @mutant("parameters_learn", "shift: no gradient reaches it")
-class ShiftsAllLogits(Extended, ContentCrossAttention):
+class ShiftsAllLogits(Extended, BiasedAttention):
     """What is added to all logits alike changes no weight: its gradient is a rounding error."""
 
     def add(self, dims):
         self.shift = nn.Parameter(torch.zeros(1, 1, 1))
 
-    def forward(self, state, memory):
-        shift = self.shift.float().expand(1, 1, memory.keys.shape[2])
-        return self.core(state.features, memory.keys, memory.values, shift)
+    def bias(self, state, memory):
+        return self.shift.float().expand(1, 1, memory.keys.shape[2])
 
 
 @mutant("inputs_are_not_changed", "changes inputs, offsets")
