@@ -151,7 +151,6 @@ def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
 
 
 DEPTH = 10.0
-VIEWS = ViewsConfig(inputs=2, targets=3)
 SAMPLER = made(Overlapping)
 SHUFFLED = torch.randperm(40, generator=torch.Generator().manual_seed(0))
 
@@ -163,7 +162,7 @@ class Arc(Line):
         return circle(0.5 / DEPTH * (SHUFFLED - 20).double(), DEPTH)
 
 
-def draws(count, views=VIEWS, **options):
+def draws(count, views=TWO, **options):
     sampler = made(Overlapping, **options)
     scene = Arc(40, held_out=(0, 8, 16))
     return [sampler.draw(scene, views, seeded(k), 0) for k in range(count)]
@@ -204,7 +203,7 @@ def test_apart_moves_inputs_apart():
 
 def test_every_held_out_photo_is_judged_with_inputs_beside_it():
     scene = Arc(40, held_out=(0, 8, 16))
-    samples = samples_of(Lines(scene), VIEWS, EvaluationConfig(), SAMPLER)
+    samples = samples_of(Lines(scene), TWO, EvaluationConfig(), SAMPLER)
     assert [sample.target_frames for sample in samples] == [(0,), (8,), (16,)]
     for sample in samples:
         first, last = steps(sample.input_frames)
@@ -212,7 +211,7 @@ def test_every_held_out_photo_is_judged_with_inputs_beside_it():
 
 
 def test_without_held_out_photos_four_of_all_are_judged():
-    found = SAMPLER.windows(Arc(40), VIEWS)
+    found = SAMPLER.windows(Arc(40), TWO)
     assert [targets for _, targets in found] == [(0,), (13,), (26,), (39,)]
     for inputs, (target,) in found:
         assert target not in inputs
@@ -228,7 +227,7 @@ def test_any_number_of_inputs():
 
 def test_cameras_without_a_common_point_and_few_photos():
     """Their depth is swept; two photos are inputs, and the third is every target."""
-    inputs, targets = SAMPLER.draw(Line(3, step=0.1), VIEWS, seeded(), 0)
+    inputs, targets = SAMPLER.draw(Line(3, step=0.1), TWO, seeded(), 0)
     assert len({*inputs}) == 2
     assert {*targets} == {0, 1, 2} - {*inputs}
     assert len(targets) == 3
@@ -237,19 +236,19 @@ def test_cameras_without_a_common_point_and_few_photos():
 def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn():
     scene = Arc(40, held_out=(3,))
     scene.times = torch.arange(40).double()
-    assert SAMPLER.windows(scene, VIEWS) == []
-    must_refuse(r"moves, .* qgs/span", SAMPLER.draw, scene, VIEWS, seeded(), 0)
+    assert SAMPLER.windows(scene, TWO) == []
+    must_refuse(r"moves, .* qgs/span", SAMPLER.draw, scene, TWO, seeded(), 0)
 
 
 def test_too_few_photos_are_refused():
     must_refuse(
-        "'line2' has 2 photos, but a sample needs 3", SAMPLER.draw, Line(2), VIEWS, seeded(), 0
+        "'line2' has 2 photos, but a sample needs 3", SAMPLER.draw, Line(2), TWO, seeded(), 0
     )
     must_refuse(
         "has 1 photos beside 1 held-out ones, but a sample needs 2",
         SAMPLER.windows,
         Line(2, held_out=(1,)),
-        VIEWS,
+        TWO,
     )
 
 
