@@ -100,8 +100,7 @@ def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(tmp
         "gap": r"1 images of the scene do not exist.*view_001\.png",
     }
     for scene, reason in reasons.items():
-        with pytest.raises((ValueError, OSError), match=reason):
-            list(plan.samples(scene))
+        must_refuse(reason, list, plan.samples(scene), kind=(ValueError, OSError))
 
 
 def test_scenes_are_decoded_one_at_a_time():

@@ -5,9 +5,9 @@ Those that are refused with a recipe are cases/plugins.txt.
 
 import traceback
 
-import pytest
 from commands import done
 from refusals import refused
+from tables import must_not_find, must_refuse
 
 from qgs.recipe import RecipeError, resolve
 from qgs.recipe.registry import available_plugins, load_usable_plugins
@@ -94,9 +94,9 @@ def test_the_tracebacks_of_plugins_and_components_are_all_shown(write, install):
         ("[faulty]", "{self_attention: {type: faulty/strict, word: x}}"),
         ("[faulty]", "{refinement: {type: faulty/silent}}"),
     ):
-        with pytest.raises(RecipeError) as caught:
-            resolve(write(f"recipe: 1\nplugins: {plugins}\nmodel: {{decoder: {decoder}}}\n"))
-        shown += "".join(traceback.format_exception(caught.value))
+        recipe = write(f"recipe: 1\nplugins: {plugins}\nmodel: {{decoder: {decoder}}}\n")
+        error = must_refuse("", resolve, recipe, kind=RecipeError)
+        shown += "".join(traceback.format_exception(error))
     for word in ("_test_qgs_first.py", "_test_qgs_second.py", "strict_check", "fields_written"):
         assert word in shown
 
@@ -105,8 +105,7 @@ def test_what_fails_when_it_is_built_names_its_distribution_but_missing_data(wri
     install("qgs-faulty", "faulty", FAULTY)
     text = "losses: {x: {type: faulty/abstract}}\ndata: {type: faulty/closed}\n"
     recipe = resolve(write(f"recipe: 1\nplugins: [faulty]\n{text}"))
-    with pytest.raises(RecipeError, match=r"recipe.yaml:3: losses.x\n.*qgs-faulty 1\.2") as caught:
-        recipe.build_losses()
-    assert isinstance(caught.value.__cause__, TypeError)
-    with pytest.raises(FileNotFoundError, match="photos/"):
-        recipe.build_data()
+    reason = r"recipe.yaml:3: losses.x\n.*qgs-faulty 1\.2"
+    error = must_refuse(reason, recipe.build_losses, kind=RecipeError)
+    assert isinstance(error.__cause__, TypeError)
+    must_not_find("photos/", recipe.build_data)

@@ -3,7 +3,6 @@
 import os
 from unittest.mock import Mock
 
-import pytest
 import torch
 from commands import run_qgs
 from fuzzing.kill import RECIPES
@@ -113,9 +112,8 @@ def test_every_difference_is_listed_at_once():
     del weights["gs_tokens"]
     weights["activation_head.deconv.bias"] = torch.zeros(3)
     weights |= {"stranger": torch.zeros(1), "gs_anchor_xyz_raw": torch.zeros(1)}
-    with pytest.raises(PublishedError) as caught:
-        known.from_published(weights)
-    assert str(caught.value).endswith("""
+    error = must_refuse("", known.from_published, weights, kind=PublishedError)
+    assert str(error).endswith("""
   missing: gs_tokens
   unexpected: stranger
   unexpected: gs_anchor_xyz_raw

@@ -2,11 +2,10 @@
 
 from io import BytesIO
 
-import pytest
 import torch
 from qgs_research.published.weight_files import read_weight_file
 from safetensors.torch import save
-from tables import assert_equal
+from tables import assert_equal, must_not_find, must_refuse
 
 from qgs.checkpoint.tensors import CheckpointError
 
@@ -58,7 +57,6 @@ def test_what_cannot_be_read_is_named(tmp_path):
         "w.npz": (b"0123456789",),
     }.items():
         for content in contents:
-            with pytest.raises(CheckpointError, match=str(tmp_path / name)):
-                read(tmp_path / name, content)
-    with pytest.raises(FileNotFoundError):
-        read_weight_file(tmp_path)
+            path = tmp_path / name
+            must_refuse(str(path), read, path, content, kind=CheckpointError)
+    must_not_find("", read_weight_file, tmp_path)
