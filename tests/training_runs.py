@@ -102,7 +102,11 @@ def first_batch(recipe):
 
 
 def losses(run):
-    return [record["loss"] for record in RunFolder(run).history()]
+    return column(RunFolder(run).history(), "loss")
+
+
+def column(records, name):
+    return [record[name] for record in records]
 
 
 def read_jsonl(path):

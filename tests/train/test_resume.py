@@ -15,6 +15,7 @@ from training_runs import (
     TRAINED,
     TWO,
     assert_equal_runs,
+    column,
     read_jsonl,
     resume,
     run,
@@ -78,7 +79,7 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     assert seen == [(2, pytest.approx(0.3)), (2, 0.2), (1, pytest.approx(0.1)), (1, 0)]
     history = RunFolder(whole).history()
     rates = [5e-4 * (1 + math.cos(math.pi * step / 4)) for step in range(4)]
-    assert [record["lr"] for record in history] == pytest.approx(rates)
+    assert column(history, "lr") == pytest.approx(rates)
     assert history[3]["ssim"] == pytest.approx(history[0]["ssim"] / 4, rel=0.2)  # 0.1 is left
     assert [record["alpha_consistency"] > 0 for record in history] == [False, False, True, True]
     terms = "mse ssim visibility anchor_visibility alpha_consistency depth_consistency"
@@ -105,8 +106,8 @@ def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog
     longer = ("training.steps=4", "training.evaluate_every=4", "evaluation.scenes=1")
     assert resumed(copied, *longer, "training.save_every=7").steps == 4
     history, evaluations = (read_jsonl(file) for file in files)
-    assert [record["step"] for record in history] == [1, 2, 3, 4]
-    assert [record["step"] for record in evaluations] == [2, 2, 3, 3, 4, 4]
+    assert column(history, "step") == [1, 2, 3, 4]
+    assert column(evaluations, "step") == [2, 2, 3, 3, 4, 4]
     for file in files:
         for line in (1, 2):
             assert f"{file}, line {line} is damaged" in caplog.text
@@ -120,7 +121,7 @@ def test_the_clock_goes_on(copied):
     change_counters(copied, seconds=1.0)
     budget = ("training.steps=200", "training.seconds=1.02", "training.evaluate_every=0")
     result = resumed(copied, *budget)
-    seconds = [record["seconds"] for record in result.folder.history()]
+    seconds = column(result.folder.history(), "seconds")
     assert seconds[3] == 1.0
     assert seconds[4] > 1.0
     assert 1.02 <= result.seconds < 10

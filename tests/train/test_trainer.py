@@ -10,6 +10,7 @@ from tables import must_refuse, names_in
 from training_runs import (
     TRAINED,
     change_samples,
+    column,
     losses,
     parts_of,
     read_jsonl,
@@ -47,7 +48,7 @@ def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
     folder = trained_run.folder
     assert resolve(folder.recipe).tree == tiny("locus", *TRAINED).tree
     history = folder.history()
-    assert [record["step"] for record in history] == [1, 2, 3]
+    assert column(history, "step") == [1, 2, 3]
     assert {"psnr", "lr", "seconds", "gradient"} <= history[0].keys()
     assert CheckpointFile(folder.checkpoint).step == 3
     assert not trained_run.model.training
@@ -79,7 +80,7 @@ def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run
     assert told == [(step, weights, 2) for step in (2, 3) for weights in ("raw", "ema")]
     raw, average = (qgs.load(file) for file in (folder.checkpoint, folder.checkpoint_ema))
     scores = [evaluate(model, recipe).means() for model in (raw, average)]
-    assert [record["scores"] for record in records[2:]] == scores
+    assert column(records[2:], "scores") == scores
     assert scores[0]["psnr"] != scores[1]["psnr"]
     pictures = folder.path / "pictures"
     assert names_in(pictures) == {"step-2.png", "step-3.png"}
@@ -134,7 +135,7 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     records = read_jsonl(through / "history.jsonl")
     assert ["loss" in r for r in records] == [True, False, True, False]
     assert ["skipped" in r for r in records] == [False, True, False, True]
-    assert [record["step"] for record in curves_of(through / "checkpoint.safetensors")] == [1, 3]
+    assert column(curves_of(through / "checkpoint.safetensors"), "step") == [1, 3]
     assert parts_of(through)["guard"]["skipped"] == 1  # a good step lies between the two
     recipe = tiny("locus", *options)
     for begin in (run, resume):
