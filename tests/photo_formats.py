@@ -6,7 +6,7 @@ The writers share no code with the readers: they follow the descriptions of the 
 import io
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +71,7 @@ def scene(path, size=(30, 40), **options):
 def centred(photos):
     """The same set, taken by a camera that every format can tell."""
     focal, (height, width) = photos.intrinsics[0], photos.size
-    return PhotoSet(photos.files, photos.c2w, (focal, focal, width / 2, height / 2), photos.size)
+    return replace(photos, intrinsics=(focal, focal, width / 2, height / 2))
 
 
 def copied(photos, folder, names=None):
