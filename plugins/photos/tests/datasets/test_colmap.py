@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from photo_formats import scene as read
 from photo_formats import synthetic, world_to_camera, write_colmap
 from PIL import Image
-from tables import must_not_find, must_refuse
+from tables import must_not_find, must_refuse, rows
 
 from qgs.data.photos import read_listing
 from qgs.paths import opened_path
@@ -183,18 +183,22 @@ def test_images_as_programs_leave_them(tmp_path, photos, caplog):
         assert re.search(told, caplog.text)
 
 
+MODELS = """
+sparse/0 | sparse/0 | images
+dense/0/sparse | dense/0/sparse | dense/0/images
+colmap/sparse/0 | colmap/sparse | images
+. | . | .
+dense/0/sparse | . | dense/0/images
+Sparse/0 | . | images
+sparse/1 | . | images
+"""
+"""Where a model lies, which folder is given, and where the photos lie that are read."""
+
+
 def test_which_model_is_read(tmp_path, photos, caplog):
     """With its own photos, the largest, and its project's where its own folder is given."""
     few = replace(photos, files=photos.files[:2])
-    for model, given, images in (
-        ("sparse/0", "sparse/0", "images"),
-        ("dense/0/sparse", "dense/0/sparse", "dense/0/images"),
-        ("colmap/sparse/0", "colmap/sparse", "images"),
-        (".", ".", "."),
-        ("dense/0/sparse", ".", "dense/0/images"),
-        ("Sparse/0", ".", "images"),
-        ("sparse/1", ".", "images"),
-    ):
+    for model, given, images in rows(MODELS):
         folder = tmp_path / model.replace("/", "") / given.replace("/", "")
         write_colmap(folder, photos, "text", model=model, images=images)
         if model == "sparse/1":

@@ -10,7 +10,7 @@ import pytest
 import torch
 from photo_formats import put, row_of_frames
 from qgs_photos.datasets.dl3dv import Dl3dvSource, read_scene_list
-from tables import assert_equal, must_not_find, must_refuse
+from tables import assert_equal, must_not_find, must_refuse, rows
 from upath import UPath
 
 
@@ -48,19 +48,19 @@ opened = partial(photo_formats.opened, size=(9, 16), source=Dl3dvSource)
 scene = partial(photo_formats.scene, size=(9, 16), source=Dl3dvSource)
 
 
-PLACES = (
-    ("1K/abc.zip", "abc/", "images_4"),
-    ("abc.zip", "", "images_4"),
-    ("2K/abc", "", "images_4"),
-    ("abc", "gaussian_splat/", "images_4"),
-    ("abc.zip", "abc/gaussian_splat/", "images_4"),
-    ("abc", "", "images"),
-)
+PLACES = """
+1K/abc.zip | abc/ | images_4
+abc.zip |  | images_4
+2K/abc |  | images_4
+abc | gaussian_splat/ | images_4
+abc.zip | abc/gaussian_splat/ | images_4
+abc |  | images
+"""
 """Archives and folders, folders inside them, and those of photos."""
 
 
 def test_folders_and_archives_read_alike(tmp_path):
-    for number, (name, inside, images) in enumerate(PLACES):
+    for number, (name, inside, images) in enumerate(rows(PLACES)):
         local = tmp_path / str(number)
         for root in (UPath(local), UPath(f"memory://dl3dv{local}")):
             write(root / name, scene_files(inside, images))
