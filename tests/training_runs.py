@@ -44,9 +44,7 @@ resume = partial(run, resume=True)
 def trained_run(tmp_path_factory):
     """A finished run of `tiny("locus", *TRAINED)`, 3 steps; a test that changes it takes a copy."""
     torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qgs.data.stream.MEASURED", 8)
-        return run(tiny("locus", *TRAINED), tmp_path_factory.mktemp("trained") / "run")
+    return run(tiny("locus", *TRAINED), tmp_path_factory.mktemp("trained") / "run")
 
 
 def run_calling(after_step, recipe, folder, resume=False):
