@@ -29,7 +29,7 @@ from qgs_photos.refine.scene_photos import (
     sized,
 )
 from rich.console import Console
-from tables import must_refuse, names_in, read_json
+from tables import must_refuse, names_in, read_json, rows
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
 from torch.testing import assert_close
@@ -135,29 +135,28 @@ def test_without_the_viewer_there_is_no_page(monkeypatch):
     assert "pip install" in console.file.getvalue()
 
 
+SENSELESS = """
+--model none --scale 0.4 | --scale need a model
+--minutes 0 | --minutes
+--seconds inf | --seconds
+--holdout 1 | --holdout
+--size big | HxW
+"""
+
+
 def test_options_that_cannot_be_used_are_refused(photos, tmp_path):
     out = tmp_path / "out"
-    for options, message in (
-        ("--model none --scale 0.4", "--scale need a model"),
-        ("--minutes 0", "--minutes"),
-        ("--seconds inf", "--seconds"),
-        ("--holdout 1", "--holdout"),
-        ("--size big", "HxW"),
-    ):
+    for options, message in rows(SENSELESS):
         must_refuse(message, done, *f"scene {photos} --out {out} {options}".split())
     assert not out.exists()
     # nor is a folder with something in it written into
     assert isinstance(run_qgs("scene", photos, "--out", photos).exception, FileExistsError)
 
 
-def scene_of(count, held_out):
-    return MagicMock(held_out=held_out, __len__=lambda self: count)
-
-
 def test_a_split_of_the_photos_own_is_judged_first():
     cases = (((), "8", (4, 12)), ((), "3", (1, 4, 7, 10, 13, 16, 19)), ((0, 5), "8", (0, 5)))
     for own, holdout, judged in cases:
-        scene = scene_of(20, own)
+        scene = MagicMock(held_out=own, __len__=lambda self: 20)
         assert judged_frames(scene, holdout) == judged
         assert judged_frames(scene, NONE) == ()
 
