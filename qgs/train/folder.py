@@ -42,7 +42,6 @@ _TENSOR = "tensor"
 FREE = (
     "training.steps",
     "training.seconds",
-    "training.accumulate",
     "training.save_every",
     "training.collapse_window",
     "training.workers",
@@ -266,7 +265,8 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
         # A run that was killed before its first save has only a recipe, and starts again.
         run = resolve(folder.recipe)
         states = {}
-    may_change = tuple(f"{key}." for key in FREE)
+    # `Counters` compares the scenes of a step, which older runs counted by process.
+    may_change = tuple(f"{k}." for k in (*FREE, "training.batch_size", "training.accumulate"))
     differing = [
         f"\n  {key}: {ours or 'absent'} here, {theirs or 'absent'} in the run"
         for key, (ours, theirs) in differing_options(recipe.tree, run.tree).items()
