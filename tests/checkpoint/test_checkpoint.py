@@ -11,8 +11,7 @@ from commands import SMALL
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from small_parts import Code, shaken
-from tables import must_refuse
-from training_runs import same
+from tables import assert_equal, must_refuse
 
 import qgs
 from qgs.checkpoint.model_file import (
@@ -68,7 +67,7 @@ def must_not_load(match, path, load=qgs.load):
 def test_a_loaded_model_is_the_saved_one(model, saved):
     loaded = qgs.load(saved)
     assert not loaded.training
-    assert same(loaded.state_dict(), model.state_dict())
+    assert_equal(loaded.state_dict(), model.state_dict())
     recipe = CheckpointFile(saved).recipe
     metadata = metadata_of(saved)
     assert recipe.tree == loaded.recipe == model.recipe

@@ -10,7 +10,7 @@ import torch
 from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
 from tables import assert_equal, must_refuse
-from training_runs import batches, same, tiny
+from training_runs import batches, tiny
 
 from qgs.containers import named_tensors
 from qgs.contracts import ViewsConfig
@@ -34,7 +34,7 @@ def photos(folder):
 def assert_same(first, second):
     for a, b in zip(first, second, strict=True):
         assert a.scenes == b.scenes
-        assert same(*(dict(named_tensors([batch.inputs, batch.targets])) for batch in (a, b)))
+        assert_equal(*(dict(named_tensors([batch.inputs, batch.targets])) for batch in (a, b)))
 
 
 def test_running_out_of_memory_is_no_bad_sample(tmp_path, monkeypatch):

@@ -13,7 +13,8 @@ import pytest
 import torch
 from line_scenes import samples_of
 from rich.console import Console
-from training_runs import same, tiny
+from tables import assert_equal
+from training_runs import tiny
 
 from qgs.contracts import CONTRACT_VERSION, Column, ComponentConfig, Metric, Plugin
 from qgs.evaluate.evaluation import evaluate
@@ -224,7 +225,7 @@ def test_tuned_evaluations_say_so_and_score_the_tuned_tokens():
     model = plain.build_model()
     first = evaluate(model, plain)
     second = evaluate(model, tuned)
-    assert same(model.state_dict(), plain.build_model().state_dict())
+    assert_equal(model.state_dict(), plain.build_model().state_dict())
     assert first.summary()["tuning"] is None
     told = second.summary()["tuning"]
     assert (told["what"], told["steps"]) == ("queries", 2)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from line_scenes import samples_of
 from tables import assert_equal, must_refuse
-from training_runs import same, tiny
+from training_runs import tiny
 
 from qgs.containers import map_tensors
 from qgs.evaluate.tuning import tune
@@ -40,7 +40,7 @@ def test_the_input_views_are_met_better_and_weights_are_bit_equal(rate, words):
     part.register_forward_hook(lambda *_: calls.append(1))
     gaussians, told = tune(model, inputs, recipe)
     assert len(calls) == 1
-    assert same(model.state_dict(), before)
+    assert_equal(model.state_dict(), before)
     assert all(weights.grad is None and weights.requires_grad for weights in model.parameters())
     assert not gaussians.means.requires_grad
 

@@ -6,8 +6,7 @@ from pathlib import Path
 import torch
 import yaml
 from refusals import refused
-from tables import must_refuse
-from training_runs import same
+from tables import assert_equal, must_refuse
 
 from qgs.recipe import compose, resolve
 from qgs.recipe.errors import Problems
@@ -73,7 +72,7 @@ def test_same_recipe_same_parameters_and_the_global_random_state_stays():
     second = compose(SMALL).state_dict()
     other = compose(SMALL, ["seed=1"]).queries.features
     assert torch.equal(torch.get_rng_state(), before)
-    assert same(first, second)
+    assert_equal(first, second)
     assert not torch.equal(first["queries.features"], other)
 
 

@@ -7,9 +7,8 @@ from unittest.mock import Mock
 import pytest
 import torch
 from renderers.scenes import differentiate, make_scene
-from tables import must_refuse
+from tables import assert_equal, must_refuse
 from torch.testing import assert_close
-from training_runs import same
 
 from qgs.containers import concatenated, named_tensors
 from qgs.contracts import RendererConfig
@@ -27,7 +26,8 @@ def test_the_number_of_threads_changes_no_bit(views):
         torch.set_num_threads(count)
         rendering, gradients = differentiate(RENDER, *scene)
         results.append({**dict(named_tensors(rendering)), **gradients})
-    assert all(same(found, results[0]) for found in results[1:])
+    for found in results[1:]:
+        assert_equal(found, results[0])
 
 
 @pytest.mark.parametrize("more", [{}, {"harmonics": 3, "features": 4}])
@@ -37,7 +37,7 @@ def test_more_gaussians_than_a_unit_of_work_takes(more):
     fillers = gaussians.replace(opacities=gaussians.opacities * 0)
     rendering, gradients = differentiate(RENDER, gaussians, cameras)
     padded, found = differentiate(RENDER, concatenated([fillers, gaussians], 1), cameras)
-    assert torch.equal(padded.rgb, rendering.rgb)
+    assert_equal(padded.rgb, rendering.rgb)
     for name, _ in named_tensors(gaussians):
         of_fillers, found[name] = found[name].split(300, 1)
         assert not of_fillers.any(), name

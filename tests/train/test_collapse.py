@@ -6,8 +6,8 @@ from unittest.mock import Mock
 import pytest
 import torch
 from accelerate import PartialState
-from tables import must_refuse
-from training_runs import resume, run, run_calling, same, tiny
+from tables import assert_equal, must_refuse
+from training_runs import resume, run, run_calling, tiny
 
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
@@ -86,7 +86,7 @@ def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights(tm
     assert CheckpointFile(checkpoint).step == 8  # in doubt: saved as it is
     must_refuse("at step 15: for the last 10 steps", resume, recipe, tmp_path, kind=CollapseError)
     assert CheckpointFile(checkpoint).step == 2
-    assert same(qgs.load(checkpoint).state_dict(), after[2])
+    assert_equal(qgs.load(checkpoint).state_dict(), after[2])
 
 
 def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(tmp_path):

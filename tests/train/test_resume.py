@@ -10,7 +10,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from tables import contents, must_refuse
+from tables import assert_equal, contents, must_refuse
 from training_runs import (
     TRAINED,
     TWO,
@@ -20,7 +20,6 @@ from training_runs import (
     resume,
     run,
     run_calling,
-    same,
     tiny,
 )
 
@@ -142,7 +141,7 @@ def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, cop
     before = contents(copied)
     again = resumed(copied)
     assert (again.resumed_at, again.steps, again.stopped_by) == (3, 3, None)
-    assert same(trained_run.model.state_dict(), again.model.state_dict())
+    assert_equal(trained_run.model.state_dict(), again.model.state_dict())
     changes = ("optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
     reason = r"rate: 0\.001 here, 0\.0015 in"
     told = str(must_refuse(reason, resumed, copied, *changes, kind=OtherRunError))

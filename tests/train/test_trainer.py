@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 from qgs_viewer.curves import curves_of
-from tables import must_refuse, names_in
+from tables import assert_equal, must_refuse, names_in
 from training_runs import (
     TRAINED,
     change_samples,
@@ -16,7 +16,6 @@ from training_runs import (
     read_jsonl,
     resume,
     run,
-    same,
     tiny,
 )
 
@@ -52,7 +51,7 @@ def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
     assert {"psnr", "lr", "seconds", "gradient"} <= history[0].keys()
     assert CheckpointFile(folder.checkpoint).step == 3
     assert not trained_run.model.training
-    assert same(qgs.load(folder.checkpoint).state_dict(), trained_run.model.state_dict())
+    assert_equal(qgs.load(folder.checkpoint).state_dict(), trained_run.model.state_dict())
 
 
 def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path):
@@ -61,7 +60,7 @@ def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path
     parts = parts_of(tmp_path)
     watched = parts_of(folder.path)
     for name in ("weights", "moments", "random"):
-        assert same(parts[name], watched[name])
+        assert_equal(parts[name], watched[name])
     assert losses(tmp_path) == losses(folder.path)
     files = {"recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"}
     assert names_in(tmp_path) == files
@@ -148,7 +147,7 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     ours = parts_of(stopped)
     theirs = parts_of(through)
     for name in ("weights", "ema"):
-        assert same(ours[name], theirs[name])
+        assert_equal(ours[name], theirs[name])
         assert all(tensor.isfinite().all() for tensor in ours[name].values())
 
 
