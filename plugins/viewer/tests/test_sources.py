@@ -1,19 +1,22 @@
 """What `qgs view` makes of a PLY, and of a finished reconstruction with or without its model."""
 
 import json
+import shlex
 import shutil
 
 import pytest
+import torch
+from photo_formats import noisy_photos
 from qgs_viewer.opening import ModelSource, open_source
 from qgs_viewer.query_scene import NEUTRAL
-from small import VIEWS, model_of
+from small import VIEWS, cloud, model_of
 from tables import must_refuse
 from walk import Walk
 
 import qgs
 from qgs.data.samples import make_sample
 from qgs.reconstruction.result import reconstruct_sample
-from qgs.reconstruction.scene_formats import load_ply
+from qgs.reconstruction.scene_formats import load_ply, save_splat
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +28,41 @@ def finished(tmp_path_factory):
     sample = make_sample(Walk(), (1, 4), (0, 2, 3, 5), VIEWS, mirror=False)
     reconstruct_sample(model, sample).save(folder / "scene")
     return folder / "scene"
+
+
+def test_photos_are_shown_by_the_model_for_their_size(tmp_path, monkeypatch):
+    photos = str(tmp_path)
+    monkeypatch.setattr("qgs_viewer.opening.open_model", lambda name, device, **given: name)
+    assert open_source(photos, photos=None, size=(127, 300)) == "worlds/landmark-64"
+    assert open_source(photos, photos=None, size=(128, 300)) == "worlds/landmark-256"
+    assert open_source(photos, photos="others") == photos
+    video = tmp_path / "walk.MP4"
+    video.touch()
+    assert open_source(str(video), photos=None) == "worlds/landmark-256"
+    (tmp_path / "checkpoint.safetensors").touch()
+    assert open_source(photos, photos=None) == photos
+
+
+def test_a_scene_is_shown_with_photos_that_are_still_there(tmp_path):
+    photos = noisy_photos(tmp_path / "my photos", 4)
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    save_splat(cloud(5), scene / "scene.splat")
+    command = shlex.join(["qgs", "scene", str(photos), "--size", "16x16"])
+    names = [f"images/{frame}.png" for frame in (0, 2)]
+    record = {"command": command, "refined_on": names}
+    (scene / "metrics.json").write_text(json.dumps(record))
+    source = open_source(str(scene))
+    shown = source.scene_of(())
+    assert (shown.gaussians.count, shown.background) == (5, (0.0, 0.0, 0.0))
+    cameras = qgs.read_photos(photos).cameras.c2w
+    assert torch.equal(shown.views.cameras.c2w, cameras[:, [0, 2]])
+    assert shown.views.images.shape[-2:] == (16, 16)
+    assert not source.notes
+    shutil.rmtree(photos)
+    source = open_source(str(scene))
+    assert source.scene_of(()).views is None
+    assert "my photos" in source.notes[0]
 
 
 @pytest.fixture

@@ -49,8 +49,9 @@ class FigureName(StrEnum):
 SourceName = Annotated[
     str,
     typer.Argument(
-        help="What to show: a run folder, a checkpoint, a shipped model (PLUGIN/NAME), a .ply, "
-        ".spz or .splat file, or a folder that qgs reconstruct wrote."
+        help="What to show: a folder of photos, a video, a run folder, a checkpoint, a shipped "
+        "model (PLUGIN/NAME), a .ply, .spz or .splat file, or a folder that qgs reconstruct or qgs "
+        "scene wrote."
     ),
 ]
 ModelPhotos = Annotated[
@@ -125,7 +126,7 @@ Models = Annotated[
     typer.Option(
         "--model",
         help="Trained model to compare: run folder, checkpoint, URL or shipped model. Repeatable. "
-        "Default: three shipped models on unseen rooms, worlds/landmark-128 on photos.",
+        "Default: three shipped models on unseen rooms, worlds/landmark-256 on photos.",
     ),
 ]
 Train = Annotated[

@@ -14,13 +14,12 @@ from qgs.train.folder import RunFolder
 from qgs.train.guard import TrainingError
 from qgs.train.training import train
 from qgs_viewer.comparison import open_models, resolve_fairly
+from qgs_viewer.opening import photo_model
 from qgs_viewer.remarks import next_commands
 from qgs_viewer.report import Comparison, write_report
 
 # The shipped models that are compared on unseen rooms.
 MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
-ON_PHOTOS = {64: ["worlds/landmark-64"], 128: ["worlds/landmark-128"]}
-"""Default models for a user's photos, by the image size of the models in pixels."""
 # The recipes that `qgs demo --train` trains.
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
@@ -40,9 +39,7 @@ def compare_models(
     which camera positions are multiplied; None searches for a factor.
     """
     pixels = parse_size(size)
-    # models of 128 pixels need photos of that size at least
-    side = 64 if pixels and min(pixels) < 128 else 128
-    names = models or (MODELS if photos is None else ON_PHOTOS[side])
+    names = models or (MODELS if photos is None else [photo_model(pixels)])
     console = Console()
     scenes = "Unseen scenes" if photos is None else "Your photos"
     # warnings about photos concern whoever reads the page, not only the terminal

@@ -1,6 +1,7 @@
 """Open what `qgs view` shows: a file of Gaussians, a reconstruction, or a model with photos."""
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,24 +12,32 @@ import torch
 from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile
+from qgs.checkpoint.models import CHECKPOINT
+from qgs.cli.options import parse_size
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.images import decode_rgb, read_image, to_tensor
 from qgs.data.recognition import is_training_data
 from qgs.data.samples import make_sample, own_world, views_in
+from qgs.data.view_samplers import evenly
 from qgs.domain import Domain, verdict
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import checked_window, choose_frames
 from qgs.reconstruction.scale import constant_scale, find_scale, photo_settings
 from qgs.reconstruction.scene_formats import about_origin, load_ply
-from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene
+from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene, read_photos
 from qgs.types import Cameras
-from qgs.wording import listed
+from qgs.wording import listed, one_line
 from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 
 PLY = "gaussians.ply"
+SPLAT = "scene.splat"
+"""File of Gaussians that `qgs scene --out FOLDER` writes, beside scene.ply."""
 _SCENES = (".ply", ".splat", ".spz", ".sog", ".ksplat")
+# Photos that are shown beside a scene of `qgs scene`.
+PHOTOS = 12
+_VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 CAMERAS = "cameras.json"
 """File with the cameras, which `qgs reconstruct --out FOLDER` writes beside gaussians.ply."""
 REFINED = "refined"
@@ -106,15 +115,36 @@ class ModelSource(Source):
         return explained(self.model, inputs, picked, place)
 
 
-def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
-    """Open the file of Gaussians, the reconstruction, the run folder or the model `name`.
+def photo_model(size: Size | None = None) -> str:
+    """Return the name of the default model for a user's photos.
 
-    options: passed to `open_model`. Raises ValueError if options are given for a file of Gaussians
-    or a reconstruction, which take no options. Errors of the readers of files pass through.
+    size: (H, W) of the photos in pixels, if the user gives it.
+    """
+    # the larger models were trained on images of 128 pixels and more
+    return "worlds/landmark-64" if size and min(size) < 128 else "worlds/landmark-256"
+
+
+def holds_photos(path: Path) -> bool:
+    """Return True if `path` is a folder without checkpoint, or a video."""
+    if path.is_dir():
+        return not (path / CHECKPOINT).is_file()
+    return path.is_file() and path.suffix.lower() in _VIDEOS
+
+
+def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
+    """Open the file of Gaussians, the scene, the reconstruction, the model or the photos `name`.
+
+    options: passed to `open_model`. Photos are reconstructed by `photo_model`. Raises ValueError if
+    options are given for a file of Gaussians, a scene or a reconstruction, which take no options.
+    Errors of the readers of files pass through.
     """
     path = Path(name).expanduser()
     finished = is_finished(path)
-    if not finished and path.suffix.lower() not in _SCENES:
+    made = (path / SPLAT).is_file()
+    if not (made or finished or path.suffix.lower() in _SCENES):
+        if options.get("photos") is None and holds_photos(path):
+            options["photos"] = name
+            name = photo_model(options.get("size"))
         return open_model(name, device, **options)
     if given := [option for option, value in options.items() if value]:
         raise ValueError(
@@ -123,6 +153,8 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
         )
     if finished:
         return open_finished(path, device)
+    if made:
+        return open_made(path)
     note = "A file of Gaussians has neither queries nor photos; name the model to see them."
     # the browser gets float32
     gaussians, _ = about_origin(load_ply(path))
@@ -199,6 +231,27 @@ def _scene(recipe: Recipe, photos: str | None, size: Size | None, name: str | No
     if name is not None:
         return named_scene(data, "the data of the recipe", name)
     return data.scenes("test" if data.names("test") else "train")[0]
+
+
+def open_made(folder: Path) -> Source:
+    """Open the Gaussians that `qgs scene` wrote into `folder`, with some of their photos.
+
+    If the photos are gone, a note says so. Raises the errors of `load_ply`.
+    """
+    # one colour from all sides, as the viewer shows it; scene.ply may have harmonics
+    gaussians, _ = about_origin(load_ply(folder / SPLAT))
+    notes = []
+    views = None
+    try:
+        record = json.loads((folder / "metrics.json").read_bytes())
+        words = shlex.split(record["command"])
+        size = parse_size(words[words.index("--size") + 1])
+        # qgs scene PHOTOS
+        views = read_photos(words[2], size=size, frames=evenly(record["refined_on"], PHOTOS))
+    except (OSError, ValueError) as error:
+        notes.append(f"The photos of the scene are not shown: {one_line(error)}")
+    shown = QueryScene(gaussians, views, background=(0.0, 0.0, 0.0))
+    return Source(folder.name, notes, shown)
 
 
 def is_finished(folder: Path) -> bool:
