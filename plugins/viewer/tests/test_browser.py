@@ -129,6 +129,7 @@ def test_a_report(page, tmp_path):
     assert page.evaluate(shown) == [True, False]
 
     slide(page)
+    pick(page)
     zoom(page)
     paper = "getComputedStyle(document.body).backgroundColor"
     white = "rgb(255, 255, 255)"
@@ -138,6 +139,11 @@ def test_a_report(page, tmp_path):
     assert page.evaluate(paper) != white
     page.evaluate(press)
     assert page.evaluate(paper) == white
+
+    phone = {"width": 420, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    page.call("Emulation.setDeviceMetricsOverride", **phone)
+    assert page.evaluate("document.documentElement.scrollWidth") == 420
+    page.call("Emulation.clearDeviceMetricsOverride")
 
     assert not page.evaluate("!!document.querySelector('iframe')")
     page.evaluate("document.querySelector('.open').click()")
@@ -175,6 +181,24 @@ def slide(page):
     page.key("PageUp", 33)
     assert 5 < page.evaluate(value) < 60
     assert abs(truth - render).mean() > 10
+
+    at = {"x": left + width // 4, "y": top + 50}
+    page.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[at])
+    page.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    assert 20 < page.evaluate(value) < 30
+
+
+def pick(page):
+    """The buttons below the large picture show another model and another view."""
+    shown = "[...document.querySelectorAll('.compare:not([hidden]) img')].map(img => img.alt)"
+    best = page.evaluate(shown)
+    assert [text.partition(",")[0] for text in best] == ["photo", PAIR[0]]
+    page.evaluate("document.querySelectorAll('[data-pick=model]')[1].click()")
+    photo, render = page.evaluate(shown)
+    assert (photo, render.partition(",")[0]) == (best[0], PAIR[1])
+    page.evaluate("document.querySelectorAll('[data-pick=view]')[1].click()")
+    other, render = page.evaluate(shown)
+    assert (other != photo, render.partition(",")[0]) == (True, PAIR[1])
 
 
 def zoom(page):

@@ -94,9 +94,10 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
 def test_no_model_is_marked_by_few_samples_or_below_a_baseline(models, tmp_path, monkeypatch):
     results = opened(models, noisy_photos(tmp_path, 12))
     assert results[0].evaluation.samples < report.RANKED
-    assert not any(best for row in report.score_rows(results).values() for _, best in row)
+    columns = results[0].evaluation.columns
+    assert not any(best for row in report.score_rows(results, columns).values() for _, best in row)
     monkeypatch.setattr(report, "RANKED", 1)
-    rows = [row[0] for row in report.score_rows(results).values()]
+    rows = [row[0] for row in report.score_rows(results, columns).values()]
     highest = max(float(psnr) for psnr, _ in rows)
     assert [best for _, best in rows[:2]] == [float(psnr) == highest for psnr, _ in rows[:2]]
 

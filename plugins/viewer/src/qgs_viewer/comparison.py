@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -32,6 +32,7 @@ from qgs.reconstruction.scenes import (
     size_multiple,
     whole_size,
 )
+from qgs_viewer.trust import ScoredView, scored_views
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
 WINDOWS = 6
@@ -141,7 +142,8 @@ class Model:
     name: short and unique. file: checkpoint of the model. recipe: recipe of the training, but with
     the data of the comparison. search: the network, and the scales of camera positions found for
     scenes. step: number of training steps; None if unknown. windows: sampler of input and compared
-    photos from a user's photos; None if the scenes come from the recipe's data.
+    photos from a user's photos; None if the scenes come from the recipe's data. views: views that
+    `evaluation` has scored.
     """
 
     name: str
@@ -150,6 +152,7 @@ class Model:
     search: ScaleSearch
     step: int | None
     windows: PhotoWindows | None
+    views: list[ScoredView] = field(default_factory=list)
 
     @property
     def network(self) -> QueryGaussianModel:
@@ -160,7 +163,12 @@ class Model:
     def evaluation(self) -> Evaluation:
         """Scores on the test views of `recipe`. The evaluation leaves the network on the CPU."""
         found = evaluate(
-            self.network, self.recipe, self.step, views_of=self.search, sampler=self.windows
+            self.network,
+            self.recipe,
+            self.step,
+            views_of=self.search,
+            sampler=self.windows,
+            show=lambda *shown: self.views.extend(scored_views(*shown)),
         )
         # the next model needs the memory of the accelerator
         self.network.cpu()

@@ -11,9 +11,8 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from qgs.drawing.images import rgb_picture
-from qgs.geometry.transforms import to_camera, to_pixels
 from qgs_viewer.look import INK, Color, enlarged
-from qgs_viewer.placement import Splats, corners, on_photo
+from qgs_viewer.placement import Splats, corners, on_photo, seen_from
 from qgs_viewer.query_scene import QueryScene
 
 Others = Literal["shown", "faint", "hidden"]
@@ -306,10 +305,8 @@ def distance_to(scene: QueryScene) -> float:
         found = (solid - solid.median(0).values).norm(dim=-1)
     else:
         cameras = scene.views.cameras.to("cpu")
-        points = to_camera(solid[None], cameras)[0]
-        pixels = to_pixels(points, cameras.intrinsics[0])
-        inside = (pixels >= 0) & (pixels <= torch.tensor(cameras.size[::-1]))
-        seen = (points[..., 2] > 0) & inside.all(-1)
-        found = points[..., 2][seen] if seen.any() else points.norm(dim=-1)
+        depths, seen = seen_from(cameras, solid)
+        eyes = cameras.c2w[0, :, :3, 3]
+        found = depths[seen] if seen.any() else torch.cdist(eyes, solid)
     # a scene of one point has no size, and frusta of none would be invisible
     return max(float(found.median()) * scene.placement.scale, 1e-6)

@@ -9,19 +9,20 @@ from rich import box
 from rich.console import Console
 from rich.text import Text
 
+from qgs.contracts import Column
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.recipe.slots import summary_of
 from qgs.terminal import print_lines, print_table
 from qgs.wording import counted, listed
-from qgs_viewer import sections
+from qgs_viewer import sections, trust
 from qgs_viewer.comparison import Model
 from qgs_viewer.look import data_uri, hex_color, page_environment
 from qgs_viewer.remarks import remarks
 from qgs_viewer.scenes import ModelScenes, model_scenes
 from qgs_viewer.sections import Detail
 
-PICTURED_SCENES = 6
+PICTURED_SCENES = 3
 # Target views of each scene that are shown.
 TARGETS = 2
 RANKED = 5
@@ -44,14 +45,18 @@ class Comparison:
     notes: Sequence[str] = ()
 
 
-def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
+def score_rows(
+    models: Sequence[Model], columns: Mapping[str, Column]
+) -> dict[str, list[tuple[str, bool]]]:
     """Return the table of scores as rows by name: first the models, then the baselines.
 
-    A cell is a pair: its text, and True if its value is the best of all rows. With fewer than
-    RANKED samples no value is marked.
+    columns: what to show, by name; "coverage" is that of `trust.means`. A cell is a pair: its text,
+    and True if its value is the best of all rows. With fewer than RANKED samples no value is
+    marked.
     """
-    columns = models[0].evaluation.columns
     means = [model.evaluation.means() for model in models]
+    for model, own in zip(models, means, strict=True):
+        own["coverage"] = 100 * trust.means(model.views).coverage
     baselines = {name: models[0].evaluation.means(name) for name in BASELINES}
     rivals = [*means, *baselines.values()] if models[0].evaluation.samples >= RANKED else []
     rows = {}
@@ -59,25 +64,32 @@ def score_rows(models: Sequence[Model]) -> dict[str, list[tuple[str, bool]]]:
         cells = rows[model.name] = list[tuple[str, bool]]()
         for name, column in columns.items():
             cell = column.shown(own[name])
-            best = column.best(other[name] for other in rivals)
+            best = column.best(other.get(name) for other in rivals)
             # cells that read alike are both best
             cells.append((cell, best is not None and cell == column.shown(best)))
         for size in (model.evaluation.gaussians, model.parameters):
             cells.append((f"{size:,}", False))
     for baseline, own in baselines.items():
-        shown = [column.shown(own[name]) for name, column in columns.items()]
+        shown = [column.shown(own.get(name)) for name, column in columns.items()]
         # they have neither Gaussians nor parameters
         cells = [(cell, False) for cell in (*shown, "–", "–")]
         rows[baseline.replace("_", " ").capitalize()] = cells
     return rows
 
 
+def verdicts(models: Sequence[Model]) -> dict[str, str]:
+    """Return the verdict on each model, by name."""
+    return {model.name: trust.verdict(model.views) for model in models}
+
+
 def show_scores(comparison: Comparison, console: Console) -> None:
     """Print the table of scores in the terminal, with the best values in green."""
-    columns = comparison.models[0].evaluation.columns.values()
+    # the verdicts give the coverage, for which a narrow terminal has no column
+    columns = comparison.models[0].evaluation.columns
     lines = list[Sequence[str | Text]]()
-    lines.append(["", *(column.title for column in columns), "Gaussians", "parameters"])
-    for name, row in score_rows(comparison.models).items():
+    titles = [column.title for column in columns.values()]
+    lines.append(["", *titles, "Gaussians", "parameters"])
+    for name, row in score_rows(comparison.models, columns).items():
         lines.append([name, *(Text(cell, "green" if best else "") for cell, best in row)])
     look = {"box": box.SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True}
     samples = comparison.models[0].evaluation.samples
@@ -95,8 +107,14 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     models = comparison.models
     first = models[0]
     detail = Detail()
+    scenes = [
+        sections.pictured_scene(shown, place, range(len(sample.target_frames))[:TARGETS])
+        for place, sample in enumerate(shown[0].samples)
+    ]
+    ranked = [view for scene in scenes for view in scene["views"]]
+    # the best first, by the first model
+    ranked.sort(key=lambda view: -view["score"])
     found = [
-        sections.scene_to_turn(shown),
         sections.queries(shown, detail),
         sections.anchors(shown, detail),
         sections.attention(shown, detail),
@@ -109,18 +127,20 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     views = f"{samples}, {first.recipe.views.inputs} inputs, scored on views {judged} the inputs"
     names = listed((model.name for model in models), most=3)
     metrics = [part for place, part in first.recipe.parts.items() if place[0] == "metrics"]
+    columns = [*first.evaluation.columns.items()]
+    columns.insert(1, ("coverage", trust.COVERAGE))
     environment = page_environment(uri=data_uri, hex=hex_color)
     return environment.get_template("report.html").render(
         comparison=comparison,
         title=f"{names}: {comparison.scenes.lower()}",
-        columns=first.evaluation.columns.values(),
-        rows=score_rows(models),
+        columns=[column for _, column in columns],
+        rows=score_rows(models, dict(columns)),
         facts={"Data": data, "Views": views, **comparison.facts},
         meanings=[summary_of(metric.component) for metric in metrics],
-        scenes=[
-            sections.pictured_scene(shown, place, range(len(sample.target_frames))[:TARGETS])
-            for place, sample in enumerate(shown[0].samples)
-        ],
+        scenes=scenes,
+        views=ranked,
+        turned=sections.scene_to_turn(shown),
+        verdicts=verdicts(models),
         sections=[section for section in found if section.rows],
     )
 
@@ -131,6 +151,7 @@ def write_report(comparison: Comparison, folder: Path, console: Console) -> None
     print_lines(console, notes)
     comparison = replace(comparison, notes=[*comparison.notes, *notes])
     show_scores(comparison, console)
+    print_lines(console, [f"{name}: {text}" for name, text in verdicts(comparison.models).items()])
     # the table first: the page takes longer
     console.print("writing the page", style="dim")
     page = folder / "report.html"

@@ -103,11 +103,8 @@ def scene_to_turn(models: Shown) -> Section:
     for model in models:
         camera = images.finer(model.target_camera, Detail.side)
         picture = rgb_picture(model.network.render(model.gaussians[0], camera).rgb[0, 0])
-        choice = None
-        if model.scene.has_anchors:
-            (query,) = model.notable(1, camera)
-            choice = Choice(query.index, layer=model.scene.depth, others="shown")
-        tiles.append(Tile(picture, model.name, page=scene_html(model.scene, choice)))
+        page = scene_html(model.scene, Choice(anchors=False))
+        tiles.append(Tile(picture, model.name, page=page))
     return Section("scene", {"": tiles})
 
 
@@ -208,24 +205,27 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
     """Return the pictures of a scene as a dict for the template.
 
     Keys are `name`, the name of the scene; `inputs`, tiles of the input photos; `kinds`, tiles of
-    the target views by kind (Render, Error, Depth), then by column (Truth, names of models); and
-    `most`, the absolute error that the error pictures show as the brightest colour.
+    the target views by kind (Render, Error, Depth), then by column (Truth, names of models);
+    `most`, the absolute error that the error pictures show as the brightest colour; and `views`,
+    with the PSNR by the first model (`score`) and the render of all (`tiles`) of each target view.
 
     place: index of the scene among the samples. targets: indices of the target views to show.
     """
     sample = models[0].samples[place]
     views = sample.targets.select(list(targets))
     truth = views.images[0]
-    captions = [f"frame {sample.label(sample.target_frames[target])}" for target in targets]
+    captions = [f"frame {sample.short_label(sample.target_frames[view])}" for view in targets]
     colors = {"Truth": _photos(truth, captions)}
     depths = {} if views.depths is None else {"Truth": views.depths[0]}
     errors = {}
+    ranks: list[float] = []
     for model in models:
         own = model.samples[place]
         cameras = own.targets.select(list(targets)).cameras
         rendering = model.network.render(model.gaussians[place], cameras)
         rgb = rendering.rgb[0]
         scores = psnr(rgb, truth).tolist()
+        ranks = ranks or scores
         quality = [f"{Psnr.column.shown(score)} {Psnr.column.unit}" for score in scores]
         colors[model.name] = _photos(rgb, quality)
         errors[model.name] = (rgb.clamp(0, 1) - truth.to(rgb)).abs().mean(1, keepdim=True)
@@ -239,12 +239,15 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
         kinds["Error"][name] = [Tile(shaded(error, 0.0, most, ERROR_MAP)) for error in maps]
     for name, maps in depths.items():
         kinds["Depth"][name] = [Tile(depth_picture(depth, near, far)) for depth in maps]
-    inputs = [f"frame {sample.label(frame)}" for frame in sample.input_frames]
+    shown = [dict(zip(colors, tiles, strict=True)) for tiles in zip(*colors.values(), strict=True)]
+    views = zip(ranks, shown, strict=True)
+    inputs = [f"frame {sample.short_label(frame)}" for frame in sample.input_frames]
     return {
         "name": sample.scene,
         "inputs": _photos(sample.inputs.images[0], inputs),
         "kinds": kinds,
         "most": most,
+        "views": [{"score": score, "tiles": tiles} for score, tiles in views],
     }
 
 

@@ -10,8 +10,36 @@ theme.onclick = () => { root.style.colorScheme = isDark() ? "light" : "dark"; na
 system.onchange = name;
 name();
 
-for (const slider of all(".compare input"))
-  slider.oninput = () => slider.parentElement.style.setProperty("--at", slider.value + "%");
+const sliders = all(".compare input");
+function slide(value) {
+  for (const slider of sliders) {
+    slider.value = value;
+    slider.parentElement.style.setProperty("--at", slider.value + "%");
+  }
+}
+for (const slider of sliders) {
+  slider.oninput = () => slide(slider.value);
+  // Phones move a slider by its thumb alone, here by any place.
+  slider.onpointerdown = slider.onpointermove = (event) => {
+    const { left, width } = slider.getBoundingClientRect();
+    if (event.buttons) slide((100 * (event.clientX - left)) / width);
+  };
+}
+
+const large = all(".large .compare"), picks = all(".picks button"), picked = { view: "0", model: "0" };
+for (const button of picks)
+  button.onclick = () => {
+    picked[button.dataset.pick] = button.dataset.number;
+    for (const pick of picks) pick.ariaPressed = pick.dataset.number === picked[pick.dataset.pick];
+    for (const figure of large)
+      figure.hidden = figure.dataset.view !== picked.view || figure.dataset.model !== picked.model;
+  };
+for (const pick of picks.filter((pick) => pick.dataset.pick === "view")) {
+  const small = document.createElement("img");
+  small.src = large.find((figure) => figure.dataset.view === pick.dataset.number).querySelector("img").src;
+  small.alt = pick.title;
+  pick.replaceChildren(small);
+}
 
 for (const button of all(".open"))
   button.onclick = () => {
@@ -24,14 +52,14 @@ for (const button of all(".open"))
     frame.focus();
   };
 
-const dialog = document.getElementById("zoom"), large = dialog.querySelector("img");
+const dialog = document.getElementById("zoom"), enlarged = dialog.querySelector("img");
 const pictures = all("figure img").filter((img) => !img.closest(".open, .compare"));
 let place = 0;
 function zoom(img) {
   place = pictures.indexOf(img);
-  large.src = img.src;
-  large.alt = dialog.querySelector("p").textContent = img.alt;
-  large.classList.toggle("pixels", img.naturalWidth <= 128);
+  enlarged.src = img.src;
+  enlarged.alt = dialog.querySelector("p").textContent = img.alt;
+  enlarged.classList.toggle("pixels", img.naturalWidth <= 128);
   if (!dialog.open) dialog.showModal();
 }
 for (const img of pictures) {

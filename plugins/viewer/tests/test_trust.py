@@ -1,0 +1,69 @@
+"""The verdict on a model: what inputs see of scored views, and the rules of its words."""
+
+import pytest
+import torch
+from qgs_viewer.trust import UNSEEN, WHOLE, WRONG, Part, means, scored_views, verdict
+
+from qgs.data.samples import Sample
+from qgs.types import Cameras, Rendering, Views
+
+SIDE = 12
+
+
+def cameras(*places):
+    """They look along z, the view of each as wide as what it sees is far away."""
+    c2w = torch.eye(4).repeat(1, len(places), 1, 1)
+    c2w[0, :, 0, 3] = torch.tensor(places)
+    lens = torch.tensor([SIDE, SIDE, SIDE / 2, SIDE / 2])
+    return Cameras(c2w, lens.expand(1, len(places), 4), (SIDE, SIDE))
+
+
+def test_a_pixel_is_seen_if_its_point_at_the_rendered_depth_lies_in_an_input():
+    """A target a third of its view to the left of the input, and rows of little alpha."""
+    grey = torch.full((1, 1, 3, SIDE, SIDE), 0.5)
+    depth = torch.full((1, 1, 1, SIDE, SIDE), 2.0)
+    alpha = torch.ones_like(depth)
+    alpha[..., -4:, :] = 0.4
+    inputs = Views(grey + 0.1, cameras(0.0))
+    targets = Views(grey, cameras(-2 / 3))
+    sample = Sample("room", inputs, targets, (3,), (7,), ())
+    ((name, parts),) = scored_views(sample, Rendering(grey - 0.01, alpha, depth))
+    assert name == "view 7 of room"
+    found = {name: part.coverage for name, part in parts.items()}
+    thirds = {"left": 0, "middle": 2 / 3, "right": 2 / 3, "top": 2 / 3, "bottom": 0}
+    assert found == pytest.approx({WHOLE: 4 / 9, **thirds})
+    assert parts["right"][1:] == pytest.approx((40, 20), abs=1e-3)
+    assert parts["left"].doubt == UNSEEN
+
+
+GOOD = Part(1.0, 26.0, 15.0)
+BAD = Part(0.8, 14.0, 15.0)
+DARK = Part(0.2, 30.0, 15.0)
+
+
+@pytest.mark.parametrize(
+    ("whole", "parts", "said"),
+    [
+        (GOOD, {}, "Sharp where the inputs look, at 100 % of the scored views (26.0 dB"),
+        (GOOD._replace(psnr=24.9), {}, "Soft"),
+        (GOOD._replace(psnr=19.9), {}, "Blurred"),
+        (BAD, {"left": DARK}, "Wrong where the inputs look, at 80 % of the scored views (14.0 dB"),
+        (BAD, {"left": DARK}, "the left third of a.jpg. Do not trust any part."),
+        (Part(0.0, torch.nan, torch.nan), {}, "Do not trust any part."),
+        (GOOD, {"left": DARK}, f"{UNSEEN}: the left third of a.jpg."),
+        (GOOD, {"top": BAD}, f"{WRONG}: the top third of a.jpg."),
+        (GOOD, {"top": BAD, "left": DARK}, "Do not trust the top or the left third."),
+    ],
+)
+def test_words_follow_the_rules(whole, parts, said):
+    one = ("a.jpg", {WHOLE: whole, **parts})
+    assert said in verdict([one])
+    # what is seen in two of three views is trusted
+    others = [("b.jpg", {WHOLE: GOOD, **dict.fromkeys(parts, GOOD)})] * 2
+    if parts:
+        assert "Do not trust" not in verdict([one, *others])
+
+
+def test_a_view_that_no_input_sees_counts_for_coverage_alone():
+    views = [("a", {WHOLE: GOOD}), ("b", {WHOLE: Part(0.0, torch.nan, torch.nan)})]
+    assert means(views) == Part(0.5, 26.0, 15.0)
