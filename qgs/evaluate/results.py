@@ -68,6 +68,11 @@ class Evaluation:
     step: int | None
     remarks: Sequence[str] = ()
 
+    @property
+    def samples(self) -> int:
+        """Number of samples in all scenes."""
+        return sum(len(score.views) for score in self.scores)
+
     def mean(self, value: str) -> float | None:
         """Return the mean of a value over the scenes that have it; None if no scene has it.
 
@@ -94,7 +99,7 @@ class Evaluation:
             "step": self.step,
             "scenes": len(self.scores),
             "scenes_in_protocol": self._wanted,
-            "samples": sum(len(score.views) for score in self.scores),
+            "samples": self.samples,
             "missing": self.missing,
             "context_and_target": {s.scene: s.given for s in self.scores if s.given},
             "columns": {name: asdict(column) for name, column in self.columns.items()},

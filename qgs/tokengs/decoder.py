@@ -5,7 +5,6 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.contracts import (
-    SUBLAYER_SLOTS,
     AttentionWeights,
     ComponentConfig,
     CrossAttention,
@@ -50,7 +49,7 @@ class CrossSelfMlp(DecoderLayer):
     """
 
     name = "cross_self_mlp"
-    sublayers = SUBLAYER_SLOTS
+    sublayers = ("cross_attention", "self_attention", "feed_forward")
 
     def __init__(self, config: ComponentConfig, parts: LayerParts) -> None:
         super().__init__(config, parts)
