@@ -41,6 +41,8 @@ _SEEN = 0.7
 # Number of photos to sweep, and the ranks by distance of the photos matched with each.
 _PHOTOS = 4
 _OTHERS = (0, 1, 4)
+# Least length in pixels to which the shorter side of photos is reduced for the sweep.
+_SWEPT = 64
 # Planes at depths from 1/64 to 4 times the extent of the cameras.
 _PLANES = 28
 # Largest angle between the axes of matched photos, in degrees.
@@ -245,9 +247,12 @@ def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
     others = _matched(scene, frame, extent)
     if not others:
         return planes[:0]
-    photo, *images = scene.images([frame, *others])
-    size = scene.cameras.size
     cameras = scene.cameras.to(torch.float64)
+    # More pixels would take time and change little.
+    step = max(min(cameras.size) // _SWEPT, 1)
+    photo, *images = F.avg_pool2d(scene.images([frame, *others]), step)
+    size = photo.shape[-2:]
+    cameras = cameras.replace(intrinsics=cameras.intrinsics / step)
     pose = cameras.c2w[frame]
     rays_HW3 = pixel_directions(cameras.intrinsics[frame], size) @ pose[:3, :3].T
     points_DHW3 = pose[:3, 3] + rays_HW3 * planes[:, None, None, None]

@@ -23,7 +23,7 @@ DEPTH_MAP = "viridis_r"
 # Pixels between pictures in a row.
 GAP = 4
 # Of a GIF.
-FRAMES_PER_SECOND = 16
+FRAMES_PER_SECOND = 12
 
 
 def rgb_picture(image: Tensor) -> Picture:
@@ -76,7 +76,7 @@ def side_by_side(pictures: list[Picture]) -> Picture:
 def png_bytes(picture: Picture) -> bytes:
     """Encode a picture as the bytes of a PNG file."""
     buffer = BytesIO()
-    Image.fromarray(picture).save(buffer, format="PNG", optimize=True)
+    Image.fromarray(picture).save(buffer, format="PNG")
     return buffer.getvalue()
 
 

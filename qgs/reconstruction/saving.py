@@ -18,7 +18,7 @@ from qgs.reconstruction.result import Reconstruction, sample_cameras
 from qgs.reconstruction.scene_formats import save_gaussians, save_ply, scene_writers
 from qgs.types import Cameras
 
-ORBIT_FRAMES = 48
+ORBIT_FRAMES = 24
 ORBIT_SIDE = 320
 SWAY = 0.12
 """Sideways motion of an orbit, as a fraction of the depth of the scene."""
