@@ -76,6 +76,15 @@ class Scene(ABC):
         """
         return None
 
+    def median_depth(self, frames: Sequence[int]) -> float | None:
+        """Return the median depth of what `frames` show, in world units; None if it is unknown.
+
+        By default, it comes from the depth maps.
+        """
+        depths = self.depths(frames)
+        known = [] if depths is None else depths[depths > 0]
+        return float(known.median()) if len(known) else None
+
     def __len__(self) -> int:
         """Return F, the number of frames."""
         return self.cameras.shape[0]

@@ -4,6 +4,9 @@ Camera positions of photos may be in any unit, but a model needs the unit of its
 model runs on the inputs at several factors, and the factor with the best PSNR of rendered photos is
 chosen. Inputs alone mislead: if the factor is too small, the model can reproduce the inputs by
 surfaces close to the cameras. So a few photos that are not inputs are scored too.
+
+Depth maps or points in 3D tell how far away the things are that inputs show. Then only factors that
+bring them to depths of the training are tried.
 """
 
 import math
@@ -20,6 +23,7 @@ from qgs.geometry.poses import look_at_depth, scaled
 from qgs.metrics.baselines import pose_distance
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
+from qgs.reconstruction.scenes import reduced
 from qgs.types import Views
 from qgs.wording import listed
 
@@ -42,6 +46,11 @@ smallest depth of its training."""
 REACH = 6.0
 """Largest depth that the search tries for the point that cameras look at, in multiples of the
 smallest depth of this point in training."""
+DEPTHS = (0.5, 1.5)
+"""Smallest and largest median depth of what the inputs show that the search tries, if this depth is
+known. In the training of the shipped models, 90 % of samples have medians from 0.56 to 1.57."""
+SIDE = 128
+"""Length in pixels to which the shorter side of larger photos is reduced for the search."""
 PENALTY = 5.0
 """Penalty in dB on the score of a factor that makes depths smaller than in training. It is PENALTY
 times ln(limit / factor), with the limit from `search_range`. It applies only if the
@@ -57,7 +66,8 @@ class FoundScale:
 
     further: scored frames that are not inputs. names: file names of these frames.
     psnr: mean PSNR in dB of inputs and further photos, where further photos have twice the weight.
-    tried: pairs of a tried factor and its mean PSNR.
+    tried: pairs of a tried factor and its mean PSNR. depth: median depth of what the inputs show,
+        in the unit of the poses; None if it is unknown.
     """
 
     factor: float
@@ -65,6 +75,7 @@ class FoundScale:
     further: Frames
     names: Sequence[str]
     tried: Sequence[tuple[float, float]]
+    depth: float | None = None
 
     @property
     def poor(self) -> str:
@@ -75,7 +86,7 @@ class FoundScale:
                 f"no scale fits: the best gives only {self.psnr:.1f} dB; choose inputs that "
                 "overlap more (frames), or set the scale (--scale, views.scale_factor)"
             )
-        if self.further:
+        if self.further or self.depth:
             return ""
         return (
             "the scale was found on input photos only and may be wrong: add photos between them, "
@@ -111,16 +122,19 @@ def find_scale(
 ) -> FoundScale:
     """Search for the factor at which `model` renders photos of `scene` best.
 
-    The inputs and `further_photos` are scored. The coarse search tries factors with ratio STEP over
-    `search_range`, and goes on past an end of the range while the best factor is there. The fine
-    search tries thirds of a step around the best factor, then the vertex of a parabola through the
-    three best scores in log scale.
+    The inputs and `further_photos` are scored, reduced to SIDE pixels. The coarse search tries
+    factors with ratio STEP over `search_range`, and goes on past an end of the range while the best
+    factor is there. The fine search tries thirds of a step around the best factor, then the vertex
+    of a parabola through the three best scores in log scale. If `Scene.median_depth` is known, the
+    range is narrow: the coarse search stays in it, and the fine search tries halves of a step.
 
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
     given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
     model: must be in evaluation mode; the search runs on its device. compared: frames
         kept for the scores of the result, which the search does not use.
     """
+    scene = reduced(scene, SIDE, model.encoder.size_multiple(model.encoder.config))
+    depth = scene.median_depth(inputs)
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
     if not further and len(given) > 2:
@@ -128,11 +142,12 @@ def find_scale(
         given = tuple(frame for frame in given if frame not in further)
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
     frames = given if len(given) > 1 else given + further
-    low, high, nearest = search_range(model.trained_on or Domain(), scene, frames)
+    low, high, nearest = search_range(model.trained_on or Domain(), scene, frames, depth)
     # Even steps in log scale: what counts is the ratio to the right factor.
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))
-    # Places are thirds of a step, so that the finer search lies between those of the first.
+    # Places are parts of a step, so that the finer search lies between those of the first.
+    parts = 2 if depth else 3
     trial = _Trial(
         model,
         sample.inputs.joined(sample.targets).to(next(model.parameters()).device),
@@ -140,14 +155,14 @@ def find_scale(
         # Photos that are not given count twice: inputs alone mislead.
         [1 / len(given) for _ in given] + [2 / len(further) for _ in further],
         low,
-        ratio ** (1 / 3),
+        ratio ** (1 / parts),
         0.0 if further else nearest,
     )
-    best = trial.best(range(0, 3 * count, 3))
+    best = trial.best(range(0, parts * count, parts))
     if ratio > 1:
-        while (end := trial.past(best)) and len(trial.tried) < MOST:
+        while not depth and (end := trial.past(best)) and len(trial.tried) < MOST:
             best = trial.best(end)
-        best = trial.best([best + place for place in (-2, -1, 1, 2)])
+        best = trial.best([best + place for place in range(1 - parts, parts)])
         best = trial.best([best + trial.vertex(best)])
     return FoundScale(
         factor=trial.factor(best),
@@ -155,6 +170,7 @@ def find_scale(
         further=further,
         names=[scene.frame_name(frame) for frame in further],
         tried=sorted((trial.factor(place), found) for place, found in trial.tried.items()),
+        depth=depth,
     )
 
 
@@ -172,14 +188,20 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
     return tuple(sorted(frame for _, frame in sorted(zip(far, left, strict=True))[:FURTHER]))
 
 
-def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
+def search_range(
+    trained: Domain, scene: Scene, frames: Frames, seen: float | None = None
+) -> tuple[float, float, float]:
     """Return the least factor and the largest factor to try, and a limit for PENALTY.
 
     PENALTY may lower the scores of factors below this limit. At the limit, the point that the
     cameras look at is TOLERANCE times as far as the nearest such point in training. The limit is 0
     if the depth of the point is unknown.
-    trained: baselines and depths of cameras in the model's training. frames: the inputs.
+    trained: baselines and depths of cameras in the model's training. frames: the inputs. seen:
+        median depth of what they show; if it is known, factors bring it to DEPTHS, and the limit is
+        0.
     """
+    if seen:
+        return *_near_range(trained, seen), 0.0
     depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
     baseline = float(torch.cdist(centres, centres).max())
@@ -196,6 +218,21 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
         nearest = near * TOLERANCE / depth
     # Cameras on one point leave nothing to search: no factor changes what they see.
     return min(found, default=1.0), max(found, default=1.0), nearest
+
+
+def _near_range(trained: Domain, depth: float) -> tuple[float, float]:
+    """Return the least and the largest factor to try if the median depth of the photos is known.
+
+    trained: depths of the point that cameras look at in the model's training, which limit DEPTHS.
+    """
+    near, far = trained.ranges.get("depth", DEPTHS)
+    low = max(near, DEPTHS[0])
+    high = min(far, DEPTHS[1])
+    # A training in another unit: its own depths are all that is known.
+    if low >= high:
+        low = near
+        high = min(far, near * REACH)
+    return low / depth, high / depth
 
 
 @dataclass

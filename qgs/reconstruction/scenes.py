@@ -5,6 +5,7 @@ from os import fspath
 from typing import TypeAlias, get_args
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceConfig, Split
@@ -110,8 +111,16 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
     if multiple is None or stored is None:
         return trained
     # As many pixels as in training gave up to .3 dB less on novel views than its shorter side.
-    steps = min(trained) / min(stored) / multiple
-    height, width = (max(round(side * steps), 1) * multiple for side in stored)
+    return scaled_size(stored, min(trained), multiple)
+
+
+def scaled_size(size: Size, side: int, multiple: int) -> Size:
+    """Return a size (H, W) of about the shape of `size`, with a shorter side of about `side`.
+
+    Both sides of the result are multiples of `multiple`.
+    """
+    steps = side / min(size) / multiple
+    height, width = (max(round(length * steps), 1) * multiple for length in size)
     return height, width
 
 
@@ -172,6 +181,54 @@ def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
             )
         numbers += found
     return numbers
+
+
+def reduced(scene: Scene, side: int, multiple: int | None) -> Scene:
+    """Return `scene` with images whose shorter side has about `side` pixels; nothing is cropped.
+
+    `scene` is returned unchanged if its images are not larger, or if the size of images is fixed
+    (`multiple` is None). multiple: number that must divide both sides.
+    """
+    size = scene.cameras.size
+    if multiple is None or min(size) <= side:
+        return scene
+    return ReducedScene(scene, scaled_size(size, side, multiple))
+
+
+class ReducedScene(Scene):
+    """A scene with images reduced to `size` (H, W). It has no depth maps of its own."""
+
+    def __init__(self, scene: Scene, size: Size) -> None:
+        self.name = scene.name
+        self.held_out = scene.held_out
+        self.times = scene.times
+        self.scene = scene
+        self.size = size
+
+    @property
+    def cameras(self) -> Cameras:
+        """Cameras of all frames; their pixels may be a little longer than wide."""
+        given = self.scene.cameras
+        height, width = (new / old for new, old in zip(self.size, given.size, strict=True))
+        intrinsics = given.intrinsics * given.intrinsics.new_tensor([width, height] * 2)
+        return given.replace(intrinsics=intrinsics, size=self.size)
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """Return images (len(frames), 3, H, W)."""
+        return F.interpolate(self.scene.images(frames), self.size, mode="area")
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """Return masks (len(frames), 1, H, W); None if the scene has none."""
+        masks = self.scene.masks(frames)
+        return None if masks is None else F.interpolate(masks, self.size, mode="area")
+
+    def median_depth(self, frames: Sequence[int]) -> float | None:
+        """Return the median depth that the scene has for `frames`."""
+        return self.scene.median_depth(frames)
+
+    def frame_name(self, frame: int) -> str:
+        """Return the name that the scene has for `frame`."""
+        return self.scene.frame_name(frame)
 
 
 class GivenScene(Scene):

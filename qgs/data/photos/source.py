@@ -1,5 +1,6 @@
 """Data source `qgs/photos`: a folder of photos and cameras, or a folder of such folders."""
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -29,10 +30,11 @@ from qgs.data.images import (
     read_image,
     to_tensor,
 )
-from qgs.data.photos import formats_of, present_frames, readers
+from qgs.data.photos import formats_of, present_frames, read_listing, readers
 from qgs.data.photos.reader import PhotoFrame, Size, size_problems
 from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
 from qgs.data.view_samplers import held_out_frames
+from qgs.geometry.transforms import depths_in_view
 from qgs.paths import is_local, listing, opened_path
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
@@ -148,6 +150,18 @@ class PhotoScene(Scene):
         if all(self.photos[i].depth is None for i in frames):
             return None
         return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
+
+    def median_depth(self, frames: Sequence[int]) -> float | None:
+        """Return the median of depth maps or, without them, of the listing's points in view."""
+        config = self.config
+        known = super().median_depth(frames)
+        found = read_listing(self.folder, config.format, config.images, config.outside)
+        if known is not None or found.points is None:
+            return known
+        points = torch.from_numpy(found.points())
+        depths = depths_in_view(points, self.cameras[list(frames)])
+        median = float(depths.nanmedian())
+        return None if math.isnan(median) else median
 
     def frame_name(self, frame: int) -> str:
         """Return the path of the image file relative to the scene's folder."""
