@@ -133,5 +133,7 @@ def show(result: "Reconstruction", console: "Console") -> None:
         print_lines(console, [text.format(**tuning)])
     if result.scale:
         print_lines(console, [f"{result.scale.text}; --scale FACTOR sets another"])
+    if result.size:
+        print_lines(console, [f"{result.size.text}; --size HxW sets another"])
     # cameras.json has all of them
     print_lines(console, result.remarks[:3])

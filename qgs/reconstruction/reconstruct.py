@@ -18,7 +18,8 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
 from qgs.reconstruction.scale import constant_scale, find_scale, photo_settings
-from qgs.reconstruction.scenes import FrameNames, GivenScene, chosen_scene, frame_list
+from qgs.reconstruction.scenes import FrameNames, GivenScene, at_sizes, chosen_scene, frame_list
+from qgs.reconstruction.size import find_size
 from qgs.types import Size, Views
 from qgs.wording import counted, listed
 
@@ -38,14 +39,15 @@ def reconstruct(
     """Reconstruct one scene from photos, as the command `qgs reconstruct` does.
 
     Cameras are moved to the frame and scale of the model's recipe. If its scale is constant and the
-    photos are not training data, `find_scale` searches for the scale.
+    photos are not training data, `find_scale` searches for the scale. Then `find_size` chooses
+    between the size of training and twice this size.
 
     photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras, which are all inputs
         unless `inputs` or `frames` is given.
     inputs: number of input photos; None: the recipe's. frames: input photos, by number or file
         name; None chooses photos that overlap.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
-    size: (H, W) to crop and resize photos to; None: that of training, in the photos' aspect ratio.
+    size: (H, W) to crop and resize photos to; None: the best of `at_sizes`, without a crop.
     scene: name of a scene in the folder; None: the only one. overrides: changes of the recipe's
         `views`. tune: what to fit to the inputs first, such as "queries:50"; None: nothing.
 
@@ -75,14 +77,21 @@ def reconstruct(
         scale = find_scale(model, found, *window, views) if views.scale == "search" else None
         if scale:
             views = constant_scale(views, scale.factor)
+        chosen = None
+        if seen is None and size is None and not isinstance(photos, Views):
+            scenes = at_sizes(recipe, fspath(photos), found, scene, compare is None)
+            chosen = find_size(model, scenes, *window, views) if len(scenes) > 1 else None
+        if chosen:
+            found = chosen.scene
+            tuned = chosen.gaussians
         sample = make_sample(found, *window, views, mirror=False)
         if tune and recipe.evaluation.tuning_steps:
             tuned, tuning = tuned_on(model, sample.inputs, recipe)
         result = reconstruct_sample(model, sample, seen or (), tuned)
     finally:
         model.train(training)
-    result = replace(result, scale=scale, tuning=tuning)
-    return replace(result, remarks=_remarks(result, found))
+    result = replace(result, scale=scale, size=chosen, tuning=tuning)
+    return replace(result, remarks=_remarks(result, found, recipe))
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
@@ -175,15 +184,24 @@ def _over_time(
     return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
 
 
-def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
+def _remarks(result: Reconstruction, scene: Scene, recipe: Recipe) -> list[str]:
     """Return remarks for the user on the photos and on the result's quality."""
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
+    trained = result.model.trained_on or Domain()
+    data = recipe.data_config
+    # Older checkpoints do not record the size.
+    if data and trained.values:
+        side = [float(min(data.image_size))]
+        trained = replace(trained, values={"side": side, **trained.values})
+    # The search found no better size.
+    if result.size:
+        del found.values["side"]
     remarks = (
         result.scale.poor if result.scale else "",
         result.worse_than_nearest,
-        verdict(result.model.trained_on or Domain(), found),
+        verdict(trained, found),
         choice(sample, scene),
     )
     return [*filter(None, remarks)]

@@ -17,6 +17,7 @@ from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.scale import FoundScale
+from qgs.reconstruction.size import FoundSize
 from qgs.types import Cameras, Gaussians, Rendering
 
 KINDS = ("input", "novel", "seen in training")
@@ -43,8 +44,8 @@ class Reconstruction:
 
     rendering: images of all views of the sample, inputs first. scores: one for each of these views.
     tuning, refinement: settings with which the Gaussians were fitted to photos; None if not fitted.
-    remarks: sentences for the user. scale: result of the search for the scale; None without a
-        search.
+    remarks: sentences for the user. scale, size: results of the searches for the scale and for the
+        image size; None without a search.
     """
 
     model: QueryGaussianModel
@@ -56,6 +57,7 @@ class Reconstruction:
     refinement: Mapping[str, Any] | None = None
     remarks: Sequence[str] = ()
     scale: FoundScale | None = None
+    size: FoundSize | None = None
 
     @property
     def worse_than_nearest(self) -> str:
@@ -94,8 +96,7 @@ class Reconstruction:
         lines = [f"Reconstruction of {self.sample.scene}: {self.gaussians.count:,} Gaussians"]
         for score in self.scores:
             lines.append(f"{score.kind} {self.sample.label(score.frame)} {score.psnr:.2f} dB")
-        if self.scale:
-            lines.append(self.scale.text)
+        lines += [found.text for found in (self.scale, self.size) if found]
         return "\n  ".join([*lines, *self.remarks])
 
     def _repr_png_(self) -> bytes:

@@ -5,7 +5,6 @@ from os import fspath
 from typing import TypeAlias, get_args
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceConfig, Split
@@ -19,6 +18,9 @@ from qgs.recipe.registry import load_usable_plugins
 from qgs.types import Cameras, Size, Views
 from qgs.wording import listed, warn_once
 
+LARGEST = 256
+"""Shorter side in pixels up to which photos are read at twice the size of training, see
+`at_sizes`."""
 HOLDOUT = 8
 """Every HOLDOUT-th photo of a user's scene is held out to score the result (Mip-NeRF 360)."""
 FrameNames: TypeAlias = str | Sequence[int | str]
@@ -85,6 +87,27 @@ def chosen_scene(
     whole = size or whole_size(scene, size_multiple(recipe))
     config = holding_out(source.config, scene) if holdout else source.config
     return named_scene(resized(source, config, whole), path, name), None
+
+
+def at_sizes(
+    recipe: Recipe, path: str, scene: Scene, name: str | None, holdout: bool = True
+) -> list[Scene]:
+    """Return `scene`, and the same scene at twice its size if photos are that large.
+
+    The shorter side of the second is at most LARGEST, and at most that of the first photo; the list
+    has a single scene if this is no larger. path, name, holdout: as for `chosen_scene`, which
+    opened `scene` without a size.
+    """
+    multiple = size_multiple(recipe)
+    stored = scene.stored_size(0)
+    if multiple is None or stored is None:
+        return [scene]
+    given = scene.cameras.size
+    side = min(2 * min(given), LARGEST, min(stored))
+    larger = scaled_size(stored, side, multiple)
+    if min(larger) <= min(given):
+        return [scene]
+    return [scene, chosen_scene(recipe, path, larger, name, holdout)[0]]
 
 
 def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
@@ -181,54 +204,6 @@ def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
             )
         numbers += found
     return numbers
-
-
-def reduced(scene: Scene, side: int, multiple: int | None) -> Scene:
-    """Return `scene` with images whose shorter side has about `side` pixels; nothing is cropped.
-
-    `scene` is returned unchanged if its images are not larger, or if the size of images is fixed
-    (`multiple` is None). multiple: number that must divide both sides.
-    """
-    size = scene.cameras.size
-    if multiple is None or min(size) <= side:
-        return scene
-    return ReducedScene(scene, scaled_size(size, side, multiple))
-
-
-class ReducedScene(Scene):
-    """A scene with images reduced to `size` (H, W). It has no depth maps of its own."""
-
-    def __init__(self, scene: Scene, size: Size) -> None:
-        self.name = scene.name
-        self.held_out = scene.held_out
-        self.times = scene.times
-        self.scene = scene
-        self.size = size
-
-    @property
-    def cameras(self) -> Cameras:
-        """Cameras of all frames; their pixels may be a little longer than wide."""
-        given = self.scene.cameras
-        height, width = (new / old for new, old in zip(self.size, given.size, strict=True))
-        intrinsics = given.intrinsics * given.intrinsics.new_tensor([width, height] * 2)
-        return given.replace(intrinsics=intrinsics, size=self.size)
-
-    def images(self, frames: Sequence[int]) -> Tensor:
-        """Return images (len(frames), 3, H, W)."""
-        return F.interpolate(self.scene.images(frames), self.size, mode="area")
-
-    def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """Return masks (len(frames), 1, H, W); None if the scene has none."""
-        masks = self.scene.masks(frames)
-        return None if masks is None else F.interpolate(masks, self.size, mode="area")
-
-    def median_depth(self, frames: Sequence[int]) -> float | None:
-        """Return the median depth that the scene has for `frames`."""
-        return self.scene.median_depth(frames)
-
-    def frame_name(self, frame: int) -> str:
-        """Return the name that the scene has for `frame`."""
-        return self.scene.frame_name(frame)
 
 
 class GivenScene(Scene):
