@@ -44,9 +44,7 @@ def map_tensors(function: Callable[[Tensor], Any], value: Any) -> Any:
     """
     if isinstance(value, Tensor):
         return function(value)
-    if not isinstance(value, TensorContainer | Mapping | list | tuple):
-        return value
-    items = list(_items(value))
+    items = _items(value)
     # An unchanged part keeps its cache.
     mapped = [(name, map_tensors(function, item)) for name, item in items]
     if all(new is old for (_, new), (_, old) in zip(mapped, items, strict=True)):
@@ -84,16 +82,17 @@ def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
     """
     if isinstance(value, Tensor):
         yield name, value
-    elif isinstance(value, TensorContainer | Mapping | list | tuple):
-        for key, item in _items(value):
-            yield from named_tensors(item, f"{name}.{key}" if name else str(key))
+    for key, item in _items(value):
+        yield from named_tensors(item, f"{name}.{key}" if name else str(key))
 
 
-def _items(value: Any) -> Iterator[tuple[Any, Any]]:
+def _items(value: Any) -> list[tuple[Any, Any]]:
+    """Return the parts of `value` with their names or numbers; a value without parts has none."""
     if isinstance(value, TensorContainer):
-        yield from ((f.name, getattr(value, f.name)) for f in fields(cast(Any, value)) if f.init)
-    else:
-        yield from value.items() if isinstance(value, Mapping) else enumerate(value)
+        return [(f.name, getattr(value, f.name)) for f in fields(cast(Any, value)) if f.init]
+    if isinstance(value, Mapping):
+        return [*value.items()]
+    return [*enumerate(value)] if isinstance(value, list | tuple) else []
 
 
 def check_shapes(
