@@ -40,11 +40,9 @@ def full_precision(function: F) -> F:
 
     @wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
-        given = sorted((*args, *kwargs.values()), key=lambda value: not isinstance(value, Tensor))
-        first = next(named_tensors(given), None)
-        device = first[1].device.type if first else None
-        if device is None:
-            device = "cuda" if torch.is_autocast_enabled("cuda") else "cpu"
+        device = "cuda" if torch.is_autocast_enabled("cuda") else "cpu"
+        if first := next(named_tensors([args, kwargs]), None):
+            device = first[1].device.type
         # Leaving the outermost autocast of a thread empties a cache that all threads share.
         # Therefore a thread that loads data must not enter one while another thread trains.
         inside = device != "meta" and torch.is_autocast_enabled(device)
