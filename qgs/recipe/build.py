@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from qgs.containers import named_tensors
 from qgs.contracts import (
     SUBLAYER_SLOTS,
     Component,
@@ -114,19 +115,17 @@ class OnMeta(TorchFunctionMode):
             return func(*args, **{"device": "cpu", **kwargs})
         if func is torch.randn and not kwargs:
             return torch.empty(*args)
-        given = kwargs.values() if func in self.draws and not args else args
-        tensors = [x for x in (args[0] if func is torch.cat else given) if isinstance(x, Tensor)]
-        if not all(x.is_meta and x.dtype is torch.float32 for x in tensors):
-            return func(*args, **kwargs)
-        if func in self.draws:
-            return tensors[0]
-        if func in self.arithmetic:
-            return torch.empty(np.broadcast_shapes(*(x.shape for x in tensors)))
-        if func is torch.cat:
-            dim = args[1] if len(args) > 1 else 0
-            shape = list(tensors[0].shape)
-            shape[dim] = sum(x.shape[dim] for x in tensors)
-            return torch.empty(shape)
+        tensors = [x for _, x in named_tensors([args, kwargs])]
+        if all(x.is_meta and x.dtype is torch.float32 for x in tensors):
+            if func in self.draws:
+                return tensors[0]
+            if func in self.arithmetic:
+                return torch.empty(np.broadcast_shapes(*(x.shape for x in tensors)))
+            if func is torch.cat:
+                dim = kwargs.get("dim", args[1] if len(args) > 1 else 0)
+                shape = list(tensors[0].shape)
+                shape[dim] = sum(x.shape[dim] for x in tensors)
+                return torch.empty(shape)
         return func(*args, **kwargs)
 
 
