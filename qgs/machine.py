@@ -1,7 +1,6 @@
 """Memory and cores of this machine: available bytes, errors for lack of memory, work in threads."""
 
 import os
-import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -9,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 from rich.filesize import decimal
 
@@ -36,22 +36,17 @@ def available_bytes() -> int:
     This is the lower of two limits: that of the machine, and that of the process's control group
     (container).
     """
-    limits = [sys.maxsize]
-    with suppress(OSError, ValueError, KeyError):  # not on Linux
-        sizes = _numbers(Path("/proc/meminfo"))
-        limits.append(1024 * (sizes["MemAvailable:"] + sizes["SwapFree:"]))
+    limits = [psutil.virtual_memory().available + psutil.swap_memory().free]
     # A container sees its own control group at this path.
     group = Path("/sys/fs/cgroup")
     # No group, or none with a limit.
     with suppress(OSError, ValueError, KeyError):
         limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        rows = (group / "memory.stat").read_text().splitlines()
         # the system frees cached files on demand
-        limits.append(limit - used + _numbers(group / "memory.stat")["inactive_file"])
+        cached = dict(row.split() for row in rows)["inactive_file"]
+        limits.append(limit - used + int(cached))
     return max(0, min(limits))
-
-
-def _numbers(table: Path) -> dict[str, int]:
-    return {row.split()[0]: int(row.split()[1]) for row in table.read_text().splitlines()}
 
 
 def is_out_of_memory(error: BaseException) -> bool:
