@@ -1,9 +1,10 @@
 """`qgs train`: train a model and evaluate it."""
 
 import signal
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -82,15 +83,11 @@ def with_absolute_path(recipe: "Recipe") -> "Recipe":
     """
     from qgs.paths import is_local, opened_path
 
-    def absolute(section: dict[str, Any], *keys: str) -> dict[str, Any]:
-        changed = dict(section)
-        for key in keys:
-            given = section.get(key)
-            if isinstance(given, str) and is_local(path := opened_path(given)):
-                changed[key] = str(path.resolve())
-        return changed
-
-    tree = {**recipe.tree, "evaluation": absolute(recipe.tree["evaluation"], "index")}
-    if tree.get("data"):
-        tree["data"] = absolute(tree["data"], "path", "test_scenes")
-    return recipe if tree == recipe.tree else replace(recipe, tree=tree)
+    tree = deepcopy(recipe.tree)
+    for section, key in (("evaluation", "index"), ("data", "path"), ("data", "test_scenes")):
+        # A recipe may have no data.
+        options = tree.get(section) or {}
+        given = options.get(key)
+        if isinstance(given, str) and is_local(path := opened_path(given)):
+            options[key] = str(path.resolve())
+    return replace(recipe, tree=tree)
