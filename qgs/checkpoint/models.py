@@ -52,21 +52,17 @@ def checkpoint_path(name: AnyPath) -> Path:
         # Only a plug-in that is installed makes a name of what may be a path.
         is_name = bool(model) and "/" not in model and path.suffix != ".safetensors"
         if is_name and plugin in available_plugins().names:
-            path = _shipped(plugin, text)
+            installed = load_plugin(plugin)
+            if text not in installed.models:
+                hint = did_you_mean(text, installed.models, "models")
+                raise FileNotFoundError(f"{installed.released_as} ships no model {text}; {hint}")
+            path = installed.models[text]
     if not path.is_file():
         raise FileNotFoundError(
             f"no checkpoint at {path}; give a run folder of `qgs train`, a .safetensors file, its "
             "URL, or the name of a model that a plug-in ships, such as rooms/locus-64"
         )
     return path
-
-
-def _shipped(plugin: str, name: str) -> Path:
-    installed = load_plugin(plugin)
-    if name not in installed.models:
-        hint = did_you_mean(name, installed.models, "models")
-        raise FileNotFoundError(f"{installed.released_as} ships no model {name}; {hint}")
-    return installed.models[name]
 
 
 def card_of(file: Path) -> str:
