@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.containers import concatenated, map_tensors
@@ -242,6 +243,15 @@ def mirrored_views(views: Views) -> Views:
         (views.images, views.masks, views.depths),
     )
     return replace(views, images=images, cameras=flipped, masks=masks, depths=depths)
+
+
+def halved(views: Views) -> Views:
+    """Return views (1, V) with images of half the height and width, without depth maps."""
+    height, width = views.cameras.size
+    intrinsics = views.cameras.intrinsics / 2
+    cameras = views.cameras.replace(intrinsics=intrinsics, size=(height // 2, width // 2))
+    images, masks = map_tensors(lambda x: F.avg_pool2d(x[0], 2)[None], (views.images, views.masks))
+    return replace(views, images=images, cameras=cameras, masks=masks, depths=None)
 
 
 def collate(samples: Sequence[Sample]) -> Batch:

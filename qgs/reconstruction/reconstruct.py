@@ -17,9 +17,15 @@ from qgs.files import AnyPath
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
-from qgs.reconstruction.scale import constant_scale, find_scale, photo_settings
-from qgs.reconstruction.scenes import FrameNames, GivenScene, at_sizes, chosen_scene, frame_list
-from qgs.reconstruction.size import find_size
+from qgs.reconstruction.scale import (
+    SIDE,
+    constant_scale,
+    find_scale,
+    photo_settings,
+    takes_half,
+)
+from qgs.reconstruction.scenes import FrameNames, GivenScene, chosen_scene, frame_list
+from qgs.reconstruction.size import find_size, half
 from qgs.types import Size, Views
 from qgs.wording import counted, listed
 
@@ -39,15 +45,16 @@ def reconstruct(
     """Reconstruct one scene from photos, as the command `qgs reconstruct` does.
 
     Cameras are moved to the frame and scale of the model's recipe. If its scale is constant and the
-    photos are not training data, `find_scale` searches for the scale. Then `find_size` chooses
-    between the size of training and twice this size.
+    photos are not training data, `find_scale` searches for the scale. Then `find_size` decides
+    between the result of `whole_size` and half of it.
 
     photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras, which are all inputs
         unless `inputs` or `frames` is given.
     inputs: number of input photos; None: the recipe's. frames: input photos, by number or file
         name; None chooses photos that overlap.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
-    size: (H, W) to crop and resize photos to; None: the best of `at_sizes`, without a crop.
+    size: (H, W) to crop and resize photos to; None: the better of two sizes, without a
+        crop.
     scene: name of a scene in the folder; None: the only one. overrides: changes of the recipe's
         `views`. tune: what to fit to the inputs first, such as "queries:50"; None: nothing.
 
@@ -77,14 +84,14 @@ def reconstruct(
         scale = find_scale(model, found, *window, views) if views.scale == "search" else None
         if scale:
             views = constant_scale(views, scale.factor)
-        chosen = None
-        if seen is None and size is None and not isinstance(photos, Views):
-            scenes = at_sizes(recipe, fspath(photos), found, scene, compare is None)
-            chosen = find_size(model, scenes, *window, views) if len(scenes) > 1 else None
-        if chosen:
-            found = chosen.scene
-            tuned = chosen.gaussians
         sample = make_sample(found, *window, views, mirror=False)
+        chosen = None
+        free = seen is None and size is None and not isinstance(photos, Views)
+        if free and min(found.cameras.size) >= SIDE and takes_half(model, found):
+            chosen = find_size(model, found, *window, views)
+            tuned = chosen.gaussians
+            if chosen.size != found.cameras.size:
+                sample = half(sample)
         if tune and recipe.evaluation.tuning_steps:
             tuned, tuning = tuned_on(model, sample.inputs, recipe)
         result = reconstruct_sample(model, sample, seen or (), tuned)
@@ -193,8 +200,9 @@ def _remarks(result: Reconstruction, scene: Scene, recipe: Recipe) -> list[str]:
     data = recipe.data_config
     # Older checkpoints do not record the size.
     if data and trained.values:
-        side = [float(min(data.image_size))]
-        trained = replace(trained, values={"side": side, **trained.values})
+        sides = [min(size) for size in (data.image_size, *recipe.training.image_sizes)]
+        ends = [float(min(sides)), float(max(sides))]
+        trained = replace(trained, values={"side": ends, **trained.values})
     # The search found no better size.
     if result.size:
         del found.values["side"]

@@ -15,16 +15,14 @@ from dataclasses import dataclass, field
 from statistics import fmean
 
 import torch
-import torch.nn.functional as F
 
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.samples import make_sample
+from qgs.data.samples import halved, make_sample
 from qgs.domain import TOLERANCE, Domain
 from qgs.geometry.poses import look_at_depth, scaled
 from qgs.metrics.baselines import pose_distance
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
-from qgs.reconstruction.scenes import scaled_size
 from qgs.types import Views
 from qgs.wording import listed
 
@@ -51,7 +49,7 @@ DEPTHS = (0.6, 1.4)
 """Smallest and largest median depth of what the inputs show that the search tries, if this depth is
 known. In the training of the shipped models, 80 % of samples have medians from 0.63 to 1.49."""
 SIDE = 128
-"""Length in pixels to which the shorter side of larger photos is reduced for the search."""
+"""Length of the shorter side in pixels above which the search halves photos, to save time."""
 PENALTY = 5.0
 """Penalty in dB on the score of a factor that makes depths smaller than in training. It is PENALTY
 times ln(limit / factor), with the limit from `search_range`. It applies only if the
@@ -123,11 +121,12 @@ def find_scale(
 ) -> FoundScale:
     """Search for the factor at which `model` renders photos of `scene` best.
 
-    The inputs and `further_photos` are scored, reduced to SIDE pixels. The coarse search tries
-    factors with ratio STEP over `search_range`, and goes on past an end of the range while the best
-    factor is there. The fine search tries thirds of a step around the best factor, then the vertex
-    of a parabola through the three best scores in log scale. If `Scene.median_depth` is known, the
-    range is narrow: the coarse search stays in it, and the fine search tries halves of a step.
+    The inputs and `further_photos` are scored, at half their size if they are larger than SIDE. The
+    coarse search tries factors with ratio STEP over `search_range`, and goes on past an end of the
+    range while the best factor is there. The fine search tries thirds of a step around the best
+    factor, then the vertex of a parabola through the three best scores in log scale. If
+    `Scene.median_depth` is known, the range is narrow: the coarse search stays in it, and the fine
+    search tries halves of a step.
 
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
     given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
@@ -142,8 +141,9 @@ def find_scale(
         given = tuple(frame for frame in given if frame not in further)
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
     frames = given if len(given) > 1 else given + further
-    multiple = model.encoder.size_multiple(model.encoder.config)
-    photos = reduced(sample.inputs.joined(sample.targets), SIDE, multiple)
+    photos = sample.inputs.joined(sample.targets)
+    if min(scene.cameras.size) > SIDE and takes_half(model, scene):
+        photos = halved(photos)
     low, high, nearest = search_range(model.trained_on or Domain(), scene, frames, depth)
     # Even steps in log scale: what counts is the ratio to the right factor.
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
@@ -174,6 +174,12 @@ def find_scale(
         tried=sorted((trial.factor(place), found) for place, found in trial.tried.items()),
         depth=depth,
     )
+
+
+def takes_half(model: QueryGaussianModel, scene: Scene) -> bool:
+    """Return whether `model` takes images of half the height and width of those of `scene`."""
+    multiple = model.encoder.size_multiple(model.encoder.config)
+    return multiple is not None and not any(side % (2 * multiple) for side in scene.cameras.size)
 
 
 def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
@@ -295,24 +301,6 @@ class _Trial:
         left, middle, right = (self.score(place + side) for side in (-1, 0, 1))
         bend = left - 2 * middle + right
         return 0.5 * (left - right) / bend if bend < 0 else 0.0
-
-
-def reduced(views: Views, side: int, multiple: int | None) -> Views:
-    """Return views (1, V) reduced to a shorter side of about `side` pixels; nothing is cropped.
-
-    The result has no masks. Views that are not larger, or whose size is fixed (`multiple` is None),
-    are returned unchanged. multiple: number that must divide both sides.
-    """
-    given = views.cameras.size
-    if multiple is None or min(given) <= side:
-        return views
-    size = scaled_size(given, side, multiple)
-    height, width = (new / old for new, old in zip(size, given, strict=True))
-    intrinsics = views.cameras.intrinsics
-    intrinsics = intrinsics * intrinsics.new_tensor([width, height, width, height])
-    cameras = views.cameras.replace(intrinsics=intrinsics, size=size)
-    images = F.interpolate(views.images[0], size, mode="area")
-    return views.replace(images=images[None], cameras=cameras, masks=None)
 
 
 def at_factor(views: Views, factor: float) -> Views:

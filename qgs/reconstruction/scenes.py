@@ -18,9 +18,10 @@ from qgs.recipe.registry import load_usable_plugins
 from qgs.types import Cameras, Size, Views
 from qgs.wording import listed, warn_once
 
+LEAST = 64
+"""Shorter side of training images in pixels from which on photos are read at twice this size."""
 LARGEST = 256
-"""Shorter side in pixels up to which photos are read at twice the size of training, see
-`at_sizes`."""
+"""Shorter side in pixels up to which photos are read at twice the size of training."""
 HOLDOUT = 8
 """Every HOLDOUT-th photo of a user's scene is held out to score the result (Mip-NeRF 360)."""
 FrameNames: TypeAlias = str | Sequence[int | str]
@@ -89,27 +90,6 @@ def chosen_scene(
     return named_scene(resized(source, config, whole), path, name), None
 
 
-def at_sizes(
-    recipe: Recipe, path: str, scene: Scene, name: str | None, holdout: bool = True
-) -> list[Scene]:
-    """Return `scene`, and the same scene at twice its size if photos are that large.
-
-    The shorter side of the second is at most LARGEST, and at most that of the first photo; the list
-    has a single scene if this is no larger. path, name, holdout: as for `chosen_scene`, which
-    opened `scene` without a size.
-    """
-    multiple = size_multiple(recipe)
-    stored = scene.stored_size(0)
-    if multiple is None or stored is None:
-        return [scene]
-    given = scene.cameras.size
-    side = min(2 * min(given), LARGEST, min(stored))
-    larger = scaled_size(stored, side, multiple)
-    if min(larger) <= min(given):
-        return [scene]
-    return [scene, chosen_scene(recipe, path, larger, name, holdout)[0]]
-
-
 def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
     """Return `config` with every HOLDOUT-th photo held out.
 
@@ -124,8 +104,10 @@ def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
 def whole_size(scene: Scene, multiple: int | None) -> Size:
     """Return the image size (H, W) at which photos of a user are resized without cropping.
 
-    The shorter side is about as long as that of the training images, and the aspect ratio is about
-    that of the first photo. Both sides are multiples of `multiple`.
+    The shorter side is about that of the training images. For models of LEAST pixels and more it is
+    up to twice as long, but at most LARGEST, and at most that of the first photo; `find_size` then
+    decides between this size and its half. The aspect ratio is about that of the first photo.
+    multiple: number that must divide both sides of an image.
     scene: must be opened at the size of the training images. This size is returned if `multiple` is
         None, or if `scene` generates its images.
     """
@@ -134,16 +116,13 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
     if multiple is None or stored is None:
         return trained
     # As many pixels as in training gave up to .3 dB less on novel views than its shorter side.
-    return scaled_size(stored, min(trained), multiple)
-
-
-def scaled_size(size: Size, side: int, multiple: int) -> Size:
-    """Return a size (H, W) of about the shape of `size`, with a shorter side of about `side`.
-
-    Both sides of the result are multiples of `multiple`.
-    """
-    steps = side / min(size) / multiple
-    height, width = (max(round(length * steps), 1) * multiple for length in size)
+    shorter = min(trained)
+    if shorter >= LEAST:
+        shorter = max(shorter, min(2 * shorter, LARGEST, min(stored)))
+        # Half the size must fit too.
+        multiple *= 2
+    steps = shorter / min(stored) / multiple
+    height, width = (max(round(side * steps), 1) * multiple for side in stored)
     return height, width
 
 

@@ -46,6 +46,8 @@ def compare_models(
     with kept_warnings() as warnings:
         opened = open_models(names, photos, choose_device(device), pixels, scale_settings(scale))
         for model in opened:
+            if model.size:
+                console.print(f"{model.size.text}; --size HxW sets another", style="dim")
             console.print(f"reconstructing with {model.name}", style="dim")
             # Ctrl-C during the next model, or the page, leaves these scores
             model.evaluation.write(target / model.name)

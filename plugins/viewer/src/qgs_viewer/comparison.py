@@ -4,6 +4,7 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
@@ -12,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from qgs.checkpoint.model_file import CheckpointFile
+from qgs.checkpoint.model_file import CheckpointFile, load
 from qgs.checkpoint.models import about, checkpoint_path
 from qgs.contracts import Frames, Scene, ViewsConfig, Window
 from qgs.data.inputs import Frusta, ranked_windows
@@ -24,6 +25,8 @@ from qgs.evaluate.results import Evaluation
 from qgs.model import QueryGaussianModel
 from qgs.model_text import heading
 from qgs.recipe import Recipe, resolve
+from qgs.reconstruction.reconstruct import reconstruct
+from qgs.reconstruction.result import Reconstruction
 from qgs.reconstruction.scale import FoundScale, constant_scale, find_scale, photo_settings
 from qgs.reconstruction.scenes import (
     Size,
@@ -32,6 +35,7 @@ from qgs.reconstruction.scenes import (
     size_multiple,
     whole_size,
 )
+from qgs.reconstruction.size import FoundSize
 from qgs_viewer.trust import ScoredView, scored_views
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
@@ -142,8 +146,8 @@ class Model:
     name: short and unique. file: checkpoint of the model. recipe: recipe of the training, but with
     the data of the comparison. search: the network, and the scales of camera positions found for
     scenes. step: number of training steps; None if unknown. windows: sampler of input and compared
-    photos from a user's photos; None if the scenes come from the recipe's data. views: views that
-    `evaluation` has scored.
+    photos from a user's photos; None if the scenes come from the recipe's data. size: image size
+    that was found with this model. views: views that `evaluation` has scored.
     """
 
     name: str
@@ -152,6 +156,7 @@ class Model:
     search: ScaleSearch
     step: int | None
     windows: PhotoWindows | None
+    size: FoundSize | None = None
     views: list[ScoredView] = field(default_factory=list)
 
     @property
@@ -222,12 +227,21 @@ def open_models(
     """Load models for a comparison on unseen scenes of their data, or on held-out `photos`.
 
     names: run folders, checkpoints, URLs or shipped models. photos, size, overrides: passed on to
-    `recipes_alike`. Raises ValueError if models cannot be compared under one protocol.
+    `recipes_alike`. Without `size`, the first model decides on the size of photos by `find_size`.
+    Raises ValueError if models cannot be compared under one protocol.
     """
     files = checkpoints(names)
     recipes = recipes_alike(files, photos, size, overrides)
+    tried: Reconstruction | None = None
+    if photos is not None and size is None:
+        tried = _tried(next(iter(files.values())), recipes, photos, device, overrides)
+        if tried and tried.size and tried.size.size < tried.size.other:
+            data = next(iter(recipes.values())).data_config
+            assert data is not None
+            height, width = data.image_size
+            recipes = recipes_alike(files, photos, (height // 2, width // 2), overrides)
     windows: PhotoWindows | None = None
-    models = []
+    models = list[Model]()
     for name, path in files.items():
         with CheckpointFile(path) as file:
             network = file.model(device)
@@ -236,8 +250,26 @@ def open_models(
             # those of the first model for all, so that one protocol judges them
             windows = PhotoWindows(network.trained_on or Domain())
         search = ScaleSearch(network, recipes[name].views)
-        models.append(Model(name, path, recipes[name], search, step, windows))
+        found = None
+        if tried and not models:
+            found = tried.size
+            sample = tried.sample
+            if tried.scale:
+                window = (sample.scene, sample.input_frames, sample.target_frames)
+                search.found[window] = tried.scale
+        models.append(Model(name, path, recipes[name], search, step, windows, found))
     return models
+
+
+def _tried(
+    file: Path, recipes: Mapping[str, Recipe], photos: str, device: str, overrides: Sequence[str]
+) -> Reconstruction | None:
+    """Reconstruct the first scene of `photos` by the model in `file`; None if this fails."""
+    data = next(iter(recipes.values())).build_data()
+    scene = (data.names("test") or data.names("train"))[0]
+    # the evaluation names scenes that fail
+    with suppress(ValueError):
+        return reconstruct(load(file, device), photos, scene=scene, overrides=overrides)
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:

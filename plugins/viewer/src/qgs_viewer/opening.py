@@ -16,14 +16,13 @@ from qgs.checkpoint.models import CHECKPOINT
 from qgs.cli.options import parse_size
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.images import decode_rgb, read_image, to_tensor
-from qgs.data.recognition import is_training_data
 from qgs.data.samples import make_sample, own_world, views_in
 from qgs.data.view_samplers import evenly
 from qgs.domain import Domain, verdict
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
-from qgs.reconstruction.reconstruct import checked_window, choose_frames
-from qgs.reconstruction.scale import constant_scale, find_scale, photo_settings
+from qgs.reconstruction.reconstruct import checked_window, choose_frames, reconstruct
+from qgs.reconstruction.scale import constant_scale
 from qgs.reconstruction.scene_formats import about_origin, load_ply
 from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene, read_photos
 from qgs.types import Cameras
@@ -183,40 +182,44 @@ def open_model(
         recipe = file.recipe
     if overrides:
         recipe = resolve(recipe.tree, overrides)
-    shown = _scene(recipe, photos, size, scene)
-    chosen = None if frames is None else frame_list(frames, "--frames", shown)
-    trained = model.trained_on or Domain()
-    own = photos is None or is_training_data(photos, recipe.data_config)
-    window = choose_frames(shown, recipe.views, inputs, chosen, None, trained)
-    # photos of a user have a unit of their own
-    views = photo_settings(recipe.views, own, overrides)
-    scale = find_scale(model, shown, *window, views) if views.scale == "search" else None
-    if scale:
-        # inputs that are chosen later keep the scale
-        views = constant_scale(views, scale.factor)
-    sample = make_sample(shown, *window, views, mirror=False)
-    # users learn if their photos are like those of the training
-    seen = Domain()
-    seen.see(sample.inputs.cameras, sample.targets.cameras)
-    notes = [
-        f"{scale.text}; --scale sets another" if scale else "",
-        f"input photos: {listed(map(shown.frame_name, sample.input_frames))}" if photos else "",
-        verdict(trained, seen),
-        scale.poor if scale else "",
-    ]
-    title = f"{name}: {shown.name}"
-    given = [note for note in notes if note]
-    return ModelSource(model, shown, views, sample.input_frames, title, given)
+    views = recipe.views
+    if photos is None:
+        shown = _scene(recipe, size, scene)
+        chosen = None if frames is None else frame_list(frames, "--frames", shown)
+        given, compared = choose_frames(shown, views, inputs, chosen, None, model.trained_on)
+        sample = make_sample(shown, given, compared, views, mirror=False)
+        # users learn if these views are like those of the training
+        seen = Domain()
+        seen.see(sample.inputs.cameras, sample.targets.cameras)
+        notes = [verdict(model.trained_on or Domain(), seen)]
+    else:
+        found = reconstruct(
+            model,
+            photos,
+            inputs=inputs,
+            frames=frames,
+            size=size,
+            scene=scene,
+            overrides=overrides,
+        )
+        # inputs that are chosen later keep size and scale
+        given = found.sample.input_frames
+        shown, _ = chosen_scene(recipe, photos, found.sample.inputs.cameras.size, scene)
+        notes = list(found.remarks)
+        if found.size:
+            notes.insert(0, f"{found.size.text}; --size sets another")
+        if found.scale:
+            notes.insert(0, f"{found.scale.text}; --scale sets another")
+            views = constant_scale(views, found.scale.factor)
+    return ModelSource(model, shown, views, given, f"{name}: {shown.name}", notes)
 
 
-def _scene(recipe: Recipe, photos: str | None, size: Size | None, name: str | None) -> Scene:
-    """Return a scene of the folder `photos`; if `photos` is None, a scene of the recipe's data.
+def _scene(recipe: Recipe, size: Size | None, name: str | None) -> Scene:
+    """Return a scene of the recipe's data.
 
-    name: name of the scene; None takes the first test scene. Raises ValueError if `photos` is None
-    and the recipe has no data, or if `photos` is None and `size` is given.
+    name: name of the scene; None takes the first test scene. Raises ValueError if the recipe has no
+    data, or if `size` is given.
     """
-    if photos is not None:
-        return chosen_scene(recipe, photos, size, name)[0]
     if recipe.data_config is None:
         raise ValueError(
             "the checkpoint's recipe has no data to show: add a folder of photos after the "
