@@ -165,14 +165,16 @@ class Component(metaclass=ABCMeta):
         """Give every subclass its own Config class, with a reference to the subclass."""
         super().__init_subclass__(**options)
         # A Config stores its component, so components must not share one.
-        inherited = cls.Config
-        if inherited.__qualname__ != f"{cls.__qualname__}.Config":
-            own: dict[str, Any] = {"__qualname__": f"{cls.__qualname__}.Config"}
-            own["__module__"] = cls.__module__
-            # It has no own options, and a search for their docstrings would take 15 ms.
-            own["model_config"] = ConfigDict(use_attribute_docstrings=False)
-            cls.Config = type("Config", (inherited,), own)
-            cls.Config.model_config["use_attribute_docstrings"] = True  # for subclasses
+        if cls.Config.__qualname__ != f"{cls.__qualname__}.Config":
+
+            class Config(cls.Config):
+                __module__ = cls.__module__
+                __qualname__ = f"{cls.__qualname__}.Config"
+                # It has no own options, and a search for their docstrings would take 15 ms.
+                model_config = ConfigDict(use_attribute_docstrings=False)
+
+            Config.model_config["use_attribute_docstrings"] = True  # for subclasses
+            cls.Config = Config
         cls.Config.__component__ = cls
 
     @classmethod
