@@ -44,8 +44,6 @@ class TrainingPass(nn.Module):
         if not losses:
             raise ValueError("training needs at least one loss; add one under `losses`")
         self.losses = nn.ModuleDict(losses)
-        self._of_gaussians = [n for n, loss in losses.items() if loss.renderings == "none"]
-        self._of_images = [name for name in losses if name not in self._of_gaussians]
         self.reads_depths = any(loss.reads_depths for loss in losses.values())
         self._owners: dict[str, str] = {}  # names of terms to those of their losses
         self.render_views = recipe.training.render_views
@@ -97,12 +95,12 @@ class TrainingPass(nn.Module):
                 shown = signs_of(rendering, part, background)
                 deviations.append(shown.pop("deviation"))
                 _add({name: share * mean for name, mean in shown.items()}, signs)
-                found = self._terms(self._of_images, layer.prediction, rendering, part, inputs)
+                found = self._terms(True, layer.prediction, rendering, part, inputs)
                 layer.add(found, weight * share)
             signs["deviation"] = torch.stack(deviations).amax()
             # Losses of the Gaussians alone run once for all parts, with a rendering without views.
             no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
-            found = self._terms(self._of_gaussians, layer.prediction, no_views, targets, inputs)
+            found = self._terms(False, layer.prediction, no_views, targets, inputs)
             layer.add(found, weight)
             # The layers are summed here: one backward pass through the network serves all.
             total = total + layer.total()
@@ -126,16 +124,18 @@ class TrainingPass(nn.Module):
 
     def _terms(
         self,
-        names: Sequence[str],
+        of_images: bool,
         prediction: LayerPrediction,
         rendering: Rendering,
         target: Views,
         inputs: Views,
     ) -> dict[str, Tensor]:
-        """Call the losses `names` with the other arguments; return all their terms by name."""
+        """Call the losses of images, or those of Gaussians alone; return all terms by name."""
         terms: dict[str, Tensor] = {}
-        for name in names:
-            found = self.losses[name](prediction, rendering, target, inputs)
+        for name, loss in self.losses.items():
+            if of_images == (loss.renderings == "none"):
+                continue
+            found = loss(prediction, rendering, target, inputs)
             for term, value in found.items():
                 owner = self._owners.setdefault(term, name)
                 if owner != name:
