@@ -65,14 +65,10 @@ def concatenated(parts: Sequence[_C], dim: int) -> _C:
     for other in found:
         if some := sorted(other.keys() ^ found[0].keys()):
             raise ValueError(f"{', '.join(some)} must be in all concatenated parts or in none")
+    joined = [torch.cat([tensors[name] for tensors in found], dim) for name in found[0]]
     # `map_tensors` comes to the tensors in the order of their names.
-    names = iter(found[0])
-
-    def joined(_: Tensor) -> Tensor:
-        name = next(names)
-        return torch.cat([tensors[name] for tensors in found], dim)
-
-    return map_tensors(joined, parts[0])
+    tensors = iter(joined)
+    return map_tensors(lambda _: next(tensors), parts[0])
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
