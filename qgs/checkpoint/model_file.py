@@ -20,6 +20,7 @@ from qgs.checkpoint.tensors import (
     copied,
     differing_tensors,
     differing_types,
+    inside,
     nonfinite,
     shapes_of,
     write_tensors,
@@ -73,11 +74,7 @@ class CheckpointFile(TensorFile):
             )
         if SEAL not in self.metadata:
             raise self.damaged(f"its metadata lack the checksum {SEAL}")
-        self.extra = {
-            key.removeprefix(_EXTRA): value
-            for key, value in self.metadata.items()
-            if key.startswith(_EXTRA)
-        }
+        self.extra: dict[str, str] = inside(_EXTRA, self.metadata)
 
     @cached_property
     def recipe(self) -> Recipe:

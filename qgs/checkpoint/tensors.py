@@ -160,6 +160,11 @@ def pickle_kind(path: AnyPath) -> str:
     return next((kind for magic, kind in _PICKLES.items() if start.startswith(magic)), "")
 
 
+def inside(prefix: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries whose names begin with `prefix`, by name without the prefix."""
+    return {k.removeprefix(prefix): v for k, v in entries.items() if k.startswith(prefix)}
+
+
 def copied(tensors: Weights) -> dict[str, Tensor]:
     """Return contiguous copies of `tensors` on the CPU, which share no memory."""
     return {

@@ -1,7 +1,6 @@
 """Option `init_from` of a recipe: training starts from the weights of a checkpoint."""
 
 import torch
-from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, load_weights, unique_tensors
 from qgs.checkpoint.tensors import (
@@ -9,6 +8,7 @@ from qgs.checkpoint.tensors import (
     Shapes,
     Weights,
     differing_tensors,
+    inside,
     shapes_of,
 )
 from qgs.model import QueryGaussianModel
@@ -46,7 +46,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     ]
     weights = dict(learned)
     for part in ("encoder", "feedback", "head"):
-        adapted = getattr(model, part).adapted(_part(f"{part}.", learned))
+        adapted = getattr(model, part).adapted(inside(f"{part}.", learned))
         weights |= {f"{part}.{name}": values.cpu() for name, values in adapted.items()}
     own = _comparable(unique_tensors(model), model.queries.count)
     if found := differing_tensors(_comparable(weights, count), own):
@@ -57,7 +57,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         trained = "options of the checkpoint's recipe that differ:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
     generator = torch.Generator().manual_seed(recipe.seed)
-    resized = model.queries.resized(_part(_QUERIES, learned), generator)
+    resized = model.queries.resized(inside(_QUERIES, learned), generator)
     weights |= {_QUERIES + name: values for name, values in resized.items()}
     load_weights(model, weights, path)
     before = shapes_of(learned)
@@ -68,11 +68,6 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         if shape != before.get(name)
     ]
     return [f"weights start from {path}", *changes, *(f"trained with {o}" for o in options)]
-
-
-def _part(prefix: str, weights: Weights) -> dict[str, Tensor]:
-    """Return the weights whose names begin with `prefix`, by name without the prefix."""
-    return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 
 def _comparable(tensors: Weights, count: int | None) -> Shapes:
