@@ -1,4 +1,4 @@
-"""How far to trust a reconstruction: what its inputs see of scored views, and how close that is."""
+"""Verdict on a reconstruction: what its inputs see of scored views, and how close that is."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
