@@ -11,8 +11,9 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from qgs.drawing.images import rgb_picture
+from qgs.geometry.transforms import depths_in_view
 from qgs_viewer.look import INK, Color, enlarged
-from qgs_viewer.placement import Splats, corners, on_photo, seen_from
+from qgs_viewer.placement import Splats, corners, on_photo
 from qgs_viewer.query_scene import QueryScene
 
 Others = Literal["shown", "faint", "hidden"]
@@ -305,8 +306,9 @@ def distance_to(scene: QueryScene) -> float:
         found = (solid - solid.median(0).values).norm(dim=-1)
     else:
         cameras = scene.views.cameras.to("cpu")
-        depths, seen = seen_from(cameras, solid)
-        eyes = cameras.c2w[0, :, :3, 3]
-        found = depths[seen] if seen.any() else torch.cdist(eyes, solid)
+        depths = depths_in_view(solid, cameras[0])
+        found = depths[~depths.isnan()]
+        if not len(found):
+            found = torch.cdist(cameras.c2w[0, :, :3, 3], solid)
     # a scene of one point has no size, and frusta of none would be invisible
     return max(float(found.median()) * scene.placement.scale, 1e-6)

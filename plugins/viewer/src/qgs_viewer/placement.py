@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.geometry.transforms import quat_to_matrix, to_camera, to_pixels
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians
 from qgs.wording import warn_once
@@ -135,18 +135,6 @@ def on_photo(cameras: Cameras, pixels: Tensor, depth: float | Tensor) -> Tensor:
     flat = (pixels.to(focal) - principal) / focal
     local = torch.cat([flat, torch.ones_like(flat[..., :1])], -1) * depth
     return local @ cameras.c2w[:, :3, :3].to(local).mT + cameras.c2w[:, None, :3, 3].to(local)
-
-
-def seen_from(cameras: Cameras, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the depths of P points (P, 3) in V cameras, and which points their images show.
-
-    cameras: (1, V). Both results are (V, P); occlusion is not considered.
-    """
-    local = to_camera(points[None], cameras)[0]
-    depths = local[..., 2]
-    pixels = to_pixels(local, cameras.intrinsics[0])
-    inside = (pixels >= 0) & (pixels <= pixels.new_tensor(cameras.size[::-1]))
-    return depths, (depths > 0) & inside.all(-1)
 
 
 def corners(size: tuple[int, int]) -> Tensor:
