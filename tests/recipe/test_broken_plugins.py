@@ -95,7 +95,7 @@ def test_the_tracebacks_of_plugins_and_components_are_all_shown(write, install):
         ("[faulty]", "{refinement: {type: faulty/silent}}"),
     ):
         recipe = write(f"recipe: 1\nplugins: {plugins}\nmodel: {{decoder: {decoder}}}\n")
-        error = must_refuse("", resolve, recipe, kind=RecipeError)
+        error = must_refuse(None, resolve, recipe, kind=RecipeError)
         shown += "".join(traceback.format_exception(error))
     for word in ("_test_qgs_first.py", "_test_qgs_second.py", "strict_check", "fields_written"):
         assert word in shown

@@ -112,7 +112,7 @@ def test_every_difference_is_listed_at_once():
     del weights["gs_tokens"]
     weights["activation_head.deconv.bias"] = torch.zeros(3)
     weights |= {"stranger": torch.zeros(1), "gs_anchor_xyz_raw": torch.zeros(1)}
-    error = must_refuse("", known.from_published, weights, kind=PublishedError)
+    error = must_refuse(None, known.from_published, weights, kind=PublishedError)
     assert str(error).endswith("""
   missing: gs_tokens
   unexpected: stranger
