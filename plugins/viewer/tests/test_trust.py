@@ -26,9 +26,9 @@ def test_a_pixel_is_seen_if_its_point_at_the_rendered_depth_lies_in_an_input():
     alpha[..., -4:, :] = 0.4
     inputs = Views(grey + 0.1, cameras(0.0))
     targets = Views(grey, cameras(-2 / 3))
-    sample = Sample("room", inputs, targets, (3,), (7,), ())
+    sample = Sample("test/room", inputs, targets, (3,), (7,), ())
     ((name, parts),) = scored_views(sample, Rendering(grey - 0.01, alpha, depth))
-    assert name == "view 7 of room"
+    assert name == "view 7 of test/room"
     found = {name: part.coverage for name, part in parts.items()}
     thirds = {"left": 0, "middle": 2 / 3, "right": 2 / 3, "top": 2 / 3, "bottom": 0}
     assert found == pytest.approx({WHOLE: 4 / 9, **thirds})

@@ -82,8 +82,8 @@ def scored_views(sample: Sample, rendering: Rendering) -> Iterator[ScoredView]:
         top, _, bottom = maps.tensor_split(3, -2)
         thirds = {"left": left, "middle": middle, "right": right, "top": top, "bottom": bottom}
         parts = {name: _part(*part) for name, part in {WHOLE: maps, **thirds}.items()}
-        name = sample.names.get(frame, f"view {frame} of {sample.scene}")
-        yield Path(name).name, parts
+        photo = Path(sample.names.get(frame, "")).name
+        yield photo or f"view {frame} of {sample.scene}", parts
 
 
 def _part(seen: Tensor, *errors: Tensor) -> Part:
