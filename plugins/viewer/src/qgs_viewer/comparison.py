@@ -40,6 +40,9 @@ from qgs_viewer.trust import ScoredView, scored_views
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
 WINDOWS = 6
+ALONE = 3
+"""Windows of a scene for a model that is compared with no other. Each takes a search for a scale,
+the longest part of a report."""
 # Sections of recipes that must be equal, so that only the models differ.
 JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
@@ -81,15 +84,16 @@ def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) ->
 
 
 class PhotoWindows(Span):
-    """View sampler that chooses at most six windows of each scene by `spread_windows`.
+    """View sampler that chooses at most `count` windows of each scene by `spread_windows`.
 
     A window is a set of input photos with the photos that renders are compared to. The choice is
     made once for each scene.
     """
 
-    def __init__(self, trained_on: Domain) -> None:
+    def __init__(self, trained_on: Domain, count: int) -> None:
         super().__init__(Span.Config())
         self._trained_on = trained_on
+        self._count = count
         self._known: dict[str, list[Window]] = {}
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
@@ -102,7 +106,7 @@ class PhotoWindows(Span):
             # a moment of a moving scene has few views; the recipe's sampler knows which
             return []
         if scene.name not in self._known:
-            windows = spread_windows(scene, views.inputs, self._trained_on, WINDOWS)
+            windows = spread_windows(scene, views.inputs, self._trained_on, self._count)
             if not any(compared for _, compared in windows):
                 raise ValueError(
                     f"all {len(scene)} photos are inputs, so no photo is left to compare renders "
@@ -248,7 +252,8 @@ def open_models(
             step = file.step
         if photos is not None and windows is None:
             # those of the first model for all, so that one protocol judges them
-            windows = PhotoWindows(network.trained_on or Domain())
+            count = ALONE if len(files) == 1 else WINDOWS
+            windows = PhotoWindows(network.trained_on or Domain(), count)
         search = ScaleSearch(network, recipes[name].views)
         found = None
         if tried and not models:
