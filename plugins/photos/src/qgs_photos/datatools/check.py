@@ -151,8 +151,7 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
     """
     report = SceneReport(candidate.name, candidate.kind, candidate.split)
     try:
-        photos = candidate.photos()
-        missing = candidate.missing()
+        photos, missing = candidate.photos()
     except Exception as error:
         # whatever a reader raises; the other scenes go on
         return replace(report, findings=[_unreadable(candidate.name, error)])

@@ -4,6 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
+from posixpath import join
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from qgs_photos.datasets.chunk_files import (
     unit_problems,
 )
 from qgs_photos.datatools.findings import Finding, Severity
-from qgs_photos.datatools.photos import Candidate, Photo
+from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
 _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
 
@@ -57,7 +58,7 @@ def _folder_scenes(
         yield from _file_scenes(split, file, found)
     if not (folder / INDEX).is_file():
         return
-    label = _label(split, INDEX)
+    label = join(split, INDEX)
     try:
         index = read_chunk_index(folder / INDEX)
     except (OSError, ValueError) as error:
@@ -71,7 +72,7 @@ def _folder_scenes(
         missing = f"{counted(len(keys), 'scene')} that it does not hold: {listed(keys)}"
         reason = f"{INDEX} lists for this file {missing}"
         fix = f"copy the chunk again, or remove these scenes from {INDEX}"
-        yield Finding(_label(split, name), reason, fix)
+        yield Finding(join(split, name), reason, fix)
     if unnamed := sorted(found.keys() - index.keys()):
         reason = f"the index does not name {listed(unnamed)}, so that no reader finds these scenes"
         severity: Severity = "warning" if index else "error"
@@ -79,7 +80,7 @@ def _folder_scenes(
 
 
 def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Iterator[Candidate | Finding]:
-    label = _label(split, file.name)
+    label = join(split, file.name)
     try:
         entries = load_chunk(file)
     except (OSError, ValueError) as error:
@@ -102,19 +103,16 @@ def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Iterator[Can
         yield Finding(label, reason, _REPACK)
 
 
-def _label(split: str, name: str) -> str:
-    return f"{split}/{name}" if split else name
-
-
 _entries = lru_cache(maxsize=1)(load_chunk)
 
 
-def _photos(file: UPath, place: int) -> list[Photo]:
+def _photos(file: UPath, place: int) -> Photos:
     record = parse_record(str(file), _entries(file)[place])
     sizes = _listed_sizes(record)
     # without sizes each image would be opened again to know its own
     judged = record if sizes is None else replace(record, sizes=torch.tensor(sizes))
-    return [_photo(file, judged, i, sizes[i] if sizes else None) for i in range(len(record))]
+    photos = [_photo(file, judged, i, sizes[i] if sizes else None) for i in range(len(record))]
+    return photos, ()
 
 
 def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:

@@ -13,7 +13,7 @@ from qgs.data.photos.source import folder_name, upright
 from qgs.paths import read_file
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
 from qgs_photos.datatools.findings import Finding
-from qgs_photos.datatools.photos import Candidate, Photo
+from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
 
 def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
@@ -58,22 +58,22 @@ def dl3dv_scenes(path: UPath, images: str | None) -> Iterator[Candidate]:
         yield Candidate(name, "dl3dv", partial(_archived_photos, place, images))
 
 
-def _archived_photos(place: UPath, images: str | None) -> list[Photo]:
+def _archived_photos(place: UPath, images: str | None) -> Photos:
     return _photos(scene_folder(place), "nerfstudio", images)
 
 
-def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
+def _photos(folder: UPath, kind: str, images: str | None) -> Photos:
     listing = read_listing(folder, kind, images)
-    frames = [*map(upright, listing.frames)]
-    return [
+    photos = [
         Photo(
             listed=frame,
             read=partial(read_file, frame.path),
             maps={"mask": partial(_mask, frame), "depth map": partial(_depth, frame)},
             exists=frame.path in listing.present,
         )
-        for frame in frames
+        for frame in map(upright, listing.frames)
     ]
+    return photos, ()
 
 
 def _mask(frame: PhotoFrame) -> np.ndarray | None:

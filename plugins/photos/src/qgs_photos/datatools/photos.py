@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from PIL import Image
@@ -56,20 +57,22 @@ class Photo:
         return pixels, np.array(intrinsics)
 
 
+Photos: TypeAlias = tuple[Sequence[Photo], Sequence[str]]
+"""Photos of a scene, and names of listed images that do not exist and are not among them."""
+
+
 @dataclass(frozen=True)
 class Candidate:
     """A scene to check, whose photos are listed only when its turn comes.
 
-    kind: format of the scene. photos: function that returns the photos. missing: function that
-    returns the names of listed images that do not exist and that `photos` leaves out. Both
-    functions raise ValueError or OSError for an unreadable scene.
+    kind: format of the scene. photos: function that lists the photos; it raises ValueError or
+    OSError for an unreadable scene.
     """
 
     name: str
     kind: str
-    photos: Callable[[], Sequence[Photo]]
+    photos: Callable[[], Photos]
     split: str = ""
-    missing: Callable[[], Sequence[str]] = tuple
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Find the installed data source that can read a path, and list the scenes to check."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cache, partial
 from typing import get_args
 
@@ -12,7 +12,7 @@ from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
 from qgs.recipe.registry import Registry, load_registry, load_usable_plugins
 from qgs_photos.datatools.entries import bytes_of, encoded
-from qgs_photos.datatools.photos import Candidate, Photo
+from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
 OF_FILES = ("qgs", "datasets")
 """Plugins whose data sets are checked file by file. For a data set of another plugin, the scenes
@@ -83,33 +83,20 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
     for split in reversed(get_args(Split)):
         for place, name in enumerate(opened.names(split)):
             if name not in known:
-                photos = partial(_photos, opened, split, place)
-                missing = partial(_missing, opened, split, place)
-                yield Candidate(name, kind, photos, split, missing)
+                yield Candidate(name, kind, partial(_photos, opened, split, place), split)
             known.add(name)
 
 
-def _missing(source: SceneSource, split: Split, place: int) -> Sequence[str]:
-    return source.scenes(split)[place].missing
-
-
-def _photos(source: SceneSource, split: Split, place: int) -> list[Photo]:
+def _photos(source: SceneSource, split: Split, place: int) -> Photos:
     scene = source.scenes(split)[place]
-    return [
-        Photo(
-            listed=_frame(scene, frame),
-            read=partial(_image_file, scene, frame),
-            maps={"mask": partial(_read_mask, scene, frame)},
-        )
-        for frame in range(len(scene))
-    ]
+    return [_photo(scene, frame) for frame in range(len(scene))], scene.missing
 
 
-def _frame(scene: Scene, frame: int) -> PhotoFrame:
+def _photo(scene: Scene, frame: int) -> Photo:
     camera = scene.cameras[frame]
     name = scene.frame_name(frame)
     fx, fy, cx, cy = camera.intrinsics.tolist()
-    return PhotoFrame(
+    listed = PhotoFrame(
         name=name,
         path=UPath(name),
         c2w=camera.c2w.double().numpy(),
@@ -117,10 +104,11 @@ def _frame(scene: Scene, frame: int) -> PhotoFrame:
         size=camera.size,
         time=None if scene.times is None else float(scene.times[frame]),
     )
-
-
-def _image_file(scene: Scene, frame: int) -> bytes:
-    return encoded(bytes_of(scene.images([frame])[0]))
+    return Photo(
+        listed,
+        lambda: encoded(bytes_of(scene.images([frame])[0])),
+        {"mask": lambda: _read_mask(scene, frame)},
+    )
 
 
 def _read_mask(scene: Scene, frame: int) -> np.ndarray | None:
