@@ -68,7 +68,7 @@ def check(
     general = [item for item in items if isinstance(item, Finding)]
     if not items:
         # raises: what is missing for a photo folder
-        read_listing(path, _photo_format(options))
+        read_listing(path, options.format if options.format in readers() else "auto")
         raise FileNotFoundError(
             f"{path} holds no data of the format {options.format}: leave --format out to check any "
             "format"
@@ -136,11 +136,7 @@ def _items(path: UPath, options: Options) -> Iterator[Candidate | Finding]:
         return dl3dv_scenes(path, options.images)
     if "/" in kind:
         return source_scenes(kind, path, options.images)
-    return photo_folders(path, _photo_format(options), options.images)
-
-
-def _photo_format(options: Options) -> str:
-    return options.format if options.format in readers() else "auto"
+    return photo_folders(path, options.format, options.images)
 
 
 def check_scene(candidate: Candidate, options: Options, most_photos: int) -> SceneReport:
