@@ -3,9 +3,10 @@
 import pytest
 import torch
 from commands import MODEL
+from walk import along_x, pinhole
 
 import qgs
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Gaussians, Views
 
 OPTIONS = [
     "queries.count=12",
@@ -25,9 +26,7 @@ def model():
 @pytest.fixture
 def cameras():
     """Two cameras (1, 2) of 32x32, the identity and one to its right."""
-    c2w = torch.eye(4).repeat(1, 2, 1, 1)
-    c2w[0, 1, 0, 3] = 0.3
-    return Cameras(c2w, torch.tensor([32.0, 32.0, 16.0, 16.0]).expand(1, 2, 4), (32, 32))
+    return pinhole(along_x([0.0, 0.3]), (32.0, 32.0, 16.0, 16.0), (32, 32))[None]
 
 
 @pytest.fixture

@@ -2,12 +2,11 @@
 
 import numpy as np
 import torch
+from walk import along_x, pinhole
 
 from qgs.contracts import Scene, SceneSource, SceneSourceConfig
 from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import EvaluationPlan
-from qgs.geometry.poses import look_at
-from qgs.types import Cameras
 
 DOWN = torch.tensor([0.0, 1, 0])
 SPAN = Span(Span.Config())
@@ -16,12 +15,6 @@ SPAN = Span(Span.Config())
 def drawn(scene, views, seed, step=0, sampler=SPAN):
     """Inputs and targets as they are drawn for a training."""
     return sampler.draw(scene, views, np.random.default_rng(seed), step)
-
-
-def circle(angles, radius):
-    """Poses (V, 4, 4) on a circle about the origin that look at it, at 0 along z."""
-    eyes = radius * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
-    return look_at(eyes, -eyes, DOWN)
 
 
 def values(frames):
@@ -39,13 +32,11 @@ class Line(Scene):
         self.step = step
 
     def poses(self):
-        c2w = torch.eye(4).repeat(self.count, 1, 1)
-        c2w[:, 0, 3] = self.step * torch.arange(self.count) + 3
-        return c2w
+        return along_x(self.step * torch.arange(self.count) + 3)
 
     @property
     def cameras(self):
-        return Cameras(self.poses(), torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
+        return pinhole(self.poses(), (8.0, 8, 3, 4), (8, 8))
 
     def images(self, frames):
         return values(frames) + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)

@@ -4,7 +4,6 @@ The writers share no code with the readers: they follow the descriptions of the 
 """
 
 import io
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tables import write_json
+from walk import along_x
 
 from qgs.data import PhotosSource
 
@@ -55,11 +55,10 @@ def encoded(image, kind="PNG", **options):
 
 def row_of_frames(count, step=1.0, **top):
     """The content of transforms.json for `images/0.png`, ...: cameras `step` apart along x."""
-    frames = []
-    for i in range(count):
-        pose = np.eye(4)
-        pose[0, 3] = step * i
-        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
+    frames = [
+        {"file_path": f"images/{i}.png", "transform_matrix": pose}
+        for i, pose in enumerate(along_x(step * np.arange(count)).tolist())
+    ]
     return {**top, "frames": frames}
 
 
@@ -107,8 +106,8 @@ def write_nerfstudio(folder, photos, **top):
         for name, pose in zip(names, photos.c2w, strict=True)
     ]
     camera = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height}
-    text = json.dumps({"camera_model": "OPENCV", **camera, **top, "frames": frames})
-    (folder / "transforms.json").write_text(text)
+    content = {"camera_model": "OPENCV", **camera, **top, "frames": frames}
+    write_json(folder / "transforms.json", content)
     return folder
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from walk import along_x
 
 from qgs.contracts import Plugin, Scene, SceneSource
 from qgs.types import Cameras
@@ -59,7 +60,5 @@ def write_tape(file):
     """Noise, seen by cameras a step apart."""
     file.parent.mkdir(parents=True, exist_ok=True)
     images = np.random.default_rng(0).integers(0, 256, (6, 16, 16, 3), np.uint8)
-    c2w = np.tile(np.eye(4), (6, 1, 1))
-    c2w[:, 0, 3] = 0.1 * np.arange(6)
     with file.open("wb") as opened:
-        np.savez(opened, images=images, c2w=c2w)
+        np.savez(opened, images=images, c2w=along_x(0.1 * np.arange(6)))

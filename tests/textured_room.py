@@ -4,8 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import photo_formats
+import torch
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
+from walk import pinhole
+
+from qgs.types import Views
 
 SIZE = (120, 180)
 INTRINSICS = (145.0, 147.0, 89.0, 61.0)
@@ -26,6 +30,13 @@ def walk(count, seed=0):
     """Photos along a rising arc that turns and rolls, so that no convention is ambiguous."""
     noise = np.random.default_rng(seed).random((40, 40, 40))
     return [_shot(noise, pose) for pose in _poses(count)]
+
+
+def photos_of(shots):
+    """Photos (1, V) and their cameras, in float32."""
+    images, c2w = (np.stack([getattr(s, name) for s in shots]) for name in ("image", "c2w"))
+    cameras = pinhole(torch.tensor(c2w).float(), INTRINSICS, SIZE)
+    return Views((torch.tensor(images).movedim(-1, 1) / 255)[None], cameras[None])
 
 
 def _poses(count):

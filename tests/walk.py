@@ -17,6 +17,14 @@ def arc(degrees, radius, rise=0.0):
     return look_at(-radius * axes, axes, torch.tensor([0.0, 1.0, 0.0]))
 
 
+def along_x(places):
+    """Poses (V, 4, 4) of cameras at places along the x axis that look along z."""
+    places = torch.as_tensor(places)
+    c2w = torch.eye(4).to(places).repeat(len(places), 1, 1)
+    c2w[:, 0, 3] = places
+    return c2w
+
+
 def pinhole(c2w, lens=(64.0, 64.0, 32.0, 32.0), size=(SIDE, SIDE)):
     """Cameras (V,)."""
     return Cameras(c2w, torch.tensor(lens).to(c2w).expand(len(c2w), 4), size)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from line_scenes import DOWN, samples_of
 from training_runs import resume, run, tiny
-from walk import pinhole
+from walk import along_x, pinhole
 
 from qgs.checkpoint.model_file import CheckpointFile, save
 from qgs.checkpoint.tensors import CheckpointError
@@ -32,8 +32,7 @@ def around(target, eyes, focal=16.0):
 
 
 PAIR = around(2, (-0.5, 0.5))
-PARALLEL = replace(PAIR, c2w=torch.eye(4).repeat(1, 2, 1, 1))
-PARALLEL.c2w[..., 1, 0, 3] = 1
+PARALLEL = replace(PAIR, c2w=along_x([0.0, 1.0])[None])
 
 
 def domain(*cameras):

@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from line_scenes import DOWN, Line, Lines, circle, drawn, samples_of, values
+from line_scenes import DOWN, Line, Lines, drawn, samples_of, values
 from odd_views import odd_views
 from tables import assert_equal, must_refuse
 from torch.testing import assert_close
+from walk import arc
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
@@ -151,7 +152,7 @@ class Around(Line):
     """Cameras on a circle about the origin, at a distance of 4, that look at it."""
 
     def poses(self):
-        return circle(torch.linspace(0, 3, self.count).double(), 4)
+        return arc(torch.linspace(0, 172, self.count), 4)
 
 
 def test_auto_brings_what_all_cameras_look_at_to_depth_1(caplog):

@@ -1,11 +1,11 @@
 """Which photos become inputs, in walks, orbits and folders without order."""
 
 import pytest
-import textured_room
 import torch
 import yaml
 from tables import must_refuse
-from walk import arc, pinhole
+from textured_room import photos_of, walk
+from walk import along_x, arc, pinhole
 
 from qgs.data.inputs import Frusta, ranked_windows, scene_depth, trained_ratios
 from qgs.domain import Domain
@@ -82,16 +82,11 @@ def test_photos_that_look_elsewhere_are_no_inputs():
 
 
 def test_the_depth_of_a_walk_is_seen_in_its_photos():
-    shots = textured_room.walk(6)
-    images = torch.stack([torch.from_numpy(s.image).permute(2, 0, 1) / 255 for s in shots])
-    c2w = torch.stack([torch.from_numpy(s.c2w) for s in shots])
-    cameras = pinhole(c2w.float(), textured_room.INTRINSICS, images.shape[2:])
+    views = photos_of(walk(6))
     # walls at 1.5, seen from -1.1 to -0.6 along the axis
-    assert 1.5 < scene_depth(GivenScene(Views(images[None], cameras[None]))) < 2.7
+    assert 1.5 < scene_depth(GivenScene(views)) < 2.7
 
 
 def test_photos_without_texture_leave_the_reach_of_the_cameras():
-    row = torch.eye(4).repeat(9, 1, 1)
-    assert scene_depth(scene_of(row)) == 1.0
-    row[:, 0, 3] = 0.5 * torch.arange(9)
-    assert scene_depth(scene_of(row)) == pytest.approx(4.0)
+    assert scene_depth(scene_of(along_x([0.0] * 9))) == 1.0
+    assert scene_depth(scene_of(along_x(0.5 * torch.arange(9)))) == pytest.approx(4.0)

@@ -9,13 +9,14 @@ import yaml
 from skimage.metrics import structural_similarity
 from tables import must_refuse
 from torch.testing import assert_close
+from walk import along_x, pinhole
 
 from qgs.contracts import Column, MetricInput
 from qgs.data.samples import stack_views
 from qgs.metrics.baselines import mean_colour, nearest_input, worse_than_nearest
 from qgs.metrics.dispersion import Dispersion, token_dispersion
 from qgs.metrics.images import psnr, ssim
-from qgs.types import Cameras, Views
+from qgs.types import Views
 
 
 def pair(noise, size=(24, 37)):
@@ -54,11 +55,10 @@ def test_identical_images_with_leading_dimensions():
 
 def cameras(x, turn=()):
     """Cameras along the x axis, turned by radians about y."""
-    c2w = torch.eye(4).repeat(1, len(x), 1, 1)
+    c2w = along_x(x)
     skew = torch.tensor([[0, 0, 1.0], [0, 0, 0], [-1, 0, 0]])
-    c2w[0, : len(turn), :3, :3] = torch.tensor(turn)[:, None, None].mul(skew).matrix_exp()
-    c2w[0, :, 0, 3] = torch.tensor(x)
-    return Cameras(c2w, torch.full((1, len(x), 4), 4.0), (8, 8))
+    c2w[: len(turn), :3, :3] = torch.tensor(turn)[:, None, None].mul(skew).matrix_exp()
+    return pinhole(c2w, [4.0] * 4, (8, 8))[None]
 
 
 def views(x, turn=()):

@@ -8,12 +8,12 @@ import torch
 from renderers.scenes import differentiate, make_scene
 from tables import must_refuse
 from torch.testing import assert_close
+from walk import along_x, pinhole
 
 from qgs.containers import concatenated, named_tensors
 from qgs.contracts import RendererConfig
 from qgs.geometry.harmonics import seen_colors
 from qgs.renderers import CpuRenderer, GsplatRenderer, TorchRenderer
-from qgs.types import Cameras
 
 HAS_GSPLAT = torch.cuda.is_available() and find_spec("gsplat")
 
@@ -51,8 +51,7 @@ def compared(renderer, scene, of_images=2e-5, of_gradients=2e-5, **options):
 
 
 def fixed_cameras(batch):
-    intrinsics = torch.tensor([40.0, 40.0, 20.0, 12.0]).expand(batch, 1, 4)
-    return Cameras(torch.eye(4).repeat(batch, 1, 1, 1), intrinsics, (24, 40))
+    return pinhole(along_x([0.0] * batch), (40.0, 40.0, 20.0, 12.0), (24, 40))[:, None]
 
 
 def test_images_and_gradients_match_the_oracle(build):

@@ -3,19 +3,17 @@
 import pytest
 import torch
 from qgs_viewer.trust import UNSEEN, WHOLE, WRONG, Part, means, scored_views, verdict
+from walk import along_x, pinhole
 
 from qgs.data.samples import Sample
-from qgs.types import Cameras, Rendering, Views
+from qgs.types import Rendering, Views
 
 SIDE = 12
 
 
 def cameras(*places):
     """They look along z, the view of each as wide as what it sees is far away."""
-    c2w = torch.eye(4).repeat(1, len(places), 1, 1)
-    c2w[0, :, 0, 3] = torch.tensor(places)
-    lens = torch.tensor([SIDE, SIDE, SIDE / 2, SIDE / 2])
-    return Cameras(c2w, lens.expand(1, len(places), 4), (SIDE, SIDE))
+    return pinhole(along_x(places), (SIDE, SIDE, SIDE / 2, SIDE / 2), (SIDE, SIDE))[None]
 
 
 def test_a_pixel_is_seen_if_its_point_at_the_rendered_depth_lies_in_an_input():

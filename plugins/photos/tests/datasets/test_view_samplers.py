@@ -5,9 +5,10 @@ from itertools import islice
 
 import numpy as np
 import torch
-from line_scenes import Line, Lines, circle, samples_of
+from line_scenes import Line, Lines, samples_of
 from qgs_photos.datasets.view_samplers import Bounded, Farthest, Overlapping
 from tables import must_refuse
+from walk import arc
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
@@ -159,7 +160,7 @@ class Arc(Line):
     """40 cameras .5 apart around what they look at, DEPTH away; files in an order of chance."""
 
     def poses(self):
-        return circle(0.5 / DEPTH * (SHUFFLED - 20).double(), DEPTH)
+        return arc((0.5 / DEPTH * (SHUFFLED - 20)).rad2deg(), DEPTH)
 
 
 def draws(count, views=TWO, **options):

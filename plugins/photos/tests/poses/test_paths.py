@@ -13,7 +13,7 @@ from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, see
 from qgs_photos.poses.paths import path_of, read_path, walk
 from tables import must_refuse, write_json
 from training_runs import tiny
-from walk import pinhole
+from walk import along_x, pinhole
 from walked import frames
 
 import qgs
@@ -29,9 +29,7 @@ SIZE = (36, 54)
 
 def cameras():
     """A row of cameras that looks along z."""
-    c2w = torch.eye(4).repeat(7, 1, 1)
-    c2w[:, 0, 3] = torch.linspace(-0.5, 0.5, 7)
-    return pinhole(c2w, (44.0, 44.0, 27.0, 18.0), SIZE)[None]
+    return pinhole(along_x(torch.linspace(-0.5, 0.5, 7)), (44.0, 44.0, 27.0, 18.0), SIZE)[None]
 
 
 def wall(depth):

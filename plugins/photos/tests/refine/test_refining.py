@@ -7,10 +7,8 @@ from dataclasses import replace
 from functools import partial
 from itertools import count
 
-import numpy as np
 import pytest
 import torch
-from line_scenes import circle
 from qgs_photos.refine import refine
 from qgs_photos.refine.growth import FreeGaussians
 from qgs_photos.refine.refining import Extras, resized
@@ -19,13 +17,14 @@ from qgs_photos.refine.scene import masked
 from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
 from tables import assert_equal, must_refuse
-from textured_room import INTRINSICS, SIZE, walk
+from textured_room import INTRINSICS, photos_of, walk
+from walk import arc, pinhole
 
 from qgs.containers import map_tensors
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Gaussians, Views
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
 
@@ -58,9 +57,8 @@ def cloud(number, seed=0):
 
 def ring(views, side=24):
     """Cameras (1, views) on a quarter of a circle of radius 2 about the origin."""
-    c2w = circle(torch.linspace(0, math.pi / 2, views), 2)
-    lens = torch.tensor([side, side, side / 2, side / 2]).expand(1, views, 4)
-    return Cameras(c2w[None], lens, (side, side))
+    c2w = arc(torch.linspace(0, 90, views), 2).float()
+    return pinhole(c2w, (side, side, side / 2, side / 2), (side, side))[None]
 
 
 def photos(views, side=24, number=60):
@@ -299,11 +297,7 @@ def test_photos_that_do_not_show_a_gaussian_do_not_count():
 
 def walked(count):
     """The first photos (1, V) of a walk."""
-    shots = walk(20)[:count]
-    images, c2w = (np.stack([getattr(s, name) for s in shots]) for name in ("image", "c2w"))
-    images, c2w = torch.tensor(images).movedim(-1, 1) / 255, torch.tensor(c2w).float()
-    lens = torch.tensor(INTRINSICS).expand(1, count, 4)
-    return Views(images[None], Cameras(c2w[None], lens, SIZE))
+    return photos_of(walk(20)[:count])
 
 
 def test_points_lie_on_the_walls_in_their_colours():
