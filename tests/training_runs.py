@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 from tables import assert_equal
 
-from qgs.data.stream import SampleStream, training_batches
+from qgs.data.stream import SampleError, SampleStream, training_batches
 from qgs.recipe import resolve
 from qgs.train.folder import RunFolder, read_state
 from qgs.train.tracking import TrainingProgress
@@ -118,3 +118,16 @@ def change_samples(monkeypatch, change):
         return sample
 
     monkeypatch.setattr(SampleStream, "_sample_after", changed)
+
+
+def spoil(monkeypatch, bad, nan=False):
+    """Samples of numbers in `bad`, with those that replace others, have a bad pixel or fail."""
+
+    def spoiled(sample, number, attempt):
+        number += attempt
+        if number in bad:
+            if not nan:
+                raise SampleError(f"scene 'x', frame {number} (a.png): cannot be read")
+            sample.targets.images[0, 0, 0, 0, 0] = torch.nan
+
+    change_samples(monkeypatch, spoiled)

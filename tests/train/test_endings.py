@@ -18,6 +18,7 @@ from training_runs import (
     run,
     run_calling,
     saved_step,
+    spoil,
     tiny,
 )
 
@@ -85,12 +86,7 @@ def test_a_step_without_memory_says_what_takes_less_and_the_run_is_saved(tmp_pat
 
 def test_bad_samples_are_skipped_and_named_if_asked_for(tmp_path, monkeypatch, caplog):
     bad = {1, 3}
-
-    def unreadable(sample, number, attempt):
-        if number + attempt in bad:
-            raise SampleError(f"scene 'x', frame {number + attempt} (a.png): cannot be read")
-
-    change_samples(monkeypatch, unreadable)
+    spoil(monkeypatch, bad)
     must_refuse("frame 1", run, tiny("tokengs"), tmp_path / "stops", kind=SampleError)
     skipping = tiny("tokengs", "training.on_bad_sample=skip")
     assert run(skipping, tmp_path / "skips").steps == 3

@@ -9,13 +9,13 @@ from qgs_viewer.curves import curves_of
 from tables import assert_equal, must_refuse, names_in
 from training_runs import (
     TRAINED,
-    change_samples,
     column,
     losses,
     parts_of,
     read_jsonl,
     resume,
     run,
+    spoil,
     tiny,
 )
 
@@ -111,19 +111,9 @@ def test_a_time_budget_ends_the_run(tmp_path):
         assert record["lr"] == pytest.approx(schedule.learning_rate(step, clock[step]))
 
 
-def spoil(monkeypatch, *numbers):
-    """The training samples of these numbers hold a NaN pixel."""
-
-    def spoiled(sample, number, attempt):
-        if number in numbers:
-            sample.targets.images[0, 0, 0, 0, 0] = torch.nan
-
-    change_samples(monkeypatch, spoiled)
-
-
 def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     """By a run from its start, and by one that a bad step ended."""
-    spoil(monkeypatch, 2, 6)
+    spoil(monkeypatch, {2, 6}, nan=True)
     options = ("training.steps=4", "training.ema=0.9")
     skipping = tiny("locus", *options, "training.on_nonfinite=skip")
     through = tmp_path / "through"
@@ -162,7 +152,7 @@ def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
 
 
 def test_skipping_comes_to_an_end(tmp_path, monkeypatch):
-    spoil(monkeypatch, *range(2, 100))
+    spoil(monkeypatch, range(2, 100), nan=True)
     monkeypatch.setattr(guard, "MAX_SKIPPED", 2)
     recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
     must_refuse("most 2 steps in a row", run, recipe, tmp_path, kind=NonFiniteError)
