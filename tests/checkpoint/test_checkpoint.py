@@ -149,9 +149,8 @@ def test_a_renamed_pickle_is_refused_unread(saved):
 
 
 def test_another_format_is_refused(saved):
-    for version in ("2", "99"):
-        rewrite(saved, **{"qgs.format_version": version})
-        must_not_load(f"qgs.format_version {version}", saved)
+    rewrite(saved, **{"qgs.format_version": "99"})
+    must_not_load("qgs.format_version 99", saved)
 
 
 def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):

@@ -11,7 +11,7 @@ from training_runs import run
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.samples import collate, make_sample
 from qgs.evaluate.plan import held_out_windows
-from qgs.recipe import RecipeError, resolve
+from qgs.recipe import resolve
 
 VIEWS = ViewsConfig(inputs=2, targets=2, gap=(2, 4))
 
@@ -105,4 +105,3 @@ def test_a_dynamic_model_trains_on_photos_with_times(tmp_path):
     folder = dnerf(tmp_path, *(i / 7 for i in range(8)), 0.3)
     data = f"data={{type: qgs/photos, path: '{folder}', image_size: [16, 16]}}"
     assert run(resolve("tiny/tokengs.yaml", [*DYNAMIC, data]), tmp_path / "run").steps == 2
-    must_refuse("times", resolve, "tiny/tokengs.yaml", DYNAMIC, kind=RecipeError)

@@ -134,26 +134,31 @@ def test_terms_and_gradients_do_not_depend_on_how_many_views_are_rendered_at_onc
     assert not wrong
 
 
-def test_gradients_of_two_passes_are_those_of_the_definition():
+def test_two_passes_have_the_terms_and_gradients_of_the_definition():
     """As one graph, in which the two passes and both comparisons stand written out."""
-    recipe = tiny("locus", *TWO, "objective.alpha_weight=0.1", "objective.depth_weight=0.2")
+    weights = ("objective.alpha_weight=0.1", "objective.depth_weight=0.2")
+    frustum = "losses.frustum={type: globalsplat/frustum, weight: 1}"  # of each pass's own cameras
+    recipe = tiny("locus", *TWO, *weights, frustum)
     model = recipe.build_model().train()
     batch = first_batch(recipe)
     step = TrainingPass(recipe, model)
-    total = torch.zeros(())
-    seen = []
-    for views in ([0, 1, 3, 4], [0, 2, 4]):
-        some = batch.inputs.select(views)
-        total = total + sum(written_out(step, some, batch.targets).values()) / 2
-        seen.append(model.render(model(some).gaussians, batch.targets.cameras))
+    parts = [batch.inputs.select(views) for views in ([0, 1, 3, 4], [0, 2, 4])]
+    first, second = (written_out(step, part, batch.targets) for part in parts)
+    terms = {name: (first[name] + second[name]) / 2 for name in first}
+    total = sum(terms.values())
+    seen = [model.render(model(part).gaussians, batch.targets.cameras) for part in parts]
     for name, factor in (("alpha", 0.1), ("depth", 0.2)):
         one, other = (getattr(rendering, name) for rendering in seen)
+        terms[f"{name}_consistency"] = factor * (one - other).abs().mean()
         # half of the gradient that |one - other| has with nothing fixed, its value in full
-        total = total + factor * (one - other).abs().mean() / 2
+        total = total + terms[f"{name}_consistency"] / 2
     wanted = gradients(step, total)
     for at_once in (0, 1):
         step.render_views = at_once
-        assert furthest(gradients(step, step(batch.inputs, batch.targets).total), wanted) < 1e-5
+        outcome = step(batch.inputs, batch.targets)
+        assert_close(outcome.terms, terms)
+        assert_close(outcome.total, sum(terms.values()))
+        assert furthest(gradients(step, outcome.total), wanted) < 1e-5
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")

@@ -1,4 +1,7 @@
-"""Recipes, losses and the objective: sizes, what is refused, what is judged, small trainings."""
+"""Recipes, losses and views of both passes: sizes, what is refused, a small training.
+
+tests/train/test_training_pass.py tests what two passes judge.
+"""
 
 from functools import partial
 
@@ -8,7 +11,7 @@ import yaml
 from odd_views import odd_views
 from qgs_dev import Case
 from qgs_dev.inputs import Sizes, inputs_of
-from qgs_zoo.globalsplat.losses import Frustum, Regularisers, beyond_frusta, disagreement, subset
+from qgs_zoo.globalsplat.losses import Frustum, Regularisers, beyond_frusta, subset
 from refusals import wrong_refusals
 from torch.testing import assert_close
 from training_runs import run
@@ -16,7 +19,6 @@ from training_runs import run
 import qgs
 from qgs.model_text import parameter_counts
 from qgs.recipe import resolve
-from qgs.train.training_pass import TrainingPass
 
 PUBLISHED = "globalsplat/re10k.yaml"
 TINY = "tiny/globalsplat.yaml"
@@ -150,28 +152,3 @@ def test_passes_share_the_ends_and_part_the_rest():
         assert {*one} | {*other} == {*range(count)}
         assert [sorted(one), sorted(other)] == [[*one], [*other]]
         assert 0 <= len(one) - len(other) <= 1
-
-
-def test_both_are_judged_and_compared():
-    two = "objective={type: globalsplat/two_passes, alpha_weight: 0.1, depth_weight: 0.2}"
-    small = (*SMALL, "losses.frustum.weight=10")  # which tells by whose cameras it judges
-    recipe = resolve(TINY, [*small, "views.inputs=5", two])
-    model = recipe.build_model()
-    inputs = odd_views(5, 16, 24)
-    outcome = TrainingPass(recipe, model)(inputs, VIEWS)
-    parts = [inputs.select(part) for part in ([0, 1, 3, 4], [0, 2, 4])]
-    alone = TrainingPass(resolve(TINY, small), model)
-    one, other = (alone(part, VIEWS).terms for part in parts)
-    wanted = {name: (one[name] + other[name]) / 2 for name in one}
-    one, other = (model.render(model(part).gaussians, VIEWS.cameras) for part in parts)
-    wanted["alpha_consistency"] = 0.1 * (one.alpha - other.alpha).abs().mean()
-    wanted["depth_consistency"] = 0.2 * (one.depth - other.depth).abs().mean()
-    assert_close(outcome.terms, wanted)
-    assert_close(outcome.total, sum(wanted.values()))
-
-
-def test_each_is_pulled_to_the_other_that_stands_still():
-    one, other = (torch.tensor([x], requires_grad=True) for x in (1.0, 4.0))
-    apart = disagreement(one, other)
-    apart.backward()
-    assert (apart, one.grad, other.grad) == (3, -0.5, 0.5)
