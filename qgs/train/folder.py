@@ -42,6 +42,7 @@ _TENSOR = "tensor"
 FREE = (
     "training.steps",
     "training.seconds",
+    "training.accumulate",
     "training.save_every",
     "training.collapse_window",
     "training.workers",
@@ -265,8 +266,7 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
         # A run that was killed before its first save has only a recipe, and starts again.
         run = resolve(folder.recipe)
         states = {}
-    # `Counters` compares the scenes of a step, which older runs counted by process.
-    may_change = tuple(f"{k}." for k in (*FREE, "training.batch_size", "training.accumulate"))
+    may_change = tuple(f"{key}." for key in FREE)
     differing = [
         f"\n  {key}: {ours or 'absent'} here, {theirs or 'absent'} in the run"
         for key, (ours, theirs) in differing_options(recipe.tree, run.tree).items()

@@ -99,26 +99,14 @@ class Counters:
         return dict(zip(measured, numbers, strict=True))
 
     def state(self) -> dict[str, Any]:
-        """Return step, seconds, batch size, and the fingerprint of the scenes."""
-        return {
-            "step": self.step,
-            "seconds": self.seconds,
-            "step_size": self.config.batch_size,
-            "scenes": self.scenes,
-        }
+        """Return step, seconds, and the fingerprint of the scenes."""
+        return {"step": self.step, "seconds": self.seconds, "scenes": self.scenes}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Continue counting from `state`.
 
-        Raises OtherRunError if the batch size or the training scenes have changed.
+        Raises OtherRunError if the training scenes have changed.
         """
-        # Sample k depends only on its number, so equal step sizes give the same batches.
-        size = state["step_size"]
-        if size != self.config.batch_size:
-            raise OtherRunError(
-                f"each optimiser step of this run uses {size} samples, but the recipe asks for "
-                f"{self.config.batch_size}: add --set training.batch_size={size}"
-            )
         if state["scenes"] != self.scenes:
             raise OtherRunError(
                 "the training scenes have changed since this run was saved: restore the same "

@@ -147,7 +147,7 @@ def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, cop
     told = str(must_refuse(reason, resumed, copied, *changes, kind=OtherRunError))
     assert "seed: 4 here, 0 in the run" in told
     assert "training.save_every:" not in told
-    batches = r"uses 2 samples.*asks for 3.*batch_size=2"
+    batches = r"training\.batch_size: 3 here, 2 in the run"
     must_refuse(batches, resumed, copied, "training.batch_size=3", kind=OtherRunError)
     folder = RunFolder(copied)
     folder.take()
