@@ -4,7 +4,7 @@ import pytest
 from photo_formats import row_of_frames
 from photo_formats import scene as read
 from PIL import Image
-from tables import must_not_find, must_refuse, write_json
+from tables import must_not_find, must_refuse, rows, write_json
 
 from qgs.wording import warn_once
 
@@ -62,21 +62,19 @@ def spoon(tmp_path):
 
 
 def test_files_are_found(spoon, caplog):
-    for number, line in enumerate(FOUND.strip().splitlines()):
-        listed, file, told = line.split(":")
+    for number, (listed, file, told) in enumerate(rows(FOUND, ":")):
         scene = read(spoon(str(number), listed, file.strip()))
         assert [scene.frame_name(i) for i in range(3)] == [
             file.strip().replace("N", str(i)) for i in range(3)
         ]
         notes = [record.message for record in caplog.records]
-        assert len(notes) == bool(told.strip()), line
+        assert len(notes) == bool(told.strip()), listed
         assert all("3 of 3 files" in note and str(scene.photos[0].path) in note for note in notes)
         caplog.clear()
 
 
 def test_what_may_be_meant_by_two_names_or_none_is_refused(spoon):
-    for number, line in enumerate(REFUSED.strip().splitlines()):
-        told, listed, files = line.split(": ")
+    for number, (told, listed, files) in enumerate(rows(REFUSED, ": ")):
         folder = spoon(str(number), listed, *files.split())
         must_refuse(told, read, folder, kind=(FileNotFoundError, ValueError))
 

@@ -6,7 +6,7 @@ import photo_formats
 import pytest
 from photo_formats import numbered_photos
 from PIL import Image
-from tables import must_not_find, must_refuse
+from tables import must_not_find, must_refuse, rows
 
 
 def folder(path, frame=None, **options):
@@ -58,8 +58,7 @@ k1 | {"k1": NaN}
 
 
 def test_what_cannot_be_meant_is_refused(tmp_path):
-    for line in REFUSED.strip().splitlines():
-        word, text = line.split(" | ")
+    for word, text in rows(REFUSED):
         must_refuse(word, opened, folder(tmp_path, count=2, **json.loads(text)))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 import yaml
 from refusals import refused
-from tables import assert_equal, must_refuse
+from tables import assert_equal, must_refuse, rows
 
 from qgs.recipe import compose, resolve
 from qgs.recipe.errors import Problems
@@ -49,8 +49,8 @@ ODD = "null,- a,a: b,# a,a #b,&a,[,2e5,.nan"
 
 
 def test_scalars_are_those_of_yaml_12():
-    rows = [line.split(" = ") for line in SCALARS.strip("\n").splitlines()]
-    assert {text: repr(load_text(text, "f", Problems())) for text, _ in rows} == dict(rows)
+    scalars = dict(rows(SCALARS, " = "))
+    assert {text: repr(load_text(text, "f", Problems())) for text in scalars} == scalars
 
 
 def test_what_is_dumped_is_read_back():

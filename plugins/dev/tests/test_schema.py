@@ -8,7 +8,7 @@ import pytest
 import yaml
 from commands import done
 from qgs_dev.schema import recipe_schema
-from tables import read_json
+from tables import read_json, rows
 
 from qgs.recipe.registry import load_registry
 
@@ -74,8 +74,7 @@ recipe; seed; init_from
 
 def test_list_explains_options(monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    for line in LISTED.strip().splitlines():
-        name, *parts = line.split("; ")
+    for name, *parts in rows(LISTED, "; "):
         shown = done("list", name).output.replace("\N{BOX DRAWINGS LIGHT VERTICAL}", "|")
         output = " ".join(shown.split())
         assert all(part in output for part in parts), output
