@@ -1,5 +1,7 @@
 """Evaluation indices: what is read, what is refused, which samples they name."""
 
+from unittest.mock import Mock
+
 import pytest
 import torch
 from line_scenes import Line, Lines, plan_of, samples_of
@@ -10,24 +12,6 @@ from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.evaluate.plan import read_index
 
 VIEWS = ViewsConfig(inputs=2, gap=(2, 5))
-
-
-class Strip(Line):
-    """A line that counts what it decodes."""
-
-    decoded = 0
-
-    def __init__(self, name):
-        super().__init__(8, name=name)
-
-    def images(self, frames):
-        self.decoded += 1
-        return super().images(frames)
-
-
-class Strips(Lines):
-    def scenes(self, split):
-        return self._scenes if split == "test" else ()
 
 
 def entry(context, target):
@@ -72,7 +56,7 @@ def test_a_missing_index_is_told_with_its_path():
 
 
 def test_samples_are_those_of_the_index_in_its_order(tmp_path):
-    source = Strips(Strip("one"), Strip("two"), Strip("three"))
+    source = Lines(*(Line(8, name=name) for name in ("one", "two", "three")))
     index = {"three": entry([4, 1], [2, 3, 2]), "one": entry([0, 7], [5])}
     first, second = samples_of(source, VIEWS, indexed(tmp_path, index, scenes=1))
     assert (first.scene, second.scene) == ("three", "one")
@@ -104,8 +88,11 @@ def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(tmp
 
 
 def test_scenes_are_decoded_one_at_a_time():
-    scenes = [Strip(f"scene{n}") for n in range(4)]
-    plan = plan_of(Strips(*scenes), VIEWS, EvaluationConfig())
+    scenes = [Line(8, name=f"scene{n}") for n in range(4)]
+    for scene in scenes:
+        scene.images = Mock(wraps=scene.images)
+    plan = plan_of(Lines(*scenes), VIEWS, EvaluationConfig())
     for number, name in enumerate(plan.wanted):
         assert len(list(plan.samples(name))) == 1
-        assert [scene.decoded for scene in scenes] == [1] * (number + 1) + [0] * (3 - number)
+        decoded = [scene.images.call_count for scene in scenes]
+        assert decoded == [1] * (number + 1) + [0] * (3 - number)
