@@ -23,6 +23,13 @@ from qgs.tokengs import (
 class ExtendedMlp(Extended, MlpFeedForward): ...
 
 
+class AddsToItsOutput(ExtendedMlp):
+    """An MLP with a summand that mutants make."""
+
+    def forward(self, features):
+        return super().forward(features) + self.summand
+
+
 @mutant("builds", "RuntimeError: no kernel for width 32")
 class RaisesWhenBuilt(ExtendedMlp):
     def add(self, dims):
@@ -30,12 +37,9 @@ class RaisesWhenBuilt(ExtendedMlp):
 
 
 @mutant("sizes_vary", "`output` has shape")
-class FixedNumberOfQueries(ExtendedMlp):
+class FixedNumberOfQueries(AddsToItsOutput):
     def add(self, dims):
-        self.place = nn.Parameter(torch.zeros(6, dims.width))
-
-    def forward(self, features):
-        return super().forward(features + self.place)
+        self.summand = nn.Parameter(torch.zeros(6, dims.width))
 
 
 @mutant("sizes_vary", "in a model of width 48 with 3 heads, RuntimeError")
@@ -115,13 +119,10 @@ PINNED = {
 """What saved weights of `qgs/mlp` hold in a model of width 32."""
 
 
-@mutant("construction", "scale: allocated")
-class AllocatesOnCpu(ExtendedMlp):
+@mutant("construction", "summand: allocated")
+class AllocatesOnCpu(AddsToItsOutput):
     def add(self, dims):
-        self.scale = nn.Parameter(torch.ones(dims.width, device="cpu"))
-
-    def forward(self, features):
-        return self.scale * super().forward(features)
+        self.summand = nn.Parameter(torch.ones(dims.width, device="cpu"))
 
 
 @mutant("construction", "keeps layers outside")
@@ -147,12 +148,9 @@ class DrawsFromItsOwnGenerator(ExtendedMlp):
 
 
 @mutant("construction", "with the same state dict differ, output")
-class KeepsARandomBufferUnsaved(ExtendedMlp):
+class KeepsARandomBufferUnsaved(AddsToItsOutput):
     def add(self, dims):
-        self.register_buffer("noise", torch.randn(dims.width), persistent=False)
-
-    def forward(self, features):
-        return super().forward(features) + self.noise
+        self.register_buffer("summand", torch.randn(dims.width), persistent=False)
 
 
 @mutant("state_dict_keys", "'norm.bias'", case={"state_dict": PINNED})
