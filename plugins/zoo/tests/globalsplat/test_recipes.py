@@ -84,17 +84,13 @@ def test_what_cannot_work_is_refused():
     assert not wrong_refusals(TINY, REFUSED)
 
 
-def test_two_passes_train_and_their_terms_are_recorded(tmp_path):
+def test_two_passes_train_a_head_that_grows(tmp_path):
     growing = "model.head.level={schedule: steps, values: [0, 0.5, 1, 3], at: [1, 2, 4]}"
     two = ("objective={type: globalsplat/two_passes}", "views.inputs=4", growing)
     brief = ("training.steps=6", "training.seconds=null", "optimizer.warmup=2")
     recipe = resolve(TINY, [*SMALL, *two, *brief, "evaluation.scenes=2"])
     folder = run(recipe, tmp_path / "run").folder
-    history = folder.history()
-    assert len(history) > 1
-    for record in history:
-        terms = ("mse", "frustum", "alpha_consistency", "depth_consistency")
-        assert all(record[term] > 0 for term in terms)
+    assert [record["frustum"] > 0 for record in folder.history()] == [True] * 6
     model = qgs.load(folder.checkpoint)
     assert model.head.gaussians_per_query == 8  # those of the last step
     assert qgs.compose(TINY, overrides=[growing]).head.gaussians_per_query == 1  # of the first one
