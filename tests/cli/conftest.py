@@ -2,6 +2,9 @@
 
 import pytest
 from commands import done, run_qgs, sets
+from reconstructing import checkpoint, photos
+
+__all__ = ["checkpoint", "photos"]
 
 RECIPE = "tiny/locus.yaml"
 QUICK = sets(

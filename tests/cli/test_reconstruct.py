@@ -5,35 +5,20 @@ import pytest
 import tape_source
 import torch
 from commands import done, record_of, saved
-from photo_formats import noisy_photos, scene
+from photo_formats import scene
 from PIL import Image
 from plyfile import PlyData
+from reconstructing import kinds
 from tables import must_refuse, rows
 
 import qgs
 from qgs.reconstruction.scenes import frame_list
 
 
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory):
-    """A row of 7, 0.1 apart."""
-    return noisy_photos(tmp_path_factory.mktemp("photos") / "row")
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    return saved(tmp_path_factory.mktemp("rooms") / "rooms.safetensors", "rooms/procedural")
-
-
 def written(*words, out):
     """The record of a run into `out`."""
     done("reconstruct", *words, "--out", out)
     return record_of(out)
-
-
-def kinds(record):
-    """Of the frames of views: inputs, then those that are compared with."""
-    return {view["frame"]: view["kind"] for view in record["views"]}
 
 
 def test_everything_is_written_and_what_a_user_made_is_kept(

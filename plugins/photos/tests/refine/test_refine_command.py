@@ -4,33 +4,17 @@ import shutil
 
 import pytest
 from commands import done, record_of, saved
-from photo_formats import noisy_photos
 from plyfile import PlyData
+from reconstructing import kinds
 from tables import must_refuse, read_json, write_json
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory):
-    """A row of 7, 0.1 apart."""
-    return noisy_photos(tmp_path_factory.mktemp("photos") / "row")
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    return saved(tmp_path_factory.mktemp("rooms") / "rooms.safetensors", "rooms/procedural")
 
 
 @pytest.fixture
 def reconstruction(checkpoint, photos, tmp_path):
     done("reconstruct", checkpoint, photos, "--scale", 0.5, "--out", tmp_path / "made")
     return tmp_path / "made"
-
-
-def kinds(folder):
-    """Of the frames of views: inputs, then those that are compared with."""
-    return {view["frame"]: view["kind"] for view in record_of(folder)["views"]}
 
 
 def refined_in(file):
@@ -51,9 +35,9 @@ def test_photos_held_out_are_compared_with_and_not_refined_on(checkpoint, photos
         words = (*options.split(), "--scale", 0.5, "--out", out)
         done("reconstruct", checkpoint, photos, *words)
         done("refine", out, photos, "--seconds", 0.01)
-        refined = out / "refined"
-        assert record_of(refined)["refinement"]["frames"] == [*{*range(7)} - compared], options
-        assert kinds(refined) == kinds(out)
+        record = record_of(out / "refined")
+        assert record["refinement"]["frames"] == [*{*range(7)} - compared], options
+        assert kinds(record) == kinds(record_of(out))
 
 
 def test_photos_of_the_training_are_not_called_novel_and_those_held_out_never_refined_on(
@@ -70,9 +54,10 @@ def test_photos_of_the_training_are_not_called_novel_and_those_held_out_never_re
     ):
         out = tmp_path / name
         done("refine", made, photos, "--seconds", 0.05, *words, "--out", out)
-        assert kinds(out) == kinds(made)
-        assert record_of(out)["refinement"]["frames"] == frames
-        assert record_of(out)["views"][0]["size"] == size
+        record = record_of(out)
+        assert kinds(record) == kinds(record_of(made))
+        assert record["refinement"]["frames"] == frames
+        assert record["views"][0]["size"] == size
         assert refined_in(out / "gaussians.ply") == count
     assert PlyData.read(made / "gaussians.ply")["vertex"].count == 32
 

@@ -1,0 +1,3 @@
+from reconstructing import checkpoint, photos
+
+__all__ = ["checkpoint", "photos"]
