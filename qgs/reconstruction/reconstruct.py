@@ -90,7 +90,7 @@ def reconstruct(
         if free and min(found.cameras.size) >= SIDE and takes_half(model, found):
             chosen = find_size(model, found, *window, views)
             tuned = chosen.gaussians
-            if chosen.size != found.cameras.size:
+            if chosen.halved:
                 sample = half(sample)
         if tune and recipe.evaluation.tuning_steps:
             tuned, tuning = tuned_on(model, sample.inputs, recipe)

@@ -1,7 +1,7 @@
 """Choice between the size of photos and its half: at which a model renders photos better."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -11,30 +11,20 @@ from qgs.data.samples import Sample, halved, make_sample
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.scale import further_photos
-from qgs.types import Gaussians, Size
+from qgs.types import Gaussians
 from qgs.wording import listed
 
 
-@dataclass(frozen=True)
-class FoundSize:
-    """The better of two image sizes (H, W), and the other one.
+class FoundSize(NamedTuple):
+    """Which of two image sizes is better.
 
-    gaussians: (1, G), what the model makes of the inputs at this size. psnr, other_psnr: mean PSNR
-        in dB at the two sizes. names: file names of the photos that decided.
+    halved: whether it is half of the scene's. gaussians: (1, G), what the model makes of the inputs
+    at this size. text: sentence that gives both sizes, their PSNR, and the photos that decided.
     """
 
-    size: Size
-    other: Size
+    halved: bool
     gaussians: Gaussians
-    psnr: float
-    other_psnr: float
-    names: Sequence[str]
-
-    @property
-    def text(self) -> str:
-        """Sentence that gives the size, the photos that decided, and the PSNR of both sizes."""
-        best = f"size {self.size[0]} x {self.size[1]}: {self.psnr:.1f} dB on {listed(self.names)}"
-        return f"{best} ({self.other[0]} x {self.other[1]}: {self.other_psnr:.1f} dB)"
+    text: str
 
 
 @torch.no_grad()
@@ -58,11 +48,12 @@ def find_size(
         gaussians = model(sample.inputs.to(device)).gaussians
         seen = model.render(gaussians, sample.targets.cameras.to(device)).rgb[0]
         reduced = F.interpolate(seen.cpu(), photos.shape[-2:], mode="area")
-        found.append((float(psnr(reduced, photos).mean()), sample.inputs.cameras.size, gaussians))
-    worse, best = sorted(found, key=lambda one: one[0])
-    return FoundSize(
-        best[1], worse[1], best[2], best[0], worse[0], [*map(scene.frame_name, judges)]
-    )
+        height, width = sample.inputs.cameras.size
+        found.append((float(psnr(reduced, photos).mean()), f"{height} x {width}", gaussians))
+    (worse, other, _), (best, size, gaussians) = sorted(found, key=lambda one: one[0])
+    names = listed(map(scene.frame_name, judges))
+    text = f"size {size}: {best:.1f} dB on {names} ({other}: {worse:.1f} dB)"
+    return FoundSize(gaussians is found[0][2], gaussians, text)
 
 
 def half(sample: Sample) -> Sample:

@@ -240,7 +240,7 @@ def open_models(
     tried: Reconstruction | None = None
     if photos is not None and size is None:
         tried = _tried(next(iter(files.values())), recipes, photos, device, overrides)
-        if tried and tried.size and tried.size.size < tried.size.other:
+        if tried and tried.size and tried.size.halved:
             data = next(iter(recipes.values())).data_config
             assert data is not None
             height, width = data.image_size
