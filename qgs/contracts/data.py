@@ -76,14 +76,15 @@ class Scene(ABC):
         """
         return None
 
-    def median_depth(self, frames: Sequence[int]) -> float | None:
-        """Return the median depth of what `frames` show, in world units; None if it is unknown.
+    def median_depth(self, frames: Sequence[int]) -> float:
+        """Return the median depth of what `frames` show, in world units; 0 if it is unknown.
 
         By default, it comes from the depth maps.
         """
         depths = self.depths(frames)
-        known = [] if depths is None else depths[depths > 0]
-        return float(known.median()) if len(known) else None
+        if depths is None:
+            return 0.0
+        return float(depths[depths > 0].median().nan_to_num())
 
     def __len__(self) -> int:
         """Return F, the number of frames."""

@@ -18,14 +18,13 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
 from qgs.reconstruction.scale import (
-    SIDE,
     constant_scale,
     find_scale,
+    find_size,
+    half,
     photo_settings,
-    takes_half,
 )
 from qgs.reconstruction.scenes import FrameNames, GivenScene, chosen_scene, frame_list
-from qgs.reconstruction.size import find_size, half
 from qgs.types import Size, Views
 from qgs.wording import counted, listed
 
@@ -87,11 +86,10 @@ def reconstruct(
         sample = make_sample(found, *window, views, mirror=False)
         chosen = None
         free = seen is None and size is None and not isinstance(photos, Views)
-        if free and min(found.cameras.size) >= SIDE and takes_half(model, found):
-            chosen = find_size(model, found, *window, views)
+        if free and (chosen := find_size(model, found, *window, views)):
             tuned = chosen.gaussians
             if chosen.halved:
-                sample = half(sample)
+                sample = half(sample, model) or sample
         if tune and recipe.evaluation.tuning_steps:
             tuned, tuning = tuned_on(model, sample.inputs, recipe)
         result = reconstruct_sample(model, sample, seen or (), tuned)

@@ -16,8 +16,7 @@ from qgs.geometry.transforms import moved
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
-from qgs.reconstruction.scale import FoundScale
-from qgs.reconstruction.size import FoundSize
+from qgs.reconstruction.scale import FoundScale, FoundSize
 from qgs.types import Cameras, Gaussians, Rendering
 
 KINDS = ("input", "novel", "seen in training")

@@ -1,4 +1,6 @@
-"""Search for the scale of a scene: the factor of camera positions at which a model renders best.
+"""Search for the scale and the size of photos: those at which a model renders them best.
+
+The scale is a factor of camera positions.
 
 Camera positions of photos may be in any unit, but a model needs the unit of its training. So the
 model runs on the inputs at several factors, and the factor with the best PSNR of rendered photos is
@@ -11,19 +13,21 @@ bring them to depths of the training are tried.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import fmean
+from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.samples import halved, make_sample
+from qgs.data.samples import Sample, halved, make_sample
 from qgs.domain import TOLERANCE, Domain
 from qgs.geometry.poses import look_at_depth, scaled
 from qgs.metrics.baselines import pose_distance
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
-from qgs.types import Views
+from qgs.types import Gaussians, Views
 from qgs.wording import listed
 
 FURTHER = 2
@@ -66,7 +70,7 @@ class FoundScale:
     further: scored frames that are not inputs. names: file names of these frames.
     psnr: mean PSNR in dB of inputs and further photos, where further photos have twice the weight.
     tried: pairs of a tried factor and its mean PSNR. depth: median depth of what the inputs show,
-        in the unit of the poses; None if it is unknown.
+        in the unit of the poses; 0 if it is unknown.
     """
 
     factor: float
@@ -74,7 +78,7 @@ class FoundScale:
     further: Frames
     names: Sequence[str]
     tried: Sequence[tuple[float, float]]
-    depth: float | None = None
+    depth: float = 0.0
 
     @property
     def poor(self) -> str:
@@ -125,8 +129,7 @@ def find_scale(
     coarse search tries factors with ratio STEP over `search_range`, and goes on past an end of the
     range while the best factor is there. The fine search tries thirds of a step around the best
     factor, then the vertex of a parabola through the three best scores in log scale. If
-    `Scene.median_depth` is known, the range is narrow: the coarse search stays in it, and the fine
-    search tries halves of a step.
+    `Scene.median_depth` is known, the range is narrow, and the coarse search stays in it.
 
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
     given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
@@ -141,30 +144,28 @@ def find_scale(
         given = tuple(frame for frame in given if frame not in further)
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
     frames = given if len(given) > 1 else given + further
-    photos = sample.inputs.joined(sample.targets)
-    if min(scene.cameras.size) > SIDE and takes_half(model, scene):
-        photos = halved(photos)
+    if min(scene.cameras.size) > SIDE:
+        sample = half(sample, model) or sample
     low, high, nearest = search_range(model.trained_on or Domain(), scene, frames, depth)
     # Even steps in log scale: what counts is the ratio to the right factor.
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))
-    # Places are parts of a step, so that the finer search lies between those of the first.
-    parts = 2 if depth else 3
+    # Places are thirds of a step, so that the finer search lies between those of the first.
     trial = _Trial(
         model,
-        photos.to(next(model.parameters()).device),
+        sample.inputs.joined(sample.targets).to(next(model.parameters()).device),
         len(given),
         # Photos that are not given count twice: inputs alone mislead.
         [1 / len(given) for _ in given] + [2 / len(further) for _ in further],
         low,
-        ratio ** (1 / parts),
+        ratio ** (1 / 3),
         0.0 if further else nearest,
     )
-    best = trial.best(range(0, parts * count, parts))
+    best = trial.best(range(0, 3 * count, 3))
     if ratio > 1:
         while not depth and (end := trial.past(best)) and len(trial.tried) < MOST:
             best = trial.best(end)
-        best = trial.best([best + place for place in range(1 - parts, parts)])
+        best = trial.best([best + place for place in (-2, -1, 1, 2)])
         best = trial.best([best + trial.vertex(best)])
     return FoundScale(
         factor=trial.factor(best),
@@ -174,12 +175,6 @@ def find_scale(
         tried=sorted((trial.factor(place), found) for place, found in trial.tried.items()),
         depth=depth,
     )
-
-
-def takes_half(model: QueryGaussianModel, scene: Scene) -> bool:
-    """Return whether `model` takes images of half the height and width of those of `scene`."""
-    multiple = model.encoder.size_multiple(model.encoder.config)
-    return multiple is not None and not any(side % (2 * multiple) for side in scene.cameras.size)
 
 
 def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
@@ -197,7 +192,7 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
 
 
 def search_range(
-    trained: Domain, scene: Scene, frames: Frames, seen: float | None = None
+    trained: Domain, scene: Scene, frames: Frames, seen: float = 0.0
 ) -> tuple[float, float, float]:
     """Return the least factor and the largest factor to try, and a limit for PENALTY.
 
@@ -209,7 +204,14 @@ def search_range(
         0.
     """
     if seen:
-        return *_near_range(trained, seen), 0.0
+        near, far = trained.ranges.get("depth", DEPTHS)
+        low = max(near, DEPTHS[0])
+        high = min(far, DEPTHS[1])
+        # A training in another unit: its own depths are all that is known.
+        if low >= high:
+            low = near
+            high = min(far, near * REACH)
+        return low / seen, high / seen, 0.0
     depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
     baseline = float(torch.cdist(centres, centres).max())
@@ -226,21 +228,6 @@ def search_range(
         nearest = near * TOLERANCE / depth
     # Cameras on one point leave nothing to search: no factor changes what they see.
     return min(found, default=1.0), max(found, default=1.0), nearest
-
-
-def _near_range(trained: Domain, depth: float) -> tuple[float, float]:
-    """Return the least and the largest factor to try if the median depth of the photos is known.
-
-    trained: depths of the point that cameras look at in the model's training, which limit DEPTHS.
-    """
-    near, far = trained.ranges.get("depth", DEPTHS)
-    low = max(near, DEPTHS[0])
-    high = min(far, DEPTHS[1])
-    # A training in another unit: its own depths are all that is known.
-    if low >= high:
-        low = near
-        high = min(far, near * REACH)
-    return low / depth, high / depth
 
 
 @dataclass
@@ -307,3 +294,55 @@ def at_factor(views: Views, factor: float) -> Views:
     """Return views whose camera positions are multiplied by `factor`."""
     c2w = scaled(views.cameras.c2w, factor)
     return views.replace(cameras=views.cameras.replace(c2w=c2w))
+
+
+class FoundSize(NamedTuple):
+    """Which of two image sizes is better.
+
+    halved: whether it is half of the scene's. gaussians: (1, G), what the model makes of the inputs
+    at this size. text: sentence that gives both sizes, their PSNR, and the photos that decided.
+    """
+
+    halved: bool
+    gaussians: Gaussians
+    text: str
+
+
+@torch.no_grad()
+def find_size(
+    model: QueryGaussianModel, scene: Scene, inputs: Frames, compared: Frames, views: ViewsConfig
+) -> FoundSize | None:
+    """Decide at which image size `model` is better: that of `scene`, or half its height and width.
+
+    The judges are `further_photos`, or the inputs if there are none. Renderings are compared at the
+    smaller size. Of equally good sizes, the larger one is taken. Returns None if the scene has less
+    than SIDE pixels, or if the model cannot take half.
+    model: in evaluation mode. inputs, compared: frames, see `find_scale`. views: with the scale
+        that was found.
+    """
+    judges = further_photos(scene, inputs, compared) or inputs
+    whole = make_sample(scene, inputs, judges, views, mirror=False)
+    small = half(whole, model)
+    if small is None or min(scene.cameras.size) < SIDE:
+        return None
+    photos = small.targets.images[0]
+    device = next(model.parameters()).device
+    found = []
+    for sample in (small, whole):
+        gaussians = model(sample.inputs.to(device)).gaussians
+        seen = model.render(gaussians, sample.targets.cameras.to(device)).rgb[0]
+        reduced = F.interpolate(seen.cpu(), photos.shape[-2:], mode="area")
+        height, width = sample.inputs.cameras.size
+        found.append((float(psnr(reduced, photos).mean()), f"{height} x {width}", gaussians))
+    (worse, other, _), (best, size, gaussians) = sorted(found, key=lambda one: one[0])
+    names = listed(map(scene.frame_name, judges))
+    text = f"size {size}: {best:.1f} dB on {names} ({other}: {worse:.1f} dB)"
+    return FoundSize(gaussians is found[0][2], gaussians, text)
+
+
+def half(sample: Sample, model: QueryGaussianModel) -> Sample | None:
+    """Return `sample` with images of half the height and width; None if `model` takes none."""
+    multiple = model.encoder.size_multiple(model.encoder.config)
+    if multiple is None or any(side % (2 * multiple) for side in sample.inputs.cameras.size):
+        return None
+    return replace(sample, inputs=halved(sample.inputs), targets=halved(sample.targets))

@@ -10,8 +10,8 @@ from walk import Walk, arc, pinhole
 
 from qgs.contracts import ViewsConfig
 from qgs.recipe import resolve
+from qgs.reconstruction.scale import find_size
 from qgs.reconstruction.scenes import chosen_scene
-from qgs.reconstruction.size import find_size
 
 
 class Grey(Walk):
@@ -26,6 +26,8 @@ class Grey(Walk):
 
 class Painter(torch.nn.Linear):
     """A model whose renderings are off by an error that depends on the side of the photos."""
+
+    encoder = SimpleNamespace(config=None, size_multiple=lambda config: 8)
 
     def __init__(self, errors):
         super().__init__(1, 1)
@@ -43,7 +45,8 @@ class Painter(torch.nn.Linear):
     ("errors", "best"),
     [({8: 0.1, 16: 0.2}, 8), ({8: 0.2, 16: 0.1}, 16), ({8: 0.1, 16: 0.1}, 16)],
 )
-def test_the_better_size_is_taken_and_the_larger_of_equal_ones(errors, best):
+def test_the_better_size_is_taken_and_the_larger_of_equal_ones(errors, best, monkeypatch):
+    monkeypatch.setattr("qgs.reconstruction.scale.SIDE", 16)
     found = find_size(Painter(errors), Grey(), (1, 4), (2,), ViewsConfig())
     assert found.halved == (best == 8)
     assert found.gaussians == (best, best)

@@ -1,6 +1,5 @@
 """Data source `qgs/photos`: a folder of photos and cameras, or a folder of such folders."""
 
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -151,17 +150,16 @@ class PhotoScene(Scene):
             return None
         return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
 
-    def median_depth(self, frames: Sequence[int]) -> float | None:
+    def median_depth(self, frames: Sequence[int]) -> float:
         """Return the median of depth maps or, without them, of the listing's points in view."""
         config = self.config
         known = super().median_depth(frames)
         found = read_listing(self.folder, config.format, config.images, config.outside)
-        if known is not None or found.points is None:
+        if known or found.points is None:
             return known
         points = torch.from_numpy(found.points())
         depths = depths_in_view(points, self.cameras[list(frames)])
-        median = float(depths.nanmedian())
-        return None if math.isnan(median) else median
+        return float(depths.nanmedian().nan_to_num())
 
     def frame_name(self, frame: int) -> str:
         """Return the path of the image file relative to the scene's folder."""

@@ -166,12 +166,12 @@ def test_points_in_view_give_the_median_depth(tmp_path, photos, kind):
     c2w[2, [0, 2], [0, 2]] = -1
     folder = write_colmap(tmp_path, replace(photos, c2w=c2w), kind)
     scene = read(folder)
-    assert [scene.median_depth([frame]) for frame in range(3)] == [5, 7, None]
+    assert [scene.median_depth([frame]) for frame in range(3)] == [5, 7, 0]
     file = next((folder / "sparse/0").glob("points3D.*"))
     file.write_bytes(file.read_bytes()[: -40 if kind == "binary" else 5])
     must_refuse("points3D", scene.median_depth, [0])
     file.unlink()
-    assert scene.median_depth([0]) is None
+    assert scene.median_depth([0]) == 0
 
 
 def test_photos_beside_the_model_are_needed(tmp_path, photos):

@@ -27,7 +27,13 @@ from qgs.model_text import heading
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import reconstruct
 from qgs.reconstruction.result import Reconstruction
-from qgs.reconstruction.scale import FoundScale, constant_scale, find_scale, photo_settings
+from qgs.reconstruction.scale import (
+    FoundScale,
+    FoundSize,
+    constant_scale,
+    find_scale,
+    photo_settings,
+)
 from qgs.reconstruction.scenes import (
     Size,
     holding_out,
@@ -35,7 +41,6 @@ from qgs.reconstruction.scenes import (
     size_multiple,
     whole_size,
 )
-from qgs.reconstruction.size import FoundSize
 from qgs_viewer.trust import ScoredView, scored_views
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
