@@ -126,7 +126,7 @@ def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Po
 def _centre(make: Furniture, furnisher: Furnisher) -> None:
     rng = make.rng
     name = rng.choice(CENTRAL)
-    turn = float(rng.randrange(4)) * math.pi / 2 + rng.gauss(0, 0.12)
+    turn = rng.randrange(4) * math.pi / 2 + rng.gauss(0, 0.12)
     piece = make.piece(name)
     # after a few failed tries the room stays without it
     for _ in range(4):
@@ -152,9 +152,9 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
             piece = make.piece(rng.choice(AGAINST_WALLS))
             low, high = bounds(piece)
             # the skirting board sticks out by 2 cm
-            at = _from_wall(side, across / 2 - float(high[1]) - 0.02, position - float(low[0]))
+            at = _from_wall(side, across / 2 - high[1] - 0.02, position - low[0])
             if furnisher.place(piece, *at, turn):
-                position += float(high[0] - low[0])
+                position += high[0] - low[0]
         position += rng.uniform(0.1, 0.5)
 
 

@@ -55,7 +55,7 @@ class RoomScene(DrawnScene):
         sizes = rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
         self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]
         self.c2w = camera_path(rng, self.size, config.views_per_scene)
-        self.lens = lens(float(rng.uniform(*config.fov)), config.image_size)
+        self.lens = lens(rng.uniform(*config.fov), config.image_size)
 
     @cached_property
     def tables(self) -> "Room":
@@ -95,9 +95,9 @@ def camera_path(
     side = int(rng.integers(4))
     across = size[0] if side % 2 == 0 else size[1]
     along = size[1] if side % 2 == 0 else size[0]
-    travel = float(rng.uniform(*TRAVEL))
-    back = float(rng.uniform(WALL + 0.1, 0.25 * across)) - across / 2
-    middle = float(rng.uniform(-1, 1)) * max(along / 2 - WALL - travel / 2 - 0.1, 0.0)
+    travel = rng.uniform(*TRAVEL)
+    back = rng.uniform(WALL + 0.1, 0.25 * across) - across / 2
+    middle = rng.uniform(-1, 1) * max(along / 2 - WALL - travel / 2 - 0.1, 0.0)
     # a single camera stands in the middle, not at the start
     s = np.linspace(-0.5, 0.5, count) if count > 1 else np.zeros(1)
     sway, lift = rng.uniform(-0.12, 0.12, 2)
@@ -111,11 +111,11 @@ def camera_path(
         ],
         -1,
     )
-    drift = float(rng.uniform(-0.3, 0.5)) * travel
+    drift = rng.uniform(-0.3, 0.5) * travel
     target = np.stack(
         [
             np.full(count, 0.25 * across),
-            float(rng.uniform(-0.25, 0.25)) * along - 0.35 * middle + drift * s,
+            rng.uniform(-0.25, 0.25) * along - 0.35 * middle + drift * s,
             rng.uniform(0.7, 1.15) + 0.1 * np.sin(2 * s + phase),
         ],
         -1,

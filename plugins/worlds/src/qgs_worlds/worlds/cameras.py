@@ -152,11 +152,11 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
         step = across / np.linalg.norm(across) * max(rng.uniform(*PLAIN_TRAVEL) * shrink, 0.05)
         target = np.array([*target[:2], base[2] - rng.uniform(0.1, 0.4)])
         c2w = _look_at(base + s[:, None] * step, target + 0.1 * s[:, None] * step, np.zeros(count))
-        return Rig(c2w, float(rng.uniform(*PLAIN_FOV)), distance, "walk")
+        return Rig(c2w, rng.uniform(*PLAIN_FOV), distance, "walk")
     low, high = np.log(BASELINE)
     length = distance * math.exp(rng.uniform(low, high)) * shrink
     motion = [*_MOTIONS][rng.choice(4, p=(0.35, 0.3, 0.1, 0.25))]
-    fov = float(rng.uniform(*FOV))
+    fov = rng.uniform(*FOV)
     eyes, targets = _MOTIONS[motion](rng, Path(base, target, length, s, fov))
     # hands are not steady
     eyes = eyes + 0.03 * length * rng.normal(size=eyes.shape)
