@@ -136,7 +136,7 @@ def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
     as K allows. If K is the number of pixels of the patch, its cells are the pixels. patch: the
     field `gslrm.patch` of the queries.
     """
-    origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
+    origin_BN13, corner_BN13, across_BN13, down_BN13 = patch_BN43[..., None, :].unbind(-3)
     index_K = torch.arange(count, device=patch_BN43.device)
     # The largest divisor of K up to its root makes the most nearly square cells. It stays a tensor:
     # torch.compile would make a graph for each K that Python divides.
@@ -145,10 +145,7 @@ def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
     columns = count // rows
     u_K1 = ((index_K % columns).to(patch_BN43) + 0.5)[:, None] / columns
     v_K1 = ((index_K // columns).to(patch_BN43) + 0.5)[:, None] / rows
-    corner_BN13, across_BN13, down_BN13 = (
-        x[..., None, :] for x in (corner_BN3, across_BN3, down_BN3)
-    )
-    return origin_BN3[..., None, :], corner_BN13 + down_BN13 * v_K1 + across_BN13 * u_K1
+    return origin_BN13, corner_BN13 + down_BN13 * v_K1 + across_BN13 * u_K1
 
 
 class AlongRays(Centers):
