@@ -17,7 +17,6 @@ class Stages(NamedTuple):
 
     first: Tensor
     second: Tensor
-    third: Tensor
     features: Tensor
 
 
@@ -75,8 +74,7 @@ class CNN(nn.Module):
         # All stages are returned: the upsamplers take the finer ones.
         first = self.layer1(F.relu(F.instance_norm(self.conv1(images_N3HW))))
         second = self.layer2(first)
-        third = self.layer3(second)
-        return Stages(first, second, third, self.conv2(third))
+        return Stages(first, second, self.conv2(self.layer3(second)))
 
 
 def _stage(inputs: int, outputs: int, stride: int) -> nn.Sequential:
