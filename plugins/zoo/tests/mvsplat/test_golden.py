@@ -12,7 +12,6 @@ from published.splats import views_of, weights_of
 from qgs_research.published.layouts import fitting_recipe, names_of
 from qgs_zoo.mvsplat import sweep
 from qgs_zoo.mvsplat.depthsplat import nearest_neighbours
-from qgs_zoo.mvsplat.sweep import feature_lenses, relative_poses
 from torch import nn
 from torch.testing import assert_close
 
@@ -85,15 +84,14 @@ def test_both_ways_to_correlate_agree(monkeypatch):
     features = golden.tensors["features_mv.0"]
     neighbours = nearest_neighbours(cameras.c2w, 2)
     inverse = golden.tensors["inverse_depth_candidates.0"][..., None, None]
-    lens = feature_lenses(cameras, features.shape[-2:])
-    rest = (inverse, lens, relative_poses(cameras.c2w, neighbours), neighbours)
+    given = sweep.Sweep(cameras, neighbours, golden.input("near"), golden.input("far"))
 
     gradients = []
     for pairs, samples in ((sweep.PAIRS, sweep.MAX_SAMPLES), (0, 1 << 15), (40, 1 << 10)):
         monkeypatch.setattr(sweep, "PAIRS", pairs)
         monkeypatch.setattr(sweep, "MAX_SAMPLES", samples)
         learned = features.clone().requires_grad_()
-        volume = sweep.cost_volume(learned, *rest)
+        volume = sweep.cost_volume(learned, inverse, given)
         gradients += torch.autograd.grad(volume.square().sum(), learned)
         # Sums cancel: twice the rounding of the released code's own.
         assert_close(volume, golden.tensors["cost_volume.0"], rtol=1e-4, atol=1.5e-4)

@@ -15,17 +15,15 @@ from torch import Tensor, nn
 from qgs.contracts import ComponentConfig, OptionError
 from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs.encoder import imagenet_normalised
-from qgs.types import Cameras
 from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS, Stages
 from qgs_zoo.mvsplat.dpt import LEVELS, DptHead
-from qgs_zoo.mvsplat.mvsplat import Sweep, bounds, expected_disparity
+from qgs_zoo.mvsplat.mvsplat import bounds, expected_disparity
 from qgs_zoo.mvsplat.sweep import (
+    Sweep,
     cost_volume,
     cyclic_neighbours,
-    feature_lenses,
     inverse_depth_candidates,
-    relative_poses,
 )
 from qgs_zoo.mvsplat.unet import (
     OverViews,
@@ -207,19 +205,14 @@ class DepthPredictor(nn.Module):
         """Return the number of depths that a sweep tries. Scale 0 is the first sweep."""
         return self.sizes.candidates // 4**scale
 
-    def forward(
-        self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
-    ) -> Depths:
-        """Return the depths of all pixels. near, far: bounds of camera-frame z in world units."""
+    def forward(self, images_BV3HW: Tensor, sweep: Sweep) -> Depths:
+        """Return the depths of all pixels."""
         size = images_BV3HW.shape[-2:]
         shape = images_BV3HW.shape[:2]
         normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
-        # Chosen once: both scales and the transformer read the same views.
-        neighbours_BVJ = nearest_neighbours(cameras.c2w, self.sizes.neighbours)
-        sweep = Sweep(cameras, neighbours_BVJ, near_BV, far_BV)
         cnn = self.backbone(normalized_N3HW)
         x_BVChw = with_positions(cnn.features.unflatten(0, shape))
-        x_NChw = self.transformer(x_BVChw, neighbours_BVJ).flatten(0, 1)
+        x_NChw = self.transformer(x_BVChw, sweep.neighbours).flatten(0, 1)
         maps = self.vit_maps(normalized_N3HW)
         mono_NChw = maps[-1]
         # The ViT's maps are at 1/8; features for matching may be at 1/4.
@@ -251,7 +244,6 @@ class DepthPredictor(nn.Module):
         found: list[Tensor] = []
         views = sweep.near.shape[1]
         confidence = multi[0]
-        poses_BVJ44 = relative_poses(sweep.cameras.c2w, sweep.neighbours)
         for scale, (own, features) in enumerate(zip(multi, mono, strict=True)):
             count = self.candidates(scale)
             if scale == 0:
@@ -262,9 +254,7 @@ class DepthPredictor(nn.Module):
             cost_BVDhw = cost_volume(
                 own.unflatten(0, sweep.near.shape),
                 candidates.unflatten(0, sweep.near.shape),
-                feature_lenses(sweep.cameras, (own.shape[-2], own.shape[-1])),
-                poses_BVJ44,
-                sweep.neighbours,
+                sweep,
             )
             # Published weights expect this order.
             seen = [cost_BVDhw.flatten(0, 1), cnn.second if scale else cnn.features, own, features]
@@ -342,15 +332,12 @@ class DepthSplat(nn.Module):
                 parameter[3:6] = 0
                 parameter[GAUSSIAN_CHANNELS:] = 0
 
-    def forward(
-        self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
-    ) -> tuple[list[Tensor], Tensor]:
+    def forward(self, images_BV3HW: Tensor, sweep: Sweep) -> tuple[list[Tensor], Tensor]:
         """Return depths (B, V, H, W) from each sweep, and raw Gaussians (B, V, 10 + 3 K, H, W).
 
-        near, far: bounds of depth, camera-frame z in world units. K: number of harmonics per
-        colour.
+        K: number of harmonics per colour.
         """
-        found = self.depth_predictor(images_BV3HW, cameras, near_BV, far_BV)
+        found = self.depth_predictor(images_BV3HW, sweep)
         features_NFHW = self.feature_upsampler(found.maps, found.joined)
         images_N3HW = images_BV3HW.flatten(0, 1)
         # Depth, up to `far`, not its inverse (released code).

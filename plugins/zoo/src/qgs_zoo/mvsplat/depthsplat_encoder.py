@@ -11,9 +11,14 @@ from qgs.geometry.harmonics import SH_C0
 from qgs.precision import at_least_float32
 from qgs.types import Views
 from qgs_zoo.mvsplat.adapter import coefficients
-from qgs_zoo.mvsplat.depthsplat import GAUSSIAN_CHANNELS, DepthSplat, DepthSplatConfig
+from qgs_zoo.mvsplat.depthsplat import (
+    GAUSSIAN_CHANNELS,
+    DepthSplat,
+    DepthSplatConfig,
+    nearest_neighbours,
+)
 from qgs_zoo.mvsplat.pixels import WIDTHS, degree_of
-from qgs_zoo.mvsplat.sweep import DepthRange, SweepEncoder
+from qgs_zoo.mvsplat.sweep import DepthRange, Sweep, SweepEncoder
 
 
 class DepthSplatEncoder(SweepEncoder):
@@ -66,7 +71,10 @@ class DepthSplatEncoder(SweepEncoder):
         return True
 
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        depths, raw_BVCHW = self.network(views.images, views.cameras, near_BV, far_BV)
+        # Chosen once: both scales and the transformer read the same views.
+        neighbours = nearest_neighbours(views.cameras.c2w, self.config.neighbours)
+        sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
+        depths, raw_BVCHW = self.network(views.images, sweep)
         raw_BVCHW = at_least_float32(raw_BVCHW)
         first = GAUSSIAN_CHANNELS
         gaussian = raw_BVCHW[:, :, :first]

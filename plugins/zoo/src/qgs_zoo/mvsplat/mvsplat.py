@@ -3,7 +3,7 @@
 The networks are a CNN, a window transformer, a plane sweep and two U-Nets.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -13,16 +13,15 @@ from torch import Tensor, nn
 from qgs.contracts import ModelDims
 from qgs.precision import full_precision
 from qgs.tokengs.encoder import imagenet_normalised
-from qgs.types import Cameras, Views
+from qgs.types import Views
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS
 from qgs_zoo.mvsplat.sweep import (
     DepthRange,
+    Sweep,
     SweepEncoder,
     cost_volume,
     cyclic_neighbours,
-    feature_lenses,
     inverse_depth_candidates,
-    relative_poses,
 )
 from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, group_norm, resized, two_convolutions
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
@@ -102,19 +101,6 @@ class MVSplatEncoder(SweepEncoder):
         return self.depth_predictor(views.images, cnn, features, sweep)
 
 
-class Sweep(NamedTuple):
-    """Inputs of a plane sweep: cameras, views to compare, and depths.
-
-    cameras: (B, V). neighbours: indices (B, V, J) of the J views with which each view is compared.
-    near, far: least and largest depth in world units, (B, V).
-    """
-
-    cameras: Cameras
-    neighbours: Tensor
-    near: Tensor
-    far: Tensor
-
-
 class DepthPredictor(nn.Module):
     """Network that predicts depths and raw Gaussians from features at 1/4 of the image size."""
 
@@ -185,13 +171,7 @@ class DepthPredictor(nn.Module):
         size = features_BVDhw.shape[3:]
         volume_BVDhw = features_BVDhw.new_zeros(*candidates_BVD.shape, *size)
         if self.compares:
-            volume_BVDhw = cost_volume(
-                features_BVDhw,
-                candidates_BVD[..., None, None],
-                feature_lenses(sweep.cameras, size),
-                relative_poses(sweep.cameras.c2w, sweep.neighbours),
-                sweep.neighbours,
-            )
+            volume_BVDhw = cost_volume(features_BVDhw, candidates_BVD[..., None, None], sweep)
         matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
         refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
         # The network only corrects the volume, so that matches survive an untrained U-Net.

@@ -6,6 +6,7 @@
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -46,6 +47,19 @@ def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
     # A single view is compared with itself.
     step = torch.arange(1, max(views, 2), device=device)
     return ((view[:, None] + step) % views).expand(scenes, -1, -1)
+
+
+class Sweep(NamedTuple):
+    """Inputs of a plane sweep: cameras, views to compare, and depths.
+
+    cameras: (B, V). neighbours: indices (B, V, J) of the J views with which each view is compared.
+    near, far: least and largest depth in world units, (B, V).
+    """
+
+    cameras: Cameras
+    neighbours: Tensor
+    near: Tensor
+    far: Tensor
 
 
 @full_precision
@@ -107,13 +121,7 @@ def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
     return sampled.unflatten(2, grid_NDhw2.shape[1:3])
 
 
-def cost_volume(
-    features_BVChw: Tensor,
-    inverse_depth_BVDhw: Tensor,
-    lens_BV4: Tensor,
-    poses_BVJ44: Tensor,
-    neighbours_BVJ: Tensor,
-) -> Tensor:
+def cost_volume(features_BVChw: Tensor, inverse_depth_BVDhw: Tensor, sweep: Sweep) -> Tensor:
     """Correlate the features of each pixel with those of neighbour views at D depths.
 
     Returns the mean over neighbours of <f, f'> / sqrt(C), (B, V, D, h, w). f is the feature of a
@@ -125,7 +133,9 @@ def cost_volume(
     depth_NDhw = (1 / inverse_depth_BVDhw.detach()).flatten(0, 1)
     depth_NDhw = depth_NDhw.expand(-1, -1, height, width)
     own_NChw = features_BVChw.flatten(0, 1)
-    lens_N4 = lens_BV4.flatten(0, 1)
+    neighbours_BVJ = sweep.neighbours
+    lens_N4 = feature_lenses(sweep.cameras, (height, width)).flatten(0, 1)
+    poses_BVJ44 = relative_poses(sweep.cameras.c2w, neighbours_BVJ)
     batch = torch.arange(scenes, device=features_BVChw.device)[:, None]
     # Two ways with the same result; the faster one depends on pixels and candidates.
     correlate = _of_all_pairs if height * width <= PAIRS * depth_NDhw.shape[1] else _of_warped
