@@ -10,6 +10,7 @@ import numpy as np
 from av.error import FFmpegError
 from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
 from PIL import Image
+from scipy.ndimage import laplace
 
 from qgs.wording import counted
 from qgs_photos.poses.photos import LEAST, PosesError, Show
@@ -234,9 +235,7 @@ def _sharpness(frame: Any) -> float:
     height, width = (max(round(side * scale) // 2 * 2, 4) for side in (frame.height, frame.width))
     pixels = _grey(frame, (height, width))
     # the variance of the Laplacian
-    inner = pixels[1:-1, 1:-1]
-    around = pixels[:-2, 1:-1] + pixels[2:, 1:-1] + pixels[1:-1, :-2] + pixels[1:-1, 2:]
-    return float((around - 4 * inner).var())
+    return float(laplace(pixels)[1:-1, 1:-1].var())
 
 
 def _grey(frame: Any, size: tuple[int, int]) -> np.ndarray:
