@@ -35,10 +35,10 @@ class EllipsoidQueries(CentredQueries):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         # No rotation at first: with equal radii the model starts as LocusGS does.
-        identity = [torch.ones(config.count, 1), torch.zeros(config.count, 3)]
-        self.rotation = nn.Parameter(torch.cat(identity, -1))
-        raw = [torch.full((config.count, 1), raw_radius_of(r)) for r in config.init_radii]
-        self.raw_radii = nn.Parameter(torch.cat(raw, -1))
+        identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        self.rotation = nn.Parameter(identity.repeat(config.count, 1))
+        raw = torch.tensor([*map(raw_radius_of, config.init_radii)])
+        self.raw_radii = nn.Parameter(raw.repeat(config.count, 1))
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
