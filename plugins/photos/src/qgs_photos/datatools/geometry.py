@@ -174,7 +174,7 @@ class _Matcher:
         self.frames = frames
         self.poses = np.stack([scene.photos[frame].listed.c2w for frame in frames])
         self.centres = self.poses[:, :3, 3]
-        self._known: dict[int, tuple[Features, np.ndarray, float]] = {}
+        self._features = [self._detected(frame) for frame in frames]
 
     def pairs(self) -> Pairs:
         """Match each frame with the next, and with the first of `partners` that has matches."""
@@ -201,8 +201,8 @@ class _Matcher:
         The distance is a fraction of the photos' diagonal. Returns None if the photos have too few
         matches.
         """
-        one, lens_of_one, diagonal = self._features(first)
-        two, lens_of_two, _ = self._features(second)
+        one, lens_of_one, diagonal = self._features[first]
+        two, lens_of_two, _ = self._features[second]
         matches = match(one, two)
         if matches is None:
             return None
@@ -212,13 +212,13 @@ class _Matcher:
         back = off_lines(matches[::-1], poses[::-1], lenses[::-1])
         return float(np.median(there + back) / 2 / diagonal)
 
-    def _features(self, place: int) -> tuple[Features, np.ndarray, float]:
-        if place not in self._known:
-            frame = self.frames[place]
-            photo = self.scene.photos[frame]
-            picture, intrinsics = photo.picture(self.scene.decoded[frame].size, SIDE)
-            self._known[place] = detect(picture), intrinsics, float(np.hypot(*picture.shape[:2]))
-        return self._known[place]
+    def _detected(self, frame: int) -> tuple[Features, np.ndarray, float]:
+        """Return the features, the intrinsics and the diagonal of a photo, reduced to SIDE pixels.
+
+        frame: index in the scene.
+        """
+        picture, intrinsics = self.scene.photos[frame].picture(self.scene.decoded[frame].size, SIDE)
+        return detect(picture), intrinsics, float(np.hypot(*picture.shape[:2]))
 
     def partners(self, start: int) -> Iterator[int]:
         """Yield frames that may show what `start` shows: near in the list, then near in space."""
