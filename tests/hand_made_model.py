@@ -1,4 +1,4 @@
-"""A TokenGS of a few thousand parameters, a hand-made scene, cameras that look at it."""
+"""A TokenGS of a few thousand parameters, cameras, and noise that they see."""
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ from commands import MODEL
 from walk import along_x, pinhole
 
 import qgs
-from qgs.types import Gaussians, Views
+from qgs.types import Views
 
 OPTIONS = [
     "queries.count=12",
@@ -32,15 +32,3 @@ def cameras():
 @pytest.fixture
 def views(cameras):
     return Views(torch.rand(1, 2, 3, 32, 32, generator=torch.Generator().manual_seed(1)), cameras)
-
-
-@pytest.fixture
-def gaussians():
-    """As many as the model makes, spread over what the cameras see."""
-    generator = torch.Generator().manual_seed(2)
-    xy, z, colours = torch.rand(1, 48, 6, generator=generator).split([2, 1, 3], -1)
-    z = z + 1
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 48, 4)
-    means = torch.cat([(xy - 0.5) * z, z], -1)
-    opacities = torch.full((1, 48), 0.8)
-    return Gaussians(means, torch.full((1, 48, 3), 0.05), quats, opacities, colours)

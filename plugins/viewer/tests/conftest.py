@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from hand_made_model import cameras, gaussians, model
+from hand_made_model import cameras, model
 
 pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
 
-__all__ = ["cameras", "gaussians", "model"]
+__all__ = ["cameras", "model"]
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from qgs_viewer import queries
 from qgs_viewer.look import CATEGORICAL
 from qgs_viewer.placement import IDENTITY, Placement, hit, on_photo, splats
+from renderers.scenes import make_scene
 from scipy.spatial.transform import Rotation
 from small import cloud
 from walk import arc, pinhole
@@ -44,9 +45,7 @@ def test_a_centre_is_drawn_where_it_lies_though_its_support_reaches_behind_the_c
     assert places.mean(0) == pytest.approx((63.5, 89.1), abs=1)
 
 
-def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(
-    model, gaussians, cameras
-):
+def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(model, cameras):
     """Query 5 is heavy at the border; 6 covers the view from behind, so it comes last."""
     u = torch.tensor([0.2, 0.21, 0.8, 0.2, 0.8, 0.1, 0.5])
     v = torch.tensor([0.2, 0.2, 0.2, 0.8, 0.8, 0.5, 0.5])
@@ -55,7 +54,8 @@ def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(
     centers = torch.stack([(u - 0.5) * depths, (v - 0.5) * depths, depths], 1)
     means = centers.repeat_interleave(4, 0) + 0.01 * torch.randn(28, 3)
     scales = sizes[None, :, None].expand(1, 28, 3)
-    scene = replace(gaussians[:, :28], means=means[None], scales=scales)
+    opacities = torch.full((1, 28), 0.8)
+    scene = replace(cloud(28), means=means[None], scales=scales, opacities=opacities)
     weights = queries.rendered_weights(model, scene, cameras).view(7, 4).sum(1)
     assert weights[5:].min() > weights[:5].max()
     drawn = queries.notable_queries(model, scene, cameras, 5)
@@ -68,7 +68,8 @@ def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(
     assert len(queries.notable_queries(model, scene, cameras, 7)) == 7
 
 
-def test_a_query_picture_is_grey_but_for_its_queries(model, gaussians, cameras):
+def test_a_query_picture_is_grey_but_for_its_queries(model, cameras):
+    gaussians, _ = make_scene(count=48)
     camera = finer(cameras[:, :1], 64)
     drawn, none = (
         np.ptp(queries.query_picture(model, gaussians, some, camera).astype(int), axis=-1)
