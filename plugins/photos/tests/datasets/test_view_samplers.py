@@ -246,7 +246,7 @@ def test_too_few_photos_are_refused():
 
 REFUSED = """
 view_sampler={type: datasets/farthest, fewest: 3}
-    view_sampler.fewest: fewest
+    view_sampler.fewest: larger than `views.inputs`, 2
 view_sampler={type: datasets/overlapping, apart: [2, 1]}
     view_sampler.apart: 0 < min
 view_sampler={type: datasets/overlapping, apart: [0, 1]}
