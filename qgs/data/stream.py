@@ -118,14 +118,13 @@ class SampleStream(Dataset[Batch | Exception]):
     sizes: Sequence[Size] = ()
 
     def __post_init__(self, source: SceneSource) -> None:
-        sources = [source]
-        if self.sizes:
-            sources = [resized(source, source.config, size) for size in self.sizes]
+        sources = [resized(source, source.config, size) for size in self.sizes] or [source]
         self._openers = [partial(type(source), each.config) for each in sources]
         self._scenes = [each.scenes("train") for each in sources]
         if not len(self._scenes[0]):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
-        self._groups = [np.asarray(group, np.int64) for group in source.groups("train")]
+        groups = filter(len, source.groups("train"))
+        self._groups = [np.asarray(group, np.int64) for group in groups]
         self._orders: BoundedCache[np.ndarray] = BoundedCache(2)
 
     # Open scenes hold files and caches that cannot be sent to a worker.
@@ -145,10 +144,9 @@ class SampleStream(Dataset[Batch | Exception]):
 
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self.seed, 0, epoch])
-        groups = [group for group in self._groups if len(group)]
         # One group after another: each, such as a file of scenes, is opened once per epoch.
-        shuffled = rng.permutation(len(groups))
-        return np.concatenate([rng.permutation(groups[index]) for index in shuffled])
+        shuffled = rng.permutation(len(self._groups))
+        return np.concatenate([rng.permutation(self._groups[index]) for index in shuffled])
 
     def batch(self, numbers: Sequence[int]) -> Batch:
         """Make a batch of the samples that have these numbers in the stream.
@@ -188,29 +186,31 @@ class SampleStream(Dataset[Batch | Exception]):
 
         step: optimiser step, on which options of the view sampler may depend.
         """
-        rng = np.random.default_rng([self.seed, 1, number])
-        scene = self._scene(number, step)
-        _, inputs, targets = self._drawn(scene, rng, step)
+        scene, rng, _, inputs, targets = self._drawn(number, step)
         count = len(inputs)
         both = cameras_in(own_world(scene, inputs, self.views), scene, (*inputs, *targets))
         both = with_noise(both, count, self.views, rng)
         return both[:, :count], both[:, count:]
 
     def _drawn(
-        self, scene: Scene, rng: np.random.Generator, step: int
-    ) -> tuple[bool, Frames, Frames]:
-        """Return random choices for a sample: whether to mirror it, input frames, target frames."""
-        mirror = bool(rng.random() < self.views.mirror)
-        return mirror, *self.sampler.draw(scene, self.views, rng, step)
+        self, number: int, step: int, attempt: int = 0
+    ) -> tuple[Scene, np.random.Generator, bool, Frames, Frames]:
+        """Return the scene of a sample, its random generator, and what the generator chose.
 
-    def _sample_after(self, number: int, attempt: int) -> Sample:
-        """Make sample `number`; or its replacement, if `attempt` earlier attempts failed."""
+        These choices are whether to mirror the sample, its input frames and its target frames.
+        attempt: number of earlier attempts that failed; each takes the next scene.
+        """
         # The first attempt always draws from (seed, 1, number), also if other samples failed.
         key = [self.seed, 1, number]
         rng = np.random.default_rng([*key, attempt] if attempt else key)
-        step = number // self.per_step
         scene = self._scene(number + attempt, step)
-        mirror, inputs, targets = self._drawn(scene, rng, step)
+        mirror = bool(rng.random() < self.views.mirror)
+        return scene, rng, mirror, *self.sampler.draw(scene, self.views, rng, step)
+
+    def _sample_after(self, number: int, attempt: int) -> Sample:
+        """Make sample `number`; or its replacement, if `attempt` earlier attempts failed."""
+        step = number // self.per_step
+        scene, rng, mirror, inputs, targets = self._drawn(number, step, attempt)
         try:
             return make_sample(scene, inputs, targets, self.views, mirror, rng, self.depths)
         except Exception as error:
