@@ -86,7 +86,8 @@ class PhotosConfig(SceneSource.Config):
 class PhotoScene(Scene):
     """Scene of listed photos, in the coordinates and the order of the listing.
 
-    cache: decoded images, shared by several scenes. Raises the errors of `present_frames`.
+    cache: decoded images, shared by several scenes. Raises the errors of `read_listing` and of
+        `present_frames`.
     """
 
     def __init__(
@@ -96,7 +97,9 @@ class PhotoScene(Scene):
         self.folder = folder
         self.config = config
         self._cache = cache
-        frames, self.missing = present_frames(folder, config.format, config.images, config.outside)
+        found = read_listing(folder, config.format, config.images, config.outside)
+        self._points = found.points
+        frames, self.missing = present_frames(found, folder)
         self.photos = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
@@ -152,12 +155,10 @@ class PhotoScene(Scene):
 
     def median_depth(self, frames: Sequence[int]) -> float:
         """Return the median of depth maps or, without them, of the listing's points in view."""
-        config = self.config
         known = super().median_depth(frames)
-        found = read_listing(self.folder, config.format, config.images, config.outside)
-        if known or found.points is None:
+        if known or self._points is None:
             return known
-        points = torch.from_numpy(found.points())
+        points = torch.from_numpy(self._points())
         depths = depths_in_view(points, self.cameras[list(frames)])
         return float(depths.nanmedian().nan_to_num())
 
@@ -254,7 +255,7 @@ class PhotosSource(LazySource):
     The training split and the test split have the same scenes; test views are held-out frames. But
     if the folder has scenes in the subfolders `train` and `test`, these are the splits. A single
     scene is opened immediately; many scenes are opened when needed. Raises the errors of
-    `present_frames`.
+    `PhotoScene`.
     """
 
     name = "photos"

@@ -11,7 +11,7 @@ from qgs_photos.datatools.check import Options, check
 from tables import must_not_find
 from upath import UPath
 
-from qgs.data.photos import present_frames
+from qgs.data.photos import present_frames, read_listing
 
 FX, FY, CX, CY = INTRINSICS
 OPENGL = [1, -1, -1, 1]
@@ -152,7 +152,8 @@ def test_photos_have_one_number_in_reading_and_in_checking(planted, caplog):
     del room.files["images/1.jpg"]
     room.poses[3] = np.nan
     planted.check()
-    present, _ = present_frames(UPath(planted.root / "room 00"))
+    folder = UPath(planted.root / "room 00")
+    present, _ = present_frames(read_listing(folder), folder)
     assert "frame 2 (images/3.jpg): the pose has NaN" in caplog.text
     assert len(present) == 4
 
