@@ -65,7 +65,7 @@ def scaled(c2w: Tensor, scale: Tensor | float) -> Tensor:
     """Return poses with translations multiplied by `scale`, a number or one for each pose."""
     factor = torch.as_tensor(scale, dtype=c2w.dtype, device=c2w.device)
     result = c2w.clone()
-    result[..., :3, 3] = c2w[..., :3, 3] * factor[..., None]
+    result[..., :3, 3] *= factor[..., None]
     return result
 
 
