@@ -12,7 +12,7 @@ from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
 from qgs.files import replacing_entries, write_text
-from qgs.geometry.poses import look_at
+from qgs.geometry.poses import look_at, mean_camera
 from qgs.metrics.images import Psnr
 from qgs.reconstruction.result import Reconstruction, sample_cameras
 from qgs.reconstruction.scene_formats import save_gaussians, save_ply, scene_writers
@@ -38,9 +38,8 @@ def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
     # A smooth mean of neighbouring inputs, so that the path has no corner at any of them.
     weights_TV = torch.softmax(-0.5 * (distances_TV / 0.6) ** 2, -1)
     mean = torch.einsum("tv,vij->tij", weights_TV, inputs.c2w[0])
-    _, down, forward, centre = mean[:, :3].unbind(-1)
     # A mean of rotations is no rotation: its axes are made orthonormal again.
-    right, down, forward, centre = look_at(centre, forward, down)[:, :3].unbind(-1)
+    right, down, forward, centre = mean_camera(mean[:, None])[:, :3].unbind(-1)
     reach = SWAY * depth
     eye = centre + reach * angles.sin()[:, None] * right
     eye = eye - reach / 2 * angles.cos()[:, None] * down
