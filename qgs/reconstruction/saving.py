@@ -105,26 +105,26 @@ def overview(result: Reconstruction) -> Picture:
         titles.append(
             f"frame {result.sample.short_label(score.frame)}\n{score.kind.split()[0]}, {quality}"
         )
-    rows = {}
-    for kind, pictures in _pictures(result).items():
-        rows[kind] = [pictures[index] for index in shown]
+    rows = {
+        kind: [pictures[index] for index in shown] for kind, pictures in _pictures(result).items()
+    }
     figure = grid_figure(rows, titles, depth_range(result.rendering.depth))
     return figure_picture(figure)
 
 
 def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
     reference, scale = result.sample.world
-    views = []
-    for score, camera in zip(result.scores, _plain(sample_cameras(result.sample)), strict=True):
-        views.append(
-            {
-                "frame": score.frame,
-                "photo": result.sample.names.get(score.frame),
-                "kind": score.kind,
-                "psnr": round(score.psnr, 3),
-                **camera,
-            }
-        )
+    cameras = _plain(sample_cameras(result.sample))
+    views = [
+        {
+            "frame": score.frame,
+            "photo": result.sample.names.get(score.frame),
+            "kind": score.kind,
+            "psnr": round(score.psnr, 3),
+            **camera,
+        }
+        for score, camera in zip(result.scores, cameras, strict=True)
+    ]
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": result.sample.scene,
