@@ -76,16 +76,6 @@ class Scene(ABC):
         """
         return None
 
-    def median_depth(self, frames: Sequence[int]) -> float:
-        """Return the median depth of what `frames` show, in world units; 0 if it is unknown.
-
-        By default, it comes from the depth maps.
-        """
-        depths = self.depths(frames)
-        if depths is None:
-            return 0.0
-        return float(depths[depths > 0].median().nan_to_num())
-
     def __len__(self) -> int:
         """Return F, the number of frames."""
         return self.cameras.shape[0]

@@ -38,8 +38,6 @@ _NEAR = 48
 _POINTS = 6
 # Least part of a compared photo that the inputs must see.
 _SEEN = 0.7
-# Part of the compared photos that so many inputs see that more inputs are not needed.
-_COVERED = 0.95
 # Number of photos to sweep, and the ranks by distance of the photos matched with each.
 _PHOTOS = 4
 _OTHERS = (0, 1, 4)
@@ -81,31 +79,6 @@ def ranked_windows(
     targets = held or (usable if len(usable) > inputs else [])
     usable = evenly(usable, _MOST)
     return sorted((*frusta.window(t, usable, inputs), t) for t in evenly(targets, _MOST))
-
-
-def fewest_inputs(
-    frusta: "Frusta", inputs: int, trained_on: Domain, held_out: Sequence[int] | None = None
-) -> int:
-    """Return the number of input photos for a model that was trained with several numbers.
-
-    It is the smallest trained number, from 2 on, with which the best of `ranked_windows` sees
-    _COVERED of its compared photos; if there is none, the largest trained number for which there
-    are photos. A model trained with one number gets `inputs`. trained_on: numbers of views in
-    training. held_out: as for `ranked_windows`.
-    """
-    low, high = trained_on.ranges.get("views", (inputs, inputs))
-    if low == high:
-        return inputs
-    held = frusta.scene.held_out if held_out is None else held_out
-    # Where none is held out, one is left to compare with.
-    most = max(min(int(high), len(frusta.scene) - max(len(held), 1)), 2)
-    for count in range(max(int(low), 2), most):
-        _, frames, target = ranked_windows(frusta, count, held_out)[0]
-        compared = frusta.compared(frames, target)
-        seen = [frusta.seen(frame, frames).any(1).mean() for frame in compared]
-        if np.mean(seen) >= _COVERED:
-            return count
-    return most
 
 
 def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:

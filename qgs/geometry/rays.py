@@ -56,17 +56,3 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
     # The mean of moments and directions is a ray through the middle, a little too short.
     pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
     return pooled.flatten(2).mT.reshape(plucker.shape[0], -1, 6)
-
-
-@full_precision
-def camera_centers(rays: Tensor, grid: tuple[int, int, int]) -> Tensor:
-    """Return world-frame camera centres (B, V, 3) from `patch_rays` and `grid` of an image memory.
-
-    rays: Plücker rays (B, M, 6) of M patches. Each centre is the point where the rays of its view
-        meet, by least squares.
-    """
-    moments, directions = rays.unflatten(1, (grid[0], -1)).chunk(2, -1)
-    # A moment o x d is the sum over axes of o_i (e_i x d).
-    axes = torch.eye(3).to(rays)[None, None, None]
-    parts = torch.linalg.cross(axes, directions[..., None, :]).mT
-    return torch.linalg.lstsq(parts.flatten(2, 3), moments.flatten(2)[..., None]).solution[..., 0]

@@ -7,7 +7,7 @@ from os import fspath
 from torch import Tensor
 
 from qgs.contracts import Frames, Scene, ViewsConfig, Window
-from qgs.data.inputs import NOVEL, Frusta, fewest_inputs, ranked_windows
+from qgs.data.inputs import NOVEL, Frusta, ranked_windows
 from qgs.data.samples import Sample, make_sample
 from qgs.data.view_samplers import evenly, moments, spread
 from qgs.domain import Domain, verdict
@@ -49,8 +49,8 @@ def reconstruct(
 
     photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras, which are all inputs
         unless `inputs` or `frames` is given.
-    inputs: number of input photos; None: see `fewest_inputs`. frames: input photos, by number or
-        file name; None chooses photos that overlap.
+    inputs: number of input photos; None: the recipe's. frames: input photos, by number or file
+        name; None chooses photos that overlap.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
     size: (H, W) to crop and resize photos to; None: the better of two sizes, without a
         crop.
@@ -96,7 +96,7 @@ def reconstruct(
     finally:
         model.train(training)
     result = replace(result, scale=scale, size=chosen, tuning=tuning)
-    return replace(result, remarks=_remarks(result, found, recipe))
+    return replace(result, remarks=_remarks(result, found))
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
@@ -122,7 +122,7 @@ def choose_frames(
 ) -> Window:
     """Return the input frames of `scene` and the frames to compare the result with.
 
-    inputs: number of inputs; None uses `fewest_inputs`, for scenes with times `views.inputs`.
+    inputs: number of inputs; None uses `views.inputs`.
     frames: input frames that the user chose; None spreads them over time if the scene has times,
         and otherwise takes them from the best window of `ranked_windows`.
     compare: the user's choice of frames to compare with. None chooses frames that the inputs see;
@@ -130,19 +130,17 @@ def choose_frames(
     trained_on: distances and angles of cameras in the model's training; None allows any.
     Raises ValueError for frames that do not exist or repeat, and for too few frames.
     """
-    count = inputs or views.inputs
+    views = views.model_copy(update={"inputs": inputs or views.inputs})
     # A model whose checkpoint records no range takes any views.
     domain = trained_on or Domain()
     novel: Frames = ()
     if frames is not None:
         checked_window(len(scene), frames)
     if scene.times is not None:
-        views = views.model_copy(update={"inputs": count})
         frames, novel = _over_time(scene, scene.times, views, frames)
     elif frames is None:
         frusta = Frusta(scene, domain)
-        count = inputs or fewest_inputs(frusta, count, domain, compare)
-        ranked = ranked_windows(frusta, count, compare)
+        ranked = ranked_windows(frusta, views.inputs, compare)
         _, frames, target = ranked[0] if ranked else (0, tuple(range(len(scene))), None)
         novel = frusta.compared(frames, target)
     elif compare is None:
@@ -191,25 +189,15 @@ def _over_time(
     return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
 
 
-def _remarks(result: Reconstruction, scene: Scene, recipe: Recipe) -> list[str]:
+def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     """Return remarks for the user on the photos and on the result's quality."""
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    trained = result.model.trained_on or Domain()
-    data = recipe.data_config
-    # Older checkpoints do not record the size.
-    if data and trained.values:
-        sides = [min(size) for size in (data.image_size, *recipe.training.image_sizes)]
-        ends = [float(min(sides)), float(max(sides))]
-        trained = replace(trained, values={"side": ends, **trained.values})
-    # The search found no better size.
-    if result.size:
-        del found.values["side"]
     remarks = (
         result.scale.poor if result.scale else "",
         result.worse_than_nearest,
-        verdict(trained, found),
+        verdict(result.model.trained_on or Domain(), found),
         choice(sample, scene),
     )
     return [*filter(None, remarks)]

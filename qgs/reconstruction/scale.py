@@ -6,9 +6,6 @@ Camera positions of photos may be in any unit, but a model needs the unit of its
 model runs on the inputs at several factors, and the factor with the best PSNR of rendered photos is
 chosen. Inputs alone mislead: if the factor is too small, the model can reproduce the inputs by
 surfaces close to the cameras. So a few photos that are not inputs are scored too.
-
-Depth maps or points in 3D tell how far away the things are that inputs show. Then only factors that
-bring them to depths of the training are tried.
 """
 
 import math
@@ -49,9 +46,6 @@ smallest depth of its training."""
 REACH = 6.0
 """Largest depth that the search tries for the point that cameras look at, in multiples of the
 smallest depth of this point in training."""
-DEPTHS = (0.6, 1.4)
-"""Smallest and largest median depth of what the inputs show that the search tries, if this depth is
-known. In the training of the shipped models, 80 % of samples have medians from 0.63 to 1.49."""
 SIDE = 128
 """Length of the shorter side in pixels above which the search halves photos, to save time."""
 PENALTY = 5.0
@@ -69,8 +63,7 @@ class FoundScale:
 
     further: scored frames that are not inputs. names: file names of these frames.
     psnr: mean PSNR in dB of inputs and further photos, where further photos have twice the weight.
-    tried: pairs of a tried factor and its mean PSNR. depth: median depth of what the inputs show,
-        in the unit of the poses; 0 if it is unknown.
+    tried: pairs of a tried factor and its mean PSNR.
     """
 
     factor: float
@@ -78,7 +71,6 @@ class FoundScale:
     further: Frames
     names: Sequence[str]
     tried: Sequence[tuple[float, float]]
-    depth: float = 0.0
 
     @property
     def poor(self) -> str:
@@ -89,7 +81,7 @@ class FoundScale:
                 f"no scale fits: the best gives only {self.psnr:.1f} dB; choose inputs that "
                 "overlap more (frames), or set the scale (--scale, views.scale_factor)"
             )
-        if self.further or self.depth:
+        if self.further:
             return ""
         return (
             "the scale was found on input photos only and may be wrong: add photos between them, "
@@ -128,15 +120,13 @@ def find_scale(
     The inputs and `further_photos` are scored, at half their size if they are larger than SIDE. The
     coarse search tries factors with ratio STEP over `search_range`, and goes on past an end of the
     range while the best factor is there. The fine search tries thirds of a step around the best
-    factor, then the vertex of a parabola through the three best scores in log scale. If
-    `Scene.median_depth` is known, the range is narrow, and the coarse search stays in it.
+    factor, then the vertex of a parabola through the three best scores in log scale.
 
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
     given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
     model: must be in evaluation mode; the search runs on its device. compared: frames
         kept for the scores of the result, which the search does not use.
     """
-    depth = scene.median_depth(inputs)
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
     if not further and len(given) > 2:
@@ -146,7 +136,7 @@ def find_scale(
     frames = given if len(given) > 1 else given + further
     if min(scene.cameras.size) > SIDE:
         sample = half(sample, model) or sample
-    low, high, nearest = search_range(model.trained_on or Domain(), scene, frames, depth)
+    low, high, nearest = search_range(model.trained_on or Domain(), scene, frames)
     # Even steps in log scale: what counts is the ratio to the right factor.
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))
@@ -163,7 +153,7 @@ def find_scale(
     )
     best = trial.best(range(0, 3 * count, 3))
     if ratio > 1:
-        while not depth and (end := trial.past(best)) and len(trial.tried) < MOST:
+        while (end := trial.past(best)) and len(trial.tried) < MOST:
             best = trial.best(end)
         best = trial.best([best + place for place in (-2, -1, 1, 2)])
         best = trial.best([best + trial.vertex(best)])
@@ -173,7 +163,6 @@ def find_scale(
         further=further,
         names=[scene.frame_name(frame) for frame in further],
         tried=sorted((trial.factor(place), found) for place, found in trial.tried.items()),
-        depth=depth,
     )
 
 
@@ -191,27 +180,14 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
     return tuple(sorted(frame for _, frame in sorted(zip(far, left, strict=True))[:FURTHER]))
 
 
-def search_range(
-    trained: Domain, scene: Scene, frames: Frames, seen: float = 0.0
-) -> tuple[float, float, float]:
+def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
     """Return the least factor and the largest factor to try, and a limit for PENALTY.
 
     PENALTY may lower the scores of factors below this limit. At the limit, the point that the
     cameras look at is TOLERANCE times as far as the nearest such point in training. The limit is 0
     if the depth of the point is unknown.
-    trained: baselines and depths of cameras in the model's training. frames: the inputs. seen:
-        median depth of what they show; if it is known, factors bring it to DEPTHS, and the limit is
-        0.
+    trained: baselines and depths of cameras in the model's training. frames: the inputs.
     """
-    if seen:
-        near, far = trained.ranges.get("depth", DEPTHS)
-        low = max(near, DEPTHS[0])
-        high = min(far, DEPTHS[1])
-        # A training in another unit: its own depths are all that is known.
-        if low >= high:
-            low = near
-            high = min(far, near * REACH)
-        return low / seen, high / seen, 0.0
     depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
     baseline = float(torch.cdist(centres, centres).max())

@@ -7,7 +7,7 @@ from tables import must_refuse
 from textured_room import photos_of, walk
 from walk import along_x, arc, pinhole
 
-from qgs.data.inputs import Frusta, fewest_inputs, ranked_windows, scene_depth, trained_ratios
+from qgs.data.inputs import Frusta, ranked_windows, scene_depth, trained_ratios
 from qgs.domain import Domain
 from qgs.reconstruction.scenes import GivenScene
 from qgs.types import Views
@@ -44,20 +44,6 @@ def test_any_number_of_inputs_that_are_not_held_out():
                 assert {*targets} <= {*(held_out or range(count))}
                 assert targets
     must_refuse("too few", windows_of, scene_of(orbit(3, 6.0)), 1, 5)
-
-
-def test_more_inputs_where_two_see_too_little_of_what_is_compared():
-    corners = torch.eye(4).repeat(5, 1, 1)
-    corners[1:, :2, 3] = torch.tensor([[-0.45, -0.45], [-0.45, 0.45], [0.45, -0.45], [0.45, 0.45]])
-    for poses, held_out, trained, expected in (
-        (orbit(24, 3.0), (11,), [2, 4], 2),
-        (corners, (0,), [2, 3], 3),
-        (corners, (0,), [2, 9], 4),
-        (corners, (0,), [3, 3], 2),
-    ):
-        domain = Domain({**TRAINED.values, "views": trained})
-        frusta = Frusta(scene_of(poses, held_out), domain, 1.0)
-        assert fewest_inputs(frusta, 2, domain) == expected
 
 
 def test_inputs_of_an_orbit_stand_beside_a_held_out_photo_in_any_order():

@@ -9,7 +9,6 @@ from scipy.special import lpmv
 from torch.testing import assert_close
 
 from qgs.geometry.harmonics import harmonics, rotated, seen_colors
-from qgs.geometry.rays import camera_centers, patch_rays, plucker_rays
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import SH_COUNTS
 
@@ -66,10 +65,3 @@ def test_a_view_sees_the_direction_from_its_camera_to_the_mean():
     assert found.max() > 1
     bare = gaussians.replace(sh=None)
     assert torch.equal(seen_colors(bare, cameras), bare.colors[:, None])
-
-
-def test_the_rays_of_a_memory_meet_at_the_centres_of_its_cameras():
-    _, cameras = make_scene(2, 3, 5, dtype=torch.float64)
-    height, width = cameras.size
-    centers = camera_centers(patch_rays(plucker_rays(cameras), 4), (3, height // 4, width // 4))
-    assert_close(centers, cameras.c2w[..., :3, 3])

@@ -40,31 +40,6 @@ def test_without_further_photos_an_input_is_judged_or_inputs_alone():
     assert two.poor
 
 
-class Measured(Walk):
-    """What the photos show is known to be 3 away."""
-
-    def median_depth(self, frames):
-        return 3.0
-
-
-def test_a_known_depth_narrows_the_search():
-    views = ViewsConfig(inputs=2, scale="search")
-    model = qgs.compose("tiny/tokengs.yaml", ["model.queries.count=12"]).eval()
-    found = scale.find_scale(model, Measured(), (1, 4), (0, 2, 3, 5), views)
-    assert "inputs" not in found.poor.split(";")[0]
-    factors = [3 * factor for factor, _ in found.tried]
-    assert len(factors) < 8
-    assert min(factors) > 0.4
-    assert max(factors) < 1.9
-
-
-def test_a_known_depth_meets_the_depths_of_the_training():
-    for ends, expected in (((0.07, 9.0), (0.6, 1.4)), ((0.9, 3.0), (0.9, 1.4)), ((4, 9), (4, 9))):
-        trained = Domain({"depth": [*ends]}, 4)
-        low, high, nearest = scale.search_range(trained, Walk(), (1, 4), 2.0)
-        assert (2 * low, 2 * high, nearest) == (*expected, 0.0)
-
-
 def test_the_range_follows_the_unit_and_the_training():
     trained = Domain({"baseline": [0.1, 0.4], "depth": [0.8, 3.0]}, 4)
     low, high, nearest = scale.search_range(trained, Walk(), (1, 4))

@@ -3,7 +3,7 @@
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self, TypeAlias
 
@@ -130,15 +130,13 @@ class Listing:
 
     file: the file with the list. frames: in the order of this file.
     folder: folder of the photos; None if it is the folder that was read.
-    present: listed files that exist. points: function that reads the positions (N, 3) of points
-        that the photos show; None if there are none.
+    present: listed files that exist.
     """
 
     file: UPath
     frames: Sequence[PhotoFrame]
     folder: UPath | None = None
     present: Collection[UPath] = ()
-    points: Callable[[], np.ndarray] | None = None
 
 
 class PhotoReader(ABC):

@@ -33,7 +33,6 @@ from qgs.data.photos import formats_of, present_frames, read_listing, readers
 from qgs.data.photos.reader import PhotoFrame, Size, size_problems
 from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
 from qgs.data.view_samplers import held_out_frames
-from qgs.geometry.transforms import depths_in_view
 from qgs.paths import is_local, listing, opened_path
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
@@ -98,7 +97,6 @@ class PhotoScene(Scene):
         self.config = config
         self._cache = cache
         found = read_listing(folder, config.format, config.images, config.outside)
-        self._points = found.points
         frames, self.missing = present_frames(found, folder)
         self.photos = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
@@ -152,15 +150,6 @@ class PhotoScene(Scene):
         if all(self.photos[i].depth is None for i in frames):
             return None
         return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
-
-    def median_depth(self, frames: Sequence[int]) -> float:
-        """Return the median of depth maps or, without them, of the listing's points in view."""
-        known = super().median_depth(frames)
-        if known or self._points is None:
-            return known
-        points = torch.from_numpy(self._points())
-        depths = depths_in_view(points, self.cameras[list(frames)])
-        return float(depths.nanmedian().nan_to_num())
 
     def frame_name(self, frame: int) -> str:
         """Return the path of the image file relative to the scene's folder."""

@@ -159,21 +159,6 @@ def test_broken_models_are_told(tmp_path, photos):
         file.write_bytes(sound)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_points_in_view_give_the_median_depth(tmp_path, photos, kind):
-    c2w = np.tile(np.eye(4), (3, 1, 1))
-    c2w[1, 2, 3] = -2  # behind the first, and the third looks the other way
-    c2w[2, [0, 2], [0, 2]] = -1
-    folder = write_colmap(tmp_path, replace(photos, c2w=c2w), kind)
-    scene = read(folder)
-    assert [scene.median_depth([frame]) for frame in range(3)] == [5, 7, 0]
-    file = next((folder / "sparse/0").glob("points3D.*"))
-    file.write_bytes(file.read_bytes()[: -40 if kind == "binary" else 5])
-    must_refuse("points3D", scene.median_depth, [0])
-    file.unlink()
-    assert read(folder).median_depth([0]) == 0
-
-
 def test_photos_beside_the_model_are_needed(tmp_path, photos):
     folder = write_colmap(tmp_path, photos, "text", images="pictures")
     must_not_find("`images`", read, folder)

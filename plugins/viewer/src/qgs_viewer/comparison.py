@@ -16,7 +16,7 @@ import yaml
 from qgs.checkpoint.model_file import CheckpointFile, load
 from qgs.checkpoint.models import about, checkpoint_path
 from qgs.contracts import Frames, Scene, ViewsConfig, Window
-from qgs.data.inputs import Frusta, fewest_inputs, ranked_windows
+from qgs.data.inputs import Frusta, ranked_windows
 from qgs.data.recognition import is_training_data, open_for
 from qgs.data.view_samplers import Span
 from qgs.domain import Domain
@@ -75,12 +75,11 @@ def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) ->
 
     The first window is the best of `ranked_windows`. Each further window is nearly as good, and far
     from the windows chosen before it. inputs: number of input photos in a window. trained_on:
-    ranges of distances and angles between the cameras in training, by which windows are ranked, and
-    of numbers of inputs, from which `fewest_inputs` chooses in place of `inputs`.
+    ranges of distances and angles between the cameras in training, by which windows are ranked.
     Raises ValueError if the scene has fewer photos than `inputs`.
     """
     frusta = Frusta(scene, trained_on)
-    ranked = ranked_windows(frusta, fewest_inputs(frusta, inputs, trained_on))
+    ranked = ranked_windows(frusta, inputs)
     good = {target: window for cost, window, target in ranked if cost <= ranked[0][0] + POOR}
     chosen = [target for *_, target in ranked[:1]]
     while len(chosen) < min(count, len(good)):

@@ -1,6 +1,6 @@
 """Read COLMAP's sparse models, text or binary, that lie beside a folder of photos.
 
-Unlike pycolmap, this reader skips the 2D points, which make up most of a model, and it reads from
+Unlike pycolmap, this reader skips the points, which make up most of a model, and it reads from
 any file system. The formats are described at colmap.github.io/format.html.
 """
 
@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatch
-from functools import cache, partial
+from functools import cache
 from itertools import chain
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
@@ -125,18 +125,7 @@ def _read(model: UPath, suffix: str) -> Listing:
         inside = name if photos == folder else f"{photos.name}/{name}"
         camera = cameras.get(number) or _faulty(f"there is no camera {number}")
         frames.append(PhotoFrame(inside, folder / inside, _c2w(*pose), **camera))
-    file = model / f"points3D.{suffix}"
-    points = partial(_points, file) if file.is_file() else None
-    return Listing(model, sorted(frames, key=lambda frame: frame.name), folder, points=points)
-
-
-def _points(file: UPath) -> np.ndarray:
-    """Return the positions (N, 3) of points in 3D; raise ValueError for an unreadable file."""
-    read = _binary_points if file.suffix == ".bin" else _text_points
-    try:
-        return np.array([*read(file)], np.float64).reshape(-1, 3)
-    except ValueError as error:
-        raise ValueError(f"{file} cannot be read: {error}; copy it again, or remove it") from error
+    return Listing(model, sorted(frames, key=lambda frame: frame.name), folder)
 
 
 def _project(model: UPath) -> UPath:
@@ -182,19 +171,6 @@ Camera: TypeAlias = tuple[int, tuple[str, float, float, Sequence[float]]]
 """Number of the camera; name of its camera model, width and height in pixels, parameters."""
 Image: TypeAlias = tuple[str, list[float], int]
 """Name, world-to-camera as quaternion (w, x, y, z) and translation (x, y, z), camera's number."""
-
-
-def _text_points(file: UPath) -> Iterator[Sequence[float]]:
-    for line in read_lines(file):
-        yield [*map(_number, line.split()[1:4])]
-
-
-def _binary_points(file: UPath) -> Iterator[Sequence[float]]:
-    with open_file(file) as opened:
-        for _ in range(_unpacked("<Q", opened)[0]):
-            _, *position, photos = _unpacked("<Q3d11xQ", opened)
-            opened.seek(8 * min(photos, 2**32), 1)
-            yield position
 
 
 def _text_cameras(model: UPath) -> Iterator[Camera]:
