@@ -226,7 +226,7 @@ def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path
     """With the same score too, of the one window that is judged."""
     (result,) = opened([MODEL], room)
     (score,) = result.evaluation.scores
-    (_, inputs, compared), found = next(iter(result.search.found.items()))
+    (_, inputs, compared), found = next(iter(result.scales.items()))
     done("reconstruct", MODEL, room, "--out", tmp_path / "out")
     record = json.loads((tmp_path / "out/cameras.json").read_text())
     assert record["to_photos"]["scale"] == pytest.approx(found.factor)

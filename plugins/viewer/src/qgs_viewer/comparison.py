@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from qgs.checkpoint.model_file import CheckpointFile, load
+from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.models import about, checkpoint_path
 from qgs.contracts import Frames, Scene, ViewsConfig, Window
 from qgs.data.inputs import Frusta, ranked_windows
@@ -122,56 +122,41 @@ class PhotoWindows(Span):
         return self._known[scene.name]
 
 
-class ScaleSearch:
-    """Callable that replaces `scale: search` in settings of views by the scale found for a window.
-
-    A window is a scene with its input frames and the frames that renders are compared to. found:
-    the scale found for each window, by (scene name, input frames, compared frames), so that no
-    window is searched twice.
-    """
-
-    def __init__(self, model: QueryGaussianModel, views: ViewsConfig) -> None:
-        self.model = model
-        self.views = views
-        self.found: dict[tuple[str, Frames, Frames], FoundScale] = {}
-
-    def __call__(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
-        """Return the view settings with the scale found for a window in place of `scale: search`.
-
-        If their scale is not `search`, the view settings are returned unchanged.
-        """
-        if self.views.scale != "search":
-            return self.views
-        key = (scene.name, tuple(inputs), tuple(compared))
-        if key not in self.found:
-            self.found[key] = find_scale(self.model.eval(), scene, inputs, compared, self.views)
-        return constant_scale(self.views, self.found[key].factor)
-
-
-@dataclass(frozen=True)
+@dataclass
 class Model:
     """A trained model in a comparison.
 
     name: short and unique. file: checkpoint of the model. recipe: recipe of the training, but with
-    the data of the comparison. search: the network, and the scales of camera positions found for
-    scenes. step: number of training steps; None if unknown. windows: sampler of input and compared
-    photos from a user's photos; None if the scenes come from the recipe's data. size: image size
-    that was found with this model. views: views that `evaluation` has scored.
+    the data of the comparison. step: number of training steps; None if unknown. windows: sampler of
+    input and compared photos from a user's photos; None if the scenes come from the recipe's data.
+    size: image size that was found with this model. views: views that `evaluation` has scored.
+    scales: scale of camera positions found for each window, by (scene name, input frames, compared
+    frames), so that no window is searched twice.
     """
 
     name: str
     file: Path
+    network: QueryGaussianModel
     recipe: Recipe
-    search: ScaleSearch
     step: int | None
-    windows: PhotoWindows | None
+    windows: PhotoWindows | None = None
     size: FoundSize | None = None
     views: list[ScoredView] = field(default_factory=list)
+    scales: dict[tuple[str, Frames, Frames], FoundScale] = field(default_factory=dict)
 
-    @property
-    def network(self) -> QueryGaussianModel:
-        """The network of the model, as a PyTorch module."""
-        return self.search.model
+    def views_of(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
+        """Return the recipe's view settings, with the scale found for a window.
+
+        A window is a scene with its input frames and the frames that renders are compared to. If
+        the scale of the settings is not `search`, they are returned unchanged.
+        """
+        views = self.recipe.views
+        if views.scale != "search":
+            return views
+        key = (scene.name, tuple(inputs), tuple(compared))
+        if key not in self.scales:
+            self.scales[key] = find_scale(self.network.eval(), scene, inputs, compared, views)
+        return constant_scale(views, self.scales[key].factor)
 
     @cached_property
     def evaluation(self) -> Evaluation:
@@ -180,7 +165,7 @@ class Model:
             self.network,
             self.recipe,
             self.step,
-            views_of=self.search,
+            views_of=self.views_of,
             sampler=self.windows,
             show=lambda *shown: self.views.extend(scored_views(*shown)),
         )
@@ -241,45 +226,37 @@ def open_models(
     """
     files = checkpoints(names)
     recipes = recipes_alike(files, photos, size, overrides)
-    tried: Reconstruction | None = None
-    if photos is not None and size is None:
-        tried = _tried(next(iter(files.values())), recipes, photos, device, overrides)
-        if tried and tried.size and tried.size.halved:
-            data = next(iter(recipes.values())).data_config
-            assert data is not None
-            height, width = data.image_size
-            recipes = recipes_alike(files, photos, (height // 2, width // 2), overrides)
-    windows: PhotoWindows | None = None
     models = list[Model]()
     for name, path in files.items():
         with CheckpointFile(path) as file:
-            network = file.model(device)
-            step = file.step
-        if photos is not None and windows is None:
-            # those of the first model for all, so that one protocol judges them
-            count = ALONE if len(files) == 1 else WINDOWS
-            windows = PhotoWindows(network.trained_on or Domain(), count)
-        search = ScaleSearch(network, recipes[name].views)
-        found = None
-        if tried and not models:
-            found = tried.size
+            models.append(Model(name, path, file.model(device), recipes[name], file.step))
+    if photos is None:
+        return models
+    first = models[0]
+    # those of the first model for all, so that one protocol judges them
+    count = ALONE if len(models) == 1 else WINDOWS
+    windows = PhotoWindows(first.network.trained_on or Domain(), count)
+    if size is None and (tried := _tried(first, photos, overrides)):
+        first.size = tried.size
+        if tried.size and tried.size.size < tried.size.other:
+            height, width = first.recipe.tree["data"]["image_size"]
+            recipes = recipes_alike(files, photos, (height // 2, width // 2), overrides)
+        if tried.scale:
             sample = tried.sample
-            if tried.scale:
-                window = (sample.scene, sample.input_frames, sample.target_frames)
-                search.found[window] = tried.scale
-        models.append(Model(name, path, recipes[name], search, step, windows, found))
+            first.scales[sample.scene, sample.input_frames, sample.target_frames] = tried.scale
+    for model in models:
+        model.windows = windows
+        model.recipe = recipes[model.name]
     return models
 
 
-def _tried(
-    file: Path, recipes: Mapping[str, Recipe], photos: str, device: str, overrides: Sequence[str]
-) -> Reconstruction | None:
-    """Reconstruct the first scene of `photos` by the model in `file`; None if this fails."""
-    data = next(iter(recipes.values())).build_data()
+def _tried(model: Model, photos: str, overrides: Sequence[str]) -> Reconstruction | None:
+    """Reconstruct the first scene of `photos` by `model`; None if this fails."""
+    data = model.recipe.build_data()
     scene = (data.names("test") or data.names("train"))[0]
     # the evaluation names scenes that fail
     with suppress(ValueError):
-        return reconstruct(load(file, device), photos, scene=scene, overrides=overrides)
+        return reconstruct(model.network, photos, scene=scene, overrides=overrides)
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:

@@ -17,7 +17,7 @@ def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
     """Yield a sentence with the scales of camera positions found for each model, if any."""
     parts = []
     for model in models:
-        if found := model.search.found.values():
+        if found := model.scales.values():
             factors = [scale.factor for scale in found]
             ends = dict.fromkeys(f"{factor:.3g}" for factor in (min(factors), max(factors)))
             mean = sum(scale.psnr for scale in found) / len(found)

@@ -78,7 +78,7 @@ def model_scenes(
                 views,
                 evaluation,
                 model.windows or model.recipe.build_view_sampler(),
-                model.search,
+                model.views_of,
                 # true depths cost as much as photos to decode, and one copy is enough
                 depths=not shown,
             )
