@@ -238,7 +238,7 @@ def open_models(
     windows = PhotoWindows(first.network.trained_on or Domain(), count)
     if size is None and (tried := _tried(first, photos, overrides)):
         first.size = tried.size
-        if tried.size and tried.size.size < tried.size.other:
+        if tried.size and tried.size.halved:
             height, width = first.recipe.tree["data"]["image_size"]
             recipes = recipes_alike(files, photos, (height // 2, width // 2), overrides)
         if tried.scale:
