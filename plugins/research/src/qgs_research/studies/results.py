@@ -11,7 +11,7 @@ from qgs.evaluate.results import as_json
 from qgs.files import read_records, write_text
 from qgs.wording import listed
 from qgs_research.studies.estimates import CONFIDENCE, Estimate, interval_shown, shown, sign_of
-from qgs_research.studies.hypotheses import MAIN, Contrast
+from qgs_research.studies.hypotheses import MAIN, parsed
 from qgs_research.studies.runs import Plan
 from qgs_research.studies.scores import Scores
 from qgs_research.studies.stored import read_results
@@ -84,10 +84,11 @@ class Results(Scores):
 
     def judgements(self) -> list[Judgement]:
         """Return the verdicts on all hypotheses, in the order of the study file."""
-        pairs = zip(self.settings.hypotheses, self.plan.study.contrasts, strict=True)
-        return [self._judgement(hypothesis, contrast) for hypothesis, contrast in pairs]
+        return [*map(self._judgement, self.settings.hypotheses)]
 
-    def _judgement(self, hypothesis: Hypothesis, contrast: Contrast) -> Judgement:
+    def _judgement(self, hypothesis: Hypothesis) -> Judgement:
+        study = self.plan.study
+        contrast = parsed(hypothesis.claim, study.variants, study.evaluations)
         metric = hypothesis.metric or self.metric
         found = self.estimate(contrast.terms, metric)
         verdict = UNDECIDED

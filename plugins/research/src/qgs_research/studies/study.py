@@ -1,9 +1,8 @@
 """Study files: variants, seeds, a budget, evaluations and hypotheses."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -17,7 +16,7 @@ from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.files import found_recipe, merge
 from qgs.recipe.yaml_text import ListNode, MapNode, load_mapping
 from qgs.wording import did_you_mean
-from qgs_research.studies.hypotheses import NAME, Contrast, parsed
+from qgs_research.studies.hypotheses import NAME, parsed
 
 _BY_NAME = ("variants", "evaluations", "published")
 """Keys of mappings. An entry replaces only the entry of the same name in the extended study."""
@@ -164,12 +163,6 @@ class Study:
     def title(self) -> str:
         """Heading of the study: its title, or the name of its file."""
         return self.settings.title or self.file.stem.replace("_", " ")
-
-    @cached_property
-    def contrasts(self) -> Sequence[Contrast]:
-        """The hypotheses as weighted sums of mean scores, in the order of the study file."""
-        claims = [hypothesis.claim for hypothesis in self.settings.hypotheses]
-        return [parsed(claim, self.variants, self.evaluations) for claim in claims]
 
 
 def read_study(file: str | Path) -> Study:
