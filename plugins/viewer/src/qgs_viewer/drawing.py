@@ -62,8 +62,7 @@ def query_color(query: int) -> Color:
 
 def query_colors(scene: QueryScene) -> np.ndarray:
     """Return the colours of all N queries of `scene`, uint8 RGB (N, 3)."""
-    colors = [query_color(query) for query in range(scene.queries)]
-    return np.array(colors, np.uint8).reshape(-1, 3)
+    return np.array([*map(query_color, range(scene.queries))], np.uint8)
 
 
 def anchor_colors(scene: QueryScene, choice: Choice) -> np.ndarray:
@@ -147,10 +146,10 @@ class Drawing:
         self._draw_gaussians(scene, choice)
         if (views := self.api.get_handle_by_name("/views")) is not None:
             views.visible = choice.photos
-        self._draw_anchors(scene, choice)
-        # another query may have none of them
-        for name in ("/support", "/path", "/reading", "/patches"):
+        # another choice may have none of them
+        for name in ("/anchors", "/support", "/path", "/reading", "/patches"):
             self.api.remove_by_name(name)
+        self._draw_anchors(scene, choice)
         if choice.query is not None:
             self._draw_support(scene, choice.query, choice.layer)
             self._draw_reading(scene, choice.query, choice)
@@ -203,7 +202,6 @@ class Drawing:
     def _draw_anchors(self, scene: QueryScene, choice: Choice) -> None:
         found = scene.support(choice.layer)
         if found is None or not choice.anchors:
-            self.api.remove_by_name("/anchors")
             return
         self.api.add_point_cloud(
             "/anchors",
