@@ -54,26 +54,27 @@ def score_rows(
     and True if its value is the best of all rows. With fewer than RANKED samples no value is
     marked.
     """
-    means = [model.evaluation.means() for model in models]
-    for model, own in zip(models, means, strict=True):
-        own["coverage"] = 100 * trust.means(model.views).coverage
-    baselines = {name: models[0].evaluation.means(name) for name in BASELINES}
-    rivals = [*means, *baselines.values()] if models[0].evaluation.samples >= RANKED else []
+    means: dict[str, Mapping[str, float | None]] = {}
+    sizes: dict[str, Sequence[str]] = {}
+    for model in models:
+        coverage = 100 * trust.means(model.views).coverage
+        means[model.name] = {**model.evaluation.means(), "coverage": coverage}
+        sizes[model.name] = [f"{model.evaluation.gaussians:,}", f"{model.parameters:,}"]
+    for baseline in BASELINES:
+        own = models[0].evaluation.means(baseline)
+        means[baseline.replace("_", " ").capitalize()] = own
+    rivals = means.values() if models[0].evaluation.samples >= RANKED else ()
     rows = {}
-    for model, own in zip(models, means, strict=True):
-        cells = rows[model.name] = list[tuple[str, bool]]()
+    for label, own in means.items():
+        cells = rows[label] = list[tuple[str, bool]]()
         for name, column in columns.items():
-            cell = column.shown(own[name])
+            cell = column.shown(own.get(name))
             best = column.best(other.get(name) for other in rivals)
             # cells that read alike are both best
-            cells.append((cell, best is not None and cell == column.shown(best)))
-        for size in (model.evaluation.gaussians, model.parameters):
-            cells.append((f"{size:,}", False))
-    for baseline, own in baselines.items():
-        shown = [column.shown(own.get(name)) for name, column in columns.items()]
-        # they have neither Gaussians nor parameters
-        cells = [(cell, False) for cell in (*shown, "–", "–")]
-        rows[baseline.replace("_", " ").capitalize()] = cells
+            marked = label in sizes and best is not None and cell == column.shown(best)
+            cells.append((cell, marked))
+        # baselines have neither Gaussians nor parameters
+        cells += [(size, False) for size in sizes.get(label, ("–", "–"))]
     return rows
 
 
@@ -106,7 +107,6 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     """
     models = comparison.models
     first = models[0]
-    detail = Detail()
     scenes = [
         sections.pictured_scene(shown, place, range(len(sample.target_frames))[:TARGETS])
         for place, sample in enumerate(shown[0].samples)
@@ -114,12 +114,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     ranked = [view for scene in scenes for view in scene["views"]]
     # the best first, by the first model
     ranked.sort(key=lambda view: -view["score"])
-    found = [
-        sections.queries(shown, detail),
-        sections.anchors(shown, detail),
-        sections.attention(shown, detail),
-        sections.training_curves(shown, detail),
-    ]
+    drawn = (sections.queries, sections.anchors, sections.attention, sections.training_curves)
     height, width = first.recipe.tree["data"]["image_size"]
     data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
     judged = "beside" if first.windows else "between"
@@ -141,7 +136,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
         views=ranked,
         turned=sections.scene_to_turn(shown),
         verdicts=verdicts(models),
-        sections=[section for section in found if section.rows],
+        sections=[section(shown, Detail()) for section in drawn],
     )
 
 

@@ -239,15 +239,17 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
         kinds["Error"][name] = [Tile(shaded(error, 0.0, most, ERROR_MAP)) for error in maps]
     for name, maps in depths.items():
         kinds["Depth"][name] = [Tile(depth_picture(depth, near, far)) for depth in maps]
-    shown = [dict(zip(colors, tiles, strict=True)) for tiles in zip(*colors.values(), strict=True)]
-    views = zip(ranks, shown, strict=True)
+    shown = zip(ranks, *colors.values(), strict=True)
     inputs = [f"frame {sample.short_label(frame)}" for frame in sample.input_frames]
     return {
         "name": sample.scene,
         "inputs": _photos(sample.inputs.images[0], inputs),
         "kinds": kinds,
         "most": most,
-        "views": [{"score": score, "tiles": tiles} for score, tiles in views],
+        "views": [
+            {"score": score, "tiles": dict(zip(colors, tiles, strict=True))}
+            for score, *tiles in shown
+        ],
     }
 
 
