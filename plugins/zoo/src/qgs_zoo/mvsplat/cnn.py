@@ -13,7 +13,7 @@ WIDTHS = (64, 96, 128)
 
 
 class Stages(NamedTuple):
-    """Feature maps of the CNN's stages, and `features`, a 1 x 1 convolution of the third map."""
+    """Feature maps of the CNN's first two stages, and a 1 x 1 convolution of the third map."""
 
     first: Tensor
     second: Tensor

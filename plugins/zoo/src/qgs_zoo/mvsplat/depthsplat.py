@@ -284,8 +284,7 @@ class DepthPredictor(nn.Module):
         # The order of the release: CNN, ViT, transformer, depth. If its CNN ends at 1/4, nothing
         # joins at 1/8.
         found: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in range(LEVELS)]
-        stages = (cnn.first, cnn.second, cnn.features)
-        for x, level in zip(stages, self.sizes.cnn_levels, strict=True):
+        for x, level in zip(cnn, self.sizes.cnn_levels, strict=True):
             found[level][0].append(x)
         levels = [*map(self.sizes.level, range(len(multi))), self.sizes.finest]
         for x, level in zip([*multi, depth], levels, strict=True):
