@@ -56,36 +56,26 @@ class VitConfig(ComponentConfig):
         return heads
 
 
-class Attention(nn.Module):
-    """Multi-head self-attention on (X, T, C): X images, T tokens, C channels.
+class Block(nn.Module):
+    """Transformer block on (X, T, C): pre-norm attention and MLP, each with LayerScale.
 
-    One linear layer computes queries, keys and values.
+    X: number of images. T: tokens. C: channels. One linear layer computes queries, keys and values.
     """
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.qkv = nn.Linear(width, 3 * width)
-        self.proj = nn.Linear(width, width)
-
-    def forward(self, x_XTC: Tensor) -> Tensor:
-        return self.proj(self_attention(self.qkv(x_XTC), self.heads))
-
-
-class Block(nn.Module):
-    """Transformer block: pre-norm attention and MLP, each with LayerScale."""
-
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
         self.norm1 = nn.LayerNorm(width, EPS)
-        self.attn = Attention(width, heads)
+        qkv = nn.Linear(width, 3 * width)
+        self.attn = nn.ModuleDict({"qkv": qkv, "proj": nn.Linear(width, width)})
         self.ls1 = LayerScale(width, 1.0)
         self.norm2 = nn.LayerNorm(width, EPS)
         self.mlp = Mlp(width, 4 * width, width)
         self.ls2 = LayerScale(width, 1.0)
 
     def forward(self, x_XTC: Tensor) -> Tensor:
-        x_XTC = x_XTC + self.ls1(self.attn(self.norm1(x_XTC)))
+        read_XTC = self_attention(self.attn["qkv"](self.norm1(x_XTC)), self.heads)
+        x_XTC = x_XTC + self.ls1(self.attn["proj"](read_XTC))
         return x_XTC + self.ls2(self.mlp(self.norm2(x_XTC)))
 
 
