@@ -143,9 +143,9 @@ class Case:
     def problems(self, size: tuple[int, int] | None = None) -> list[contracts.Problem]:
         """Return the problems that the component reports for its options and images of `size`.
 
-        size: (H, W); None if the size of images is not known.
+        size: (H, W), by default `self.size`.
         """
-        context = contracts.RecipeContext(self.dims, size)
+        context = contracts.RecipeContext(self.dims, size or self.size)
         return list(self.component.problems(self.config, context))
 
     def build(self, seed: int = 0) -> Any:
@@ -196,7 +196,7 @@ class Case:
         given = dict(self.config)
         lower = {name: size for name, size in sizes.items() if (given.get(name) or 0) > size}
         smaller = self.with_config(self.config.model_copy(update=lower))
-        return self if smaller.problems(smaller.size) else smaller
+        return self if smaller.problems() else smaller
 
     def with_config(self, config: ComponentConfig) -> "Case":
         """Return a copy of this case with the options `config`."""

@@ -298,7 +298,7 @@ def _accepts(case: Case) -> bool:
     Return False if `problems` raises an error, which the checks then report.
     """
     try:
-        return not case.problems(case.size)
+        return not case.problems()
     except (Exception, SystemExit):
         return False
 

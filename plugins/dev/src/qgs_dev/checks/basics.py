@@ -66,7 +66,7 @@ SLACK = 2
 
 def check_builds(case: Case) -> None:
     """Require that `problems` accepts the options, and that the component can be built."""
-    found = [f"`{p.option}`: {p.reason}" for p in case.problems(case.size)]
+    found = [f"`{p.option}`: {p.reason}" for p in case.problems()]
     # A case with invalid options says nothing about the component.
     expect(not found, f"`problems` refuses the options of this case: {', '.join(found)}")
     case.build()
@@ -95,7 +95,7 @@ def check_sizes_vary(case: Case) -> None:
     """
     _expect_shapes(case, [*VARIED, Sizes(image=(case.size[1], case.size[0]))])
     other = case.with_dims(width=48, heads=3)
-    if case.has_parameters and not other.problems(other.size):
+    if case.has_parameters and not other.problems():
         try:
             _expect_shapes(other, VARIED[:2])
         except Exception as error:

@@ -97,8 +97,7 @@ def check_terms_have_gradients(case: Case) -> None:
     A loss that is always zero, such as one of weight 0, is accepted if it requires no fields.
     """
     trial = Trial(case)
-    terms = trial()
-    idle = {*terms}
+    idle = {*trial()}
     zeros = not case.reads
     for inputs in _draws(trial):
         terms = trial(inputs)
@@ -117,7 +116,7 @@ def check_gradients_match_differences(case: Case) -> None:
     this check and `gradients_reach_inputs` as expected failures.
     """
     small = case.with_dims(width=8, heads=2) if case.has_parameters else case
-    small = case if small.problems(small.size) else small
+    small = case if small.problems() else small
     # Further blocks would repeat the first two.
     small = small.with_at_most(depth=2)
     module = small.lively().double()

@@ -218,5 +218,4 @@ def _ready(case: Case) -> Any:
 def _called(case: Case, module: Any) -> Any:
     if case.slot == "objective":
         return rehearsed(case, module)
-    with seeded(0):
-        return module(*inputs_of(case).values())
+    return _outputs(module, inputs_of(case), 0)[0]
