@@ -196,10 +196,10 @@ def _of_ply(path: Path) -> Gaussians:
             f"its header does not end within the first {_HEADER:,} bytes, or announces more "
             "elements than the file can hold"
         )
-    elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
-    if "chunk" in elements:
+    content = PlyData.read(str(path))
+    if "chunk" in content:
         return _of_packed(path)
-    vertices = elements["vertex"]
+    vertices = content["vertex"].data
     names = vertices.dtype.names or ()
     count = sum(name.startswith("f_rest_") for name in names)
     if count not in (0, 9, 24, 45):
