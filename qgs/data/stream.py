@@ -136,12 +136,6 @@ class SampleStream(Dataset[Batch | Exception]):
         """The training scenes, once for each image size."""
         return [opened().scenes("train") for opened in self._openers]
 
-    def _scene(self, number: int, step: int) -> Scene:
-        epoch, place = divmod(number, len(self._scenes[0]))
-        order = self._orders.get(epoch, lambda: self._draw_epoch(epoch))
-        size = np.random.default_rng([self.seed, 2, step]).integers(len(self._openers))
-        return self._scenes[size][int(order[place])]
-
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self.seed, 0, epoch])
         # One group after another: each, such as a file of scenes, is opened once per epoch.
@@ -200,10 +194,13 @@ class SampleStream(Dataset[Batch | Exception]):
         These choices are whether to mirror the sample, its input frames and its target frames.
         attempt: number of earlier attempts that failed; each takes the next scene.
         """
+        epoch, place = divmod(number + attempt, len(self._scenes[0]))
+        order = self._orders.get(epoch, lambda: self._draw_epoch(epoch))
+        size = np.random.default_rng([self.seed, 2, step]).integers(len(self._openers))
+        scene = self._scenes[size][int(order[place])]
         # The first attempt always draws from (seed, 1, number), also if other samples failed.
         key = [self.seed, 1, number]
         rng = np.random.default_rng([*key, attempt] if attempt else key)
-        scene = self._scene(number + attempt, step)
         mirror = bool(rng.random() < self.views.mirror)
         return scene, rng, mirror, *self.sampler.draw(scene, self.views, rng, step)
 
