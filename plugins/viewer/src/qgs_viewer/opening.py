@@ -4,8 +4,9 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -48,53 +49,51 @@ SAME = 0.02
 
 
 @dataclass
-class Source:
-    """Content of the viewer. This class shows fixed Gaussians without a model.
+class FixedSource:
+    """Gaussians without a model, as content of the viewer.
 
-    The derived class `ModelSource` reconstructs a scene from photos that the user chooses. title:
-    heading of the viewer. notes: remarks for the user. fixed: the Gaussians to show; None in
-    `ModelSource`. frames: indices, within the scene, of the input photos that the viewer uses
-    at the start. labels: a name for every photo of the scene; empty if the user cannot change the
-    inputs.
+    title: heading of the viewer. notes: remarks for the user. fixed: the Gaussians to show. The
+    user cannot change the inputs, so frames and labels are empty.
     """
 
     title: str
-    notes: Sequence[str] = ()
-    fixed: QueryScene | None = None
-    frames: Sequence[int] = ()
-    labels: Sequence[str] = ()
+    notes: Sequence[str]
+    fixed: QueryScene
+    frames = ()
+    labels = ()
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
-        """Return the scene reconstructed from the photos `frames`; without a model, `self.fixed`.
-
-        Raises ValueError for frames that a model cannot take.
-        """
-        assert self.fixed is not None
+        """Return `self.fixed`, whatever the photos `frames`."""
         return self.fixed
 
 
-class ModelSource(Source):
+@dataclass
+class ModelSource:
     """A model and a scene: the user may choose any photos of the scene as inputs.
 
-    The viewer's world is that of the reconstruction from `frames`, the inputs at the start. All
-    later reconstructions are moved into this world.
+    frames: indices, within the scene, of the input photos that the viewer uses at the start. title,
+    notes: as in `FixedSource`.
     """
 
-    def __init__(
-        self,
-        model: QueryGaussianModel,
-        scene: Scene,
-        views: ViewsConfig,
-        frames: Sequence[int],
-        title: str,
-        notes: Sequence[str] = (),
-    ) -> None:
-        labels = [scene.label(frame) for frame in range(len(scene))]
-        super().__init__(title, notes, frames=tuple(frames), labels=labels)
-        self.model = model
-        self.scene = scene
-        self.views = views
-        self.world = own_world(scene, tuple(frames), views)
+    model: QueryGaussianModel
+    scene: Scene
+    views: ViewsConfig
+    frames: Sequence[int]
+    title: str
+    notes: Sequence[str] = ()
+
+    @property
+    def labels(self) -> list[str]:
+        """A name for every photo of the scene."""
+        return [*map(self.scene.label, range(len(self.scene)))]
+
+    @cached_property
+    def world(self) -> tuple[Tensor, Tensor]:
+        """World of the reconstruction from `frames`, which is that of the viewer.
+
+        All later reconstructions are moved into this world.
+        """
+        return own_world(self.scene, tuple(self.frames), self.views)
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
         """Return the scene reconstructed from the photos `frames`, placed in the viewer's world.
@@ -112,6 +111,10 @@ class ModelSource(Source):
         # other inputs have another world, while the user's view stays
         place = Placement.between(world, self.world)
         return explained(self.model, inputs, picked, place)
+
+
+Source: TypeAlias = FixedSource | ModelSource
+"""Content of the viewer."""
 
 
 def photo_model(size: Size | None = None) -> str:
@@ -157,7 +160,7 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
     note = "A file of Gaussians has neither queries nor photos; name the model to see them."
     # the browser gets float32
     gaussians, _ = about_origin(load_ply(path))
-    return Source(path.name, (note,), QueryScene(gaussians))
+    return FixedSource(path.name, (note,), QueryScene(gaussians))
 
 
 def open_model(
@@ -254,7 +257,7 @@ def open_made(folder: Path) -> Source:
     except (OSError, ValueError) as error:
         notes.append(f"The photos of the scene are not shown: {one_line(error)}")
     shown = QueryScene(gaussians, views, background=(0.0, 0.0, 0.0))
-    return Source(folder.name, notes, shown)
+    return FixedSource(folder.name, notes, shown)
 
 
 def is_finished(folder: Path) -> bool:
@@ -344,7 +347,7 @@ def open_finished(folder: Path, device: str) -> Source:
     try:
         source = _with_queries(plain, scene, record, device)
     except (ValueError, OSError) as error:
-        return Source(title, [f"Queries are not shown: {error}", *notes], plain)
+        return FixedSource(title, [f"Queries are not shown: {error}", *notes], plain)
     source.title = title
     source.notes = notes
     return source
