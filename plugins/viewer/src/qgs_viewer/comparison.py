@@ -337,10 +337,9 @@ def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dic
     config = source.config
     if not own and scene is not None:
         # cropped photos would hide part of the user's scene
-        multiples = [size_multiple(recipe) for recipe in recipes]
+        multiples = [*map(size_multiple, recipes)]
         # a multiple of all models' sizes; none where one takes a single size
-        known = [multiple for multiple in multiples if multiple is not None]
-        common = math.lcm(*known) if len(known) == len(multiples) else None
+        common = math.lcm(*filter(None, multiples)) if all(multiples) else None
         size = size or whole_size(scene, common)
         config = holding_out(config, scene)
     # recipes know sources of data by PLUGIN/NAME
