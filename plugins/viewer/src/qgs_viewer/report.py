@@ -57,8 +57,10 @@ def score_rows(
     means: dict[str, Mapping[str, float | None]] = {}
     sizes: dict[str, Sequence[str]] = {}
     for model in models:
+        found = model.evaluation.means()
+        # of the views that the evaluation has scored
         coverage = 100 * trust.means(model.views).coverage
-        means[model.name] = {**model.evaluation.means(), "coverage": coverage}
+        means[model.name] = {**found, "coverage": coverage}
         sizes[model.name] = [f"{model.evaluation.gaussians:,}", f"{model.parameters:,}"]
     for baseline in BASELINES:
         own = models[0].evaluation.means(baseline)
@@ -87,16 +89,16 @@ def show_scores(comparison: Comparison, console: Console) -> None:
     """Print the table of scores in the terminal, with the best values in green."""
     # the verdicts give the coverage, for which a narrow terminal has no column
     columns = comparison.models[0].evaluation.columns
-    lines = list[Sequence[str | Text]]()
     titles = [column.title for column in columns.values()]
-    lines.append(["", *titles, "Gaussians", "parameters"])
+    lines: list[Sequence[str | Text]] = [["", *titles, "Gaussians", "parameters"]]
     for name, row in score_rows(comparison.models, columns).items():
         lines.append([name, *(Text(cell, "green" if best else "") for cell, best in row)])
-    look = {"box": box.SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True}
     samples = comparison.models[0].evaluation.samples
     marks = "best in green" if samples >= RANKED else "too few to rank models"
     title = f"{comparison.scenes}, {counted(samples, 'sample')}, {marks}"
-    print_table(console, title, lines, **look)
+    print_table(
+        console, title, lines, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True
+    )
 
 
 @torch.no_grad()
