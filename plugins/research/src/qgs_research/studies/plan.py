@@ -45,7 +45,7 @@ def composed(study: Study) -> dict[str, Recipe]:
     problems = Problems("study")
     recipes: dict[str, Recipe] = {}
     for name, node in study.variants.items():
-        with _collected(problems, f"variants.{name}", study.variants[name].origin):
+        with _collected(problems, f"variants.{name}", node.origin):
             # A recipe has one seed, which each run replaces by its own.
             recipe = resolve(node, [f"seed={study.settings.seeds[0]}"])
             recipes[name] = _with_budget(study, with_absolute_path(recipe))
@@ -104,10 +104,7 @@ def _build(recipe: Recipe) -> None:
         checkpoint_path(recipe.init_from)
 
 
-EQUAL = (
-    *("data", "views", "training", "evaluation", "metrics"),
-    *("losses", "objective", "init_from"),
-)
+EQUAL = ("data", "views", "training", "evaluation", "metrics", "losses", "objective", "init_from")
 """Sections of recipes that must be equal in all variants, except for options in `differs`.
 
 Model and optimiser may always differ.

@@ -25,10 +25,6 @@ from qgs_research.studies.tables import (
     training_notes,
 )
 
-SEEN = "seen"
-CONTRADICTED = "contradicted"
-UNDECIDED = "undecided"
-
 _RANKED = 5
 """Least number of variants for a rank correlation.
 
@@ -91,23 +87,17 @@ class Results(Scores):
         contrast = parsed(hypothesis.claim, study.variants, study.evaluations)
         metric = hypothesis.metric or self.metric
         found = self.estimate(contrast.terms, metric)
-        verdict = UNDECIDED
+        verdict = "undecided"
         reasons = [f"its runs share no seed and scene with a score `{metric}`"]
         if found:
             reasons = [found.too_small or "the interval contains 0"]
-            for sign, word in ((contrast.sign, SEEN), (-contrast.sign, CONTRADICTED)):
+            for sign, word in ((contrast.sign, "seen"), (-contrast.sign, "contradicted")):
                 if found.clear(sign):
                     verdict = word
                     reasons = []
             if self.unlike(contrast.terms):
                 reasons.append("evaluated by different protocols")
-        return Judgement(
-            hypothesis=hypothesis,
-            metric=metric,
-            estimate=found,
-            verdict=verdict,
-            reason=", ".join(reasons),
-        )
+        return Judgement(hypothesis, metric, found, verdict, ", ".join(reasons))
 
     def rank_correlation(self) -> float | None:
         """Return Spearman's rank correlation of measured means and published values, by variant.

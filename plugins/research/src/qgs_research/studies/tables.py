@@ -34,8 +34,9 @@ class Summary:
         """Print the answer, the tables and the notes to `console`."""
         print_lines(console, filter(None, [self.answer]))
         for title, rows in self.tables:
-            compact = {"collapse_padding": True, "pad_edge": False}
-            print_table(console, title, rows, box=box.SIMPLE_HEAD, **compact)
+            print_table(
+                console, title, rows, box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False
+            )
         print_lines(console, self.notes)
 
     @property
