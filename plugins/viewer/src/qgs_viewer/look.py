@@ -6,7 +6,7 @@ from io import BytesIO
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from PIL import Image
+from PIL import Image, ImageOps
 
 from qgs.drawing.images import Picture, png_bytes
 
@@ -76,7 +76,5 @@ def data_uri(image: Picture, photo: bool = False) -> str:
 
 def enlarged(picture: Picture, side: int) -> Picture:
     """Resize a picture (bicubic) so that its longer side has `side` pixels."""
-    height, width = picture.shape[:2]
-    factor = side / max(height, width)
-    size = (round(width * factor), round(height * factor))
-    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
+    image = Image.fromarray(picture)
+    return np.asarray(ImageOps.scale(image, side / max(image.size)))

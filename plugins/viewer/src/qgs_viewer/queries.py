@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageOps
 from torch import Tensor
 
 from qgs.drawing.images import NOTHING, Picture, rgb_picture, side_by_side
@@ -75,12 +75,11 @@ def washed(picture: Picture, strength: float = 0.6) -> Picture:
 
 def _oversampled(picture: Picture) -> Image.Image:
     """Return `picture`, OVERSAMPLING times as large; `_reduced` restores the size."""
-    return Image.fromarray(enlarged(picture, OVERSAMPLING * max(picture.shape[:2])))
+    return ImageOps.scale(Image.fromarray(picture), OVERSAMPLING)
 
 
 def _reduced(image: Image.Image) -> Picture:
-    size = (image.width // OVERSAMPLING, image.height // OVERSAMPLING)
-    return np.asarray(image.resize(size, Image.Resampling.LANCZOS))
+    return np.asarray(ImageOps.scale(image, 1 / OVERSAMPLING, Image.Resampling.LANCZOS))
 
 
 def support_picture(
@@ -132,8 +131,8 @@ def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]
     the greatest value of all maps. Patches with NaN are grey.
     """
     seen = maps[np.isfinite(maps)]
-    low = float(seen.min()) if seen.size else 0.0
-    high = float(seen.max()) if seen.size else 1.0
+    low = seen.min(initial=np.inf)
+    high = seen.max(initial=-np.inf)
     # one scale for all photos: a query may read one of them alone
     shades = (maps - low) / max(high - low, 1e-12)
     pictures = []
