@@ -127,7 +127,6 @@ class Drawing:
 
     def __init__(self, api: viser.SceneApi) -> None:
         self.api = api
-        self._gaussians: viser.GaussianSplatHandle | None = None
         self._painted: tuple[Any, ...] = ()
 
     def put(self, scene: QueryScene, choice: Choice) -> None:
@@ -163,14 +162,14 @@ class Drawing:
         factor = shown.magnification
         centers = shown.centers * factor
         covariances = shown.covariances * factor**2
-        if self._gaussians is None:
-            self._gaussians = self.api.add_gaussian_splats(
-                "/gaussians", centers, covariances, shown.colors, shown.opacities
-            )
+        contents = (centers, covariances, shown.colors, shown.opacities)
+        handle: Any = self.api.get_handle_by_name("/gaussians")
+        if handle is None:
+            handle = self.api.add_gaussian_splats("/gaussians", *contents)
         else:
-            self._gaussians.set_gaussians(centers, covariances, shown.colors, shown.opacities)
+            handle.set_gaussians(*contents)
         # centres and covariances are magnified, see `Splats.magnification`
-        self._gaussians.scale = 1 / factor
+        handle.scale = 1 / factor
         self._painted = paint
 
     def _draw_photos(self, scene: QueryScene) -> None:
