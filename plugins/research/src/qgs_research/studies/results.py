@@ -69,15 +69,6 @@ class Results(Scores):
         self.missing = [run for run in plan.runs if not plan.done(run)]
         self.failed = [run for run in self.missing if run.failed]
 
-    @property
-    def shared(self) -> str | None:
-        """Name of the first evaluation whose runs were all scored by one protocol.
-
-        None if there is no such evaluation.
-        """
-        # The order is that of the study, so the recipes' own evaluation comes first.
-        return next((n for n in self.plan.evaluations if len(self.protocols(n)) == 1), None)
-
     def judgements(self) -> list[Judgement]:
         """Return the verdicts on all hypotheses, in the order of the study file."""
         return [*map(self._judgement, self.settings.hypotheses)]
@@ -140,16 +131,19 @@ def answer(results: Results) -> str:
 def _verdict(results: Results) -> str:
     """Return a sentence that says whether the best variant is better than the reference.
 
-    The scores are from the evaluation `Results.shared`. A variant is better if the interval of its
-    difference to the reference, at confidence 1 - 0.05 / n for n variants, lies on the better side
-    of 0 (Bonferroni correction). "All variants are worse" needs no correction, because all n
-    intervals must lie on the worse side of 0 (intersection-union test).
+    The scores are from the first evaluation whose runs were all scored by one protocol. A variant
+    is better if the interval of its difference to the reference, at confidence 1 - 0.05 / n for n
+    variants, lies on the better side of 0 (Bonferroni correction). "All variants are worse" needs
+    no correction, because all n intervals must lie on the worse side of 0 (intersection-union
+    test).
     """
     if results.metric not in results.columns:
         return "Not known yet: no run is finished."
-    evaluation = results.shared
-    if evaluation is None:
+    # The order is that of the study, so the recipes' own evaluation comes first.
+    shared = [name for name in results.plan.evaluations if len(results.protocols(name)) == 1]
+    if not shared:
         return "Not known: variants have different protocols; add an evaluation to `evaluations`."
+    evaluation = shared[0]
     found = results.differences(evaluation)
     if not found:
         return f"Not known yet: {results.reference} and another variant share no finished seed."
