@@ -96,9 +96,7 @@ def show_scores(comparison: Comparison, console: Console) -> None:
     samples = comparison.models[0].evaluation.samples
     marks = "best in green" if samples >= RANKED else "too few to rank models"
     title = f"{comparison.scenes}, {counted(samples, 'sample')}, {marks}"
-    print_table(
-        console, title, lines, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True
-    )
+    print_table(console, title, lines, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
 
 
 @torch.no_grad()
