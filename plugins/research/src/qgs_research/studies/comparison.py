@@ -35,12 +35,13 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
         )
     reference, *others = sides = _sides(results)
     for name in others:
-        if not common_scenes([*sides[reference].values(), *sides[name].values()]):
+        both = [*sides[reference].values(), *sides[name].values()]
+        if not common_scenes(both):
             raise ValueError(
                 f"{reference} and {name} have no common scene: evaluate both on the same scenes"
             )
         if not across_protocols:
-            _refuse_unlike(reference, sides[reference], name, sides[name])
+            _refuse_unlike(reference, name, both)
         sides[name] = _paired(sides[reference], sides[name])
     return Scores(
         stored={(name, MAIN): runs for name, runs in sides.items()},
@@ -86,12 +87,11 @@ def _paired(reference: Runs, runs: Runs) -> Runs:
     return dict(zip(keys, runs.values(), strict=False))
 
 
-def _refuse_unlike(reference: str, first: Runs, name: str, second: Runs) -> None:
+def _refuse_unlike(reference: str, name: str, results: Sequence[StoredResults]) -> None:
     """Raise ValueError if two sides were evaluated by different protocols or on different frames.
 
-    reference, name: names of the sides. first, second: their runs.
+    reference, name: names of the sides. results: those of the first, then those of the second.
     """
-    results = [*first.values(), *second.values()]
     ours = results[0].protocol
     theirs = results[-1].protocol
     if theirs.sha256 != ours.sha256:
