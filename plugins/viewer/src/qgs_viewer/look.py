@@ -1,7 +1,7 @@
 """Style of pages and figures: colours, Jinja templates, pictures embedded in pages."""
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 
 import numpy as np
@@ -49,11 +49,8 @@ def running_mean(values: Sequence[float]) -> np.ndarray:
     return sums / np.convolve(np.ones(len(values)), window, "same")
 
 
-def page_environment(**filters: Callable[..., str]) -> Environment:
-    """Return a Jinja environment for the templates of this plug-in.
-
-    filters: functions to add as Jinja filters, by name.
-    """
+def page_environment() -> Environment:
+    """Return a Jinja environment for the templates of this plug-in, with filters uri and hex."""
     environment = Environment(
         loader=PackageLoader("qgs_viewer", "template"),
         autoescape=True,
@@ -61,7 +58,7 @@ def page_environment(**filters: Callable[..., str]) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(filters)
+    environment.filters |= {"uri": data_uri, "hex": hex_color}
     return environment
 
 

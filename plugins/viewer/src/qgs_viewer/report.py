@@ -17,7 +17,7 @@ from qgs.terminal import print_lines, print_table
 from qgs.wording import counted, listed
 from qgs_viewer import sections, trust
 from qgs_viewer.comparison import Model
-from qgs_viewer.look import data_uri, hex_color, page_environment
+from qgs_viewer.look import page_environment
 from qgs_viewer.remarks import remarks
 from qgs_viewer.scenes import ModelScenes, model_scenes
 from qgs_viewer.sections import Detail
@@ -124,8 +124,8 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     metrics = [part for place, part in first.recipe.parts.items() if place[0] == "metrics"]
     columns = [*first.evaluation.columns.items()]
     columns.insert(1, ("coverage", trust.COVERAGE))
-    environment = page_environment(uri=data_uri, hex=hex_color)
-    return environment.get_template("report.html").render(
+    template = page_environment().get_template("report.html")
+    return template.render(
         comparison=comparison,
         title=f"{names}: {comparison.scenes.lower()}",
         columns=[column for _, column in columns],
