@@ -240,9 +240,8 @@ def query_picture(
     """
     scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
     per_query = model.head.gaussians_per_query
-    indices = torch.tensor([query.index for query in chosen], dtype=torch.long)
-    members = indices[:, None] * per_query + torch.arange(per_query)
-    shown = gaussians[:, members.flatten().to(gaussians.means.device)]
+    members = torch.arange(gaussians.count, device=gaussians.means.device).view(-1, per_query)
+    shown = gaussians[:, members[[query.index for query in chosen]].flatten()]
     paint = torch.tensor([q.color for q in chosen]).view(-1, 3).to(shown.colors) / 255
     colors = paint.repeat_interleave(per_query, 0)[None]
     # a query whose Gaussians are nearly clear is still seen
