@@ -47,10 +47,6 @@ class Sample:
     world: tuple[Tensor, Tensor]
     names: Mapping[int, str] = field(default_factory=dict)
 
-    def label(self, frame: int) -> str:
-        """Return the number of a frame, with its name if it has one, for messages."""
-        return numbered(frame, self.names.get(frame, ""))
-
     def short_label(self, frame: int) -> str:
         """Return the number of a frame, with its name without folders if it has one."""
         return numbered(frame, Path(self.names.get(frame, "")).name)

@@ -140,21 +140,18 @@ class Span(ViewSampler):
         max_gap: int | None = Field(default=None, ge=1)
         """Largest distance in frames from the first to the last input view. null uses `views.gap`.
         With a schedule, it can grow during training."""
-        most_inputs: int | None = Field(default=None, ge=1)
-        """Largest number of inputs in training. The first step uses `views.inputs`, each further
-        step one more, up to this number, and then it starts again. Evaluation always uses
-        `views.inputs`. null: training uses `views.inputs` too."""
+        extra_inputs: int = Field(default=0, ge=0)
+        """Largest number of inputs in training beyond `views.inputs`. The first step uses
+        `views.inputs`, each further step one more, up to this largest number, and then it starts
+        again. Evaluation always uses `views.inputs`."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Yield problems if `min_gap` is above `max_gap`, or `most_inputs` below `views.inputs`."""
+        """Yield a problem if `min_gap` is larger than `max_gap`."""
         if config.min_gap and config.max_gap and config.min_gap > config.max_gap:
             yield Problem("min_gap", "`min_gap` is larger than `max_gap`", "raise `max_gap`")
-        if config.most_inputs and context.inputs and config.most_inputs < context.inputs:
-            reason = f"it is smaller than `views.inputs`, {context.inputs}"
-            yield Problem("most_inputs", reason, "raise `most_inputs`, or lower `views.inputs`")
 
     def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:
         """Choose input and target frames from a random span of `scene`."""
@@ -163,8 +160,8 @@ class Span(ViewSampler):
         # A schedule may lower the largest gap below the least one of the recipe.
         low = min(options.min_gap or views.gap[0], high)
         count = views.inputs
-        if options.most_inputs and step != END:
-            count += step % (options.most_inputs - count + 1)
+        if step != END:
+            count += step % (options.extra_inputs + 1)
         views = views.model_copy(update={"gap": (low, high), "inputs": count})
         refuse_too_many(count + views.targets, scene)
         usable = moments(scene)

@@ -67,19 +67,6 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
 
 
 @full_precision
-def depths_in_view(points: Tensor, cameras: Cameras) -> Tensor:
-    """Return depths z (V, P) of points (P, 3) from cameras (V,); NaN for points out of view."""
-    local = to_camera(points[None], cameras[None])[0]
-    # Comparisons with NaN are false.
-    depths = local[..., 2]
-    depths = depths.where(depths > 1e-6, torch.nan)
-    pixels = to_pixels(torch.cat([local[..., :2], depths[..., None]], -1), cameras.intrinsics)
-    height, width = cameras.size
-    inside = (pixels >= 0) & (pixels <= pixels.new_tensor([width, height]))
-    return depths.where(inside.all(-1), torch.nan)
-
-
-@full_precision
 def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
     """Scale Gaussians by `factor` about the origin, then move them by the rigid `pose` (4, 4).
 

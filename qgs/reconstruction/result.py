@@ -94,7 +94,7 @@ class Reconstruction:
         """Return the scene's name, the PSNR of each view, the scale that was found, and remarks."""
         lines = [f"Reconstruction of {self.sample.scene}: {self.gaussians.count:,} Gaussians"]
         for score in self.scores:
-            lines.append(f"{score.kind} {self.sample.label(score.frame)} {score.psnr:.2f} dB")
+            lines.append(f"{score.kind} {self.sample.short_label(score.frame)} {score.psnr:.2f} dB")
         lines += [found.text for found in (self.scale, self.size) if found]
         return "\n  ".join([*lines, *self.remarks])
 

@@ -11,9 +11,8 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from qgs.drawing.images import rgb_picture
-from qgs.geometry.transforms import depths_in_view
 from qgs_viewer.look import INK, Color, enlarged
-from qgs_viewer.placement import Splats, corners, on_photo
+from qgs_viewer.placement import Splats, corners, depths_in_view, on_photo
 from qgs_viewer.query_scene import QueryScene
 
 Others = Literal["shown", "faint", "hidden"]
@@ -303,7 +302,7 @@ def distance_to(scene: QueryScene) -> float:
         found = (solid - solid.median(0).values).norm(dim=-1)
     else:
         cameras = scene.views.cameras.to("cpu")
-        depths = depths_in_view(solid, cameras[0])
+        depths = depths_in_view(solid, cameras)
         found = depths[~depths.isnan()]
         if not len(found):
             found = torch.cdist(cameras.c2w[0, :, :3, 3], solid)

@@ -10,11 +10,10 @@ from torch import Tensor
 
 from qgs.contracts import Column
 from qgs.data.samples import Sample
-from qgs.geometry.transforms import depths_in_view
 from qgs.metrics.baselines import nearest_input
 from qgs.types import Cameras, Rendering
 from qgs.wording import listed
-from qgs_viewer.placement import on_photo, patch_centers
+from qgs_viewer.placement import depths_in_view, on_photo, patch_centers
 
 COVERAGE = Column("coverage", "higher", digits=0, unit="%")
 WHOLE = "whole"
@@ -62,7 +61,7 @@ def seen_by(inputs: Cameras, targets: Cameras, rendering: Rendering) -> Tensor:
     centers = patch_centers((1, *targets.size), targets.size)
     depths = rendering.depth[0].flatten(1)[..., None]
     points = on_photo(targets[0], centers, depths).flatten(0, 1)
-    unseen = depths_in_view(points, inputs[0]).isnan().all(0)
+    unseen = depths_in_view(points, inputs).isnan().all(0)
     return ~unseen.view_as(alpha) & (alpha > SOLID)
 
 
