@@ -4,7 +4,7 @@ Each field of the model's state must be written before a component reads it, in 
 forward pass.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -33,8 +33,8 @@ def check(draft: Draft, problems: Problems) -> Parts:
     Sublayers that no decoder layer uses are left out. Raises RecipeError with all problems.
     """
     parts = _without_idle_sublayers(draft, problems)
-    contexts = _contexts(draft)
-    sound = [_check_options(part, contexts, problems) for part in parts.values()]
+    context = _context(draft)
+    sound = [_check_options(part, context, problems) for part in parts.values()]
     if all(sound):
         check_flow(parts, draft.dims.depth, draft.registry, problems)
     for path, reason, fix in _contradictions(draft, parts):
@@ -44,19 +44,16 @@ def check(draft: Draft, problems: Problems) -> Parts:
     return parts
 
 
-def _contexts(draft: Draft) -> Sequence[RecipeContext]:
-    """Return a context for each size of images in training and evaluation."""
+def _context(draft: Draft) -> RecipeContext:
     data: Any = draft.parts.get(("data",))
     if data is None:
-        return [RecipeContext(draft.dims)]
+        return RecipeContext(draft.dims)
     source = data.config
     size = source.image_size if isinstance(source, SceneSourceConfig) else None
-    inputs = draft.settings.views.inputs
-    sizes = (size, *draft.settings.training.image_sizes)
-    return [RecipeContext(draft.dims, s, inputs, data.component.tells_times) for s in sizes]
+    return RecipeContext(draft.dims, size, draft.settings.views.inputs, data.component.tells_times)
 
 
-def _check_options(chosen: Chosen, contexts: Sequence[RecipeContext], problems: Problems) -> bool:
+def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
     """Report problems of a component's options; return False if a method of the component fails.
 
     Otherwise returns True, even if there are problems.
@@ -76,8 +73,7 @@ def _check_options(chosen: Chosen, contexts: Sequence[RecipeContext], problems: 
         # A scheduled option must be valid at every extreme of its schedule.
         found: dict[Problem, None] = {}
         for options in (config, *chosen.later):
-            for context in contexts:
-                found |= dict.fromkeys(component.problems(options, context))
+            found |= dict.fromkeys(component.problems(options, context))
     # Code of a plugin may raise anything.
     except Exception as error:
         called = f"`{called}` of `{chosen.type}`"

@@ -43,20 +43,14 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct one scene from photos, as the command `qgs reconstruct` does.
 
-    Cameras are moved to the frame and scale of the model's recipe. If its scale is constant and the
-    photos are not training data, `find_scale` searches for the scale. Then `find_size` decides
-    between the result of `whole_size` and half of it.
-
+    Cameras are moved to the frame of the model's recipe. For photos that are no training data,
+    `find_scale` replaces a constant scale, and `find_size` may halve the size from `whole_size`.
     photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras, which are all inputs
-        unless `inputs` or `frames` is given.
-    inputs: number of input photos; None: the recipe's. frames: input photos, by number or file
-        name; None chooses photos that overlap.
+        unless `inputs` or `frames` is given. inputs: number of input photos; None: the recipe's.
+        frames: input photos, by number or file name; None chooses photos that overlap.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
-    size: (H, W) to crop and resize photos to; None: the better of two sizes, without a
-        crop.
-    scene: name of a scene in the folder; None: the only one. overrides: changes of the recipe's
-        `views`. tune: what to fit to the inputs first, such as "queries:50"; None: nothing.
-
+    size: (H, W) to crop and resize photos to. scene: name of a scene in the folder.
+    overrides: changes of the recipe's `views`. tune: what to fit first, such as "queries:50".
     Raises ValueError without a recipe, for several scenes, and for images outside of [0, 1].
     """
     recipe = _recipe(model, overrides, tune)
@@ -75,21 +69,19 @@ def reconstruct(
     window = choose_frames(found, recipe.views, inputs, wanted, against, model.trained_on)
     # Training data keep the recipe's scale; photos of a user may have any unit.
     views = photo_settings(recipe.views, seen is not None, overrides)
-    tuned = None
-    tuning = None
+    free = seen is None and size is None and not isinstance(photos, Views)
     training = model.training
+    tuning = None
     try:
         model.eval()
         scale = find_scale(model, found, *window, views) if views.scale == "search" else None
         if scale:
             views = constant_scale(views, scale.factor)
         sample = make_sample(found, *window, views, mirror=False)
-        chosen = None
-        free = seen is None and size is None and not isinstance(photos, Views)
-        if free and (chosen := find_size(model, found, *window, views)):
-            tuned = chosen.gaussians
-            if chosen.halved:
-                sample = half(sample, model) or sample
+        chosen = find_size(model, found, *window, views) if free else None
+        if chosen and chosen.halved:
+            sample = half(sample, model) or sample
+        tuned = chosen.gaussians if chosen else None
         if tune and recipe.evaluation.tuning_steps:
             tuned, tuning = tuned_on(model, sample.inputs, recipe)
         result = reconstruct_sample(model, sample, seen or (), tuned)

@@ -273,7 +273,7 @@ def at_factor(views: Views, factor: float) -> Views:
 
 
 class FoundSize(NamedTuple):
-    """Which of two image sizes is better.
+    """The better of two image sizes.
 
     halved: whether it is half of the scene's. gaussians: (1, G), what the model makes of the inputs
     at this size. text: sentence that gives both sizes, their PSNR, and the photos that decided.

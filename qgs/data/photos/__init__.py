@@ -97,14 +97,18 @@ def read_listing(
     return found
 
 
-def present_frames(found: Listing, folder: UPath) -> tuple[list[PhotoFrame], list[str]]:
-    """Return the frames of the listing `found` whose images exist, and paths of missing images.
+def present_frames(
+    folder: UPath, format: str = "auto", images: str | None = None, outside: bool = False
+) -> tuple[list[PhotoFrame], list[str]]:
+    """Return the frames of a folder's listing whose images exist, and paths of missing images.
 
     Frames that belong to no split of the listing are left out. Warnings count all that is left out.
 
-    folder: the folder that was read, for messages. Raises FileNotFoundError if fewer than two
-        images exist or a mask is missing, and ValueError for impossible poses and intrinsics.
+    format: name of a format, or "auto". images: folder with scaled copies of the photos to read.
+        outside: allow files outside of `folder`. Raises FileNotFoundError if fewer than two images
+        exist or a mask is missing, and ValueError for impossible poses and intrinsics.
     """
+    found = read_listing(folder, format, images, outside)
     frames = [frame for frame in found.frames if frame.split != "unused"]
     count = len(frames)
     if count < len(found.frames):

@@ -29,7 +29,7 @@ from qgs.data.images import (
     read_image,
     to_tensor,
 )
-from qgs.data.photos import formats_of, present_frames, read_listing, readers
+from qgs.data.photos import formats_of, present_frames, readers
 from qgs.data.photos.reader import PhotoFrame, Size, size_problems
 from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
 from qgs.data.view_samplers import held_out_frames
@@ -85,8 +85,7 @@ class PhotosConfig(SceneSource.Config):
 class PhotoScene(Scene):
     """Scene of listed photos, in the coordinates and the order of the listing.
 
-    cache: decoded images, shared by several scenes. Raises the errors of `read_listing` and of
-        `present_frames`.
+    cache: decoded images, shared by several scenes. Raises the errors of `present_frames`.
     """
 
     def __init__(
@@ -96,8 +95,7 @@ class PhotoScene(Scene):
         self.folder = folder
         self.config = config
         self._cache = cache
-        found = read_listing(folder, config.format, config.images, config.outside)
-        frames, self.missing = present_frames(found, folder)
+        frames, self.missing = present_frames(folder, config.format, config.images, config.outside)
         self.photos = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
@@ -244,7 +242,7 @@ class PhotosSource(LazySource):
     The training split and the test split have the same scenes; test views are held-out frames. But
     if the folder has scenes in the subfolders `train` and `test`, these are the splits. A single
     scene is opened immediately; many scenes are opened when needed. Raises the errors of
-    `PhotoScene`.
+    `present_frames`.
     """
 
     name = "photos"

@@ -8,10 +8,10 @@ from photo_formats import encoded
 from PIL import Image
 from planted import ALL, HASH, INTRINSICS, SIZE, assert_told, record, save
 from qgs_photos.datatools.check import Options, check
-from tables import must_not_find
+from tables import must_refuse
 from upath import UPath
 
-from qgs.data.photos import present_frames, read_listing
+from qgs.data.photos import present_frames
 
 FX, FY, CX, CY = INTRINSICS
 OPENGL = [1, -1, -1, 1]
@@ -152,8 +152,7 @@ def test_photos_have_one_number_in_reading_and_in_checking(planted, caplog):
     del room.files["images/1.jpg"]
     room.poses[3] = np.nan
     planted.check()
-    folder = UPath(planted.root / "room 00")
-    present, _ = present_frames(read_listing(folder), folder)
+    present, _ = present_frames(UPath(planted.root / "room 00"))
     assert "frame 2 (images/3.jpg): the pose has NaN" in caplog.text
     assert len(present) == 4
 
@@ -232,16 +231,18 @@ def test_single_files_are_data_sets_too(good):
 
 def test_nothing_passes_in_silence(good):
     room = UPath(good / "room")
-    must_not_find(
+    must_refuse(
         "holds no data of the format chunks: leave --format out",
         check,
         room,
         Options(format="chunks"),
+        kind=FileNotFoundError,
     )
-    must_not_find(
+    must_refuse(
         "no evaluation index at",
         check,
         room,
         Options(geometry=0),
         [room / "none.json"],
+        kind=FileNotFoundError,
     )
