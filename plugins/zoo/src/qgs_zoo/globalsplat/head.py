@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
+from qgs.containers import concatenated
 from qgs.contracts import (
     GAUSSIAN_FIELDS,
     ComponentConfig,
@@ -135,16 +136,12 @@ class MergingHead(Head):
         """
         gates = geometry[..., -1]
         candidates = torch.cat([self.bounded(geometry[..., :-1]), texture], -1)
-        parts = []
         # Both levels of a blend are decoded from the same candidates.
-        for count, share in stages(self.config.level):
-            x = merged(candidates, gates, count)
-            *place, log_scale, rotation, clear, texture = x.split(
-                (*CHANNELS, texture.shape[-1]), -1
-            )
-            log_scale = log_scale + growth(self.config.candidates, count)
-            parts.append(torch.cat([*place, log_scale, rotation, share * clear, texture], -1))
-        return self._attributes(torch.cat(parts, 2))
+        parts = [
+            self._attributes(merged(candidates, gates, count), share)
+            for count, share in stages(self.config.level)
+        ]
+        return concatenated(parts, 2)
 
     def bounded(self, raw: Tensor) -> Tensor:
         """Return candidates (..., 13): position, bounded log scale, rotation, log(1 - opacity).
@@ -162,17 +159,22 @@ class MergingHead(Head):
         clear = -F.softplus(opacity + config.opacity_bias)
         return torch.cat([place, log_scale, rotation, clear], -1)
 
-    def _attributes(self, x_BNKX: Tensor) -> GaussianAttributes:
-        """Return the attributes of Gaussians from the averaged channels of their candidates."""
+    def _attributes(self, x_BNKX: Tensor, share: float) -> GaussianAttributes:
+        """Return the attributes of Gaussians from the averaged channels of their candidates.
+
+        share: blend weight of the Gaussians' level.
+        """
         offsets, log_scale, rotation, clear, texture = x_BNKX.split(
             (*CHANNELS, 3 * self.coefficients), -1
         )
+        # Larger Gaussians keep the total volume.
+        growth = math.log(self.config.candidates / x_BNKX.shape[2]) / 3
         sh_BNKC3 = texture.unflatten(-1, (self.coefficients, 3))
         return GaussianAttributes(
             offsets=offsets,
-            scales=log_scale.exp(),
+            scales=(log_scale + growth).exp(),
             quats=rotation_6d(rotation),
-            opacities=-torch.expm1(clear[..., 0]),
+            opacities=-torch.expm1(share * clear[..., 0]),
             colors=0.5 + SH_C0 * sh_BNKC3[..., 0, :],
             sh=sh_BNKC3[..., 1:, :] if self.config.sh_degree else None,
         )
@@ -192,14 +194,6 @@ def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
     # Gates compete only within their block, so that blocks stay independent.
     weights = gates.unflatten(-1, (count, -1)).softmax(-1)
     return (weights[..., None] * candidates.unflatten(-2, (count, -1))).sum(-2)
-
-
-def growth(candidates: int, count: int) -> float:
-    """Return the number to add to log scales of merged Gaussians to keep the total volume.
-
-    candidates: number before merging. count: number after merging.
-    """
-    return math.log(candidates / count) / 3
 
 
 def stages(level: float) -> list[tuple[int, float]]:
