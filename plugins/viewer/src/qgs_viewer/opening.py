@@ -25,8 +25,15 @@ from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import checked_window, choose_frames, reconstruct
 from qgs.reconstruction.scale import constant_scale
 from qgs.reconstruction.scene_formats import about_origin, load_ply
-from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene, read_photos
-from qgs.types import Cameras
+from qgs.reconstruction.scenes import (
+    GivenScene,
+    Size,
+    chosen_scene,
+    frame_list,
+    named_scene,
+    read_photos,
+)
+from qgs.types import Cameras, Views
 from qgs.wording import listed, one_line
 from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
@@ -265,38 +272,27 @@ def is_finished(folder: Path) -> bool:
     return (folder / CAMERAS).is_file() and (folder / PLY).is_file()
 
 
-class FinishedScene(Scene):
+class FinishedScene(GivenScene):
     """Photos of a finished reconstruction, with cameras in the world of its Gaussians.
 
-    views: the entries `views` of cameras.json.
+    records: the entries `views` of cameras.json. The photos are the left halves of the pictures in
+    the subfolder views/ of `folder`.
     """
 
-    def __init__(self, name: str, folder: Path, views: Sequence[dict[str, Any]]) -> None:
-        self.name = name
-        self._folder = folder
-        self._views = views
-
-    @property
-    def cameras(self) -> Cameras:
-        """Cameras (V,) of all V views in cameras.json."""
-        c2w = torch.tensor([view["c2w"] for view in self._views], dtype=torch.float64)
-        lenses = torch.tensor([view["intrinsics"] for view in self._views], dtype=torch.float64)
-        height, width = self._views[0]["size"]
-        return Cameras(c2w, lenses, (height, width))
-
-    def images(self, frames: Sequence[int]) -> Tensor:
-        """Load the photos (V, 3, H, W) of V frames.
-
-        They are the left halves of the pictures in the folder views/.
-        """
-        height, width = self.cameras.size
+    def __init__(self, name: str, folder: Path, records: Sequence[dict[str, Any]]) -> None:
+        c2w = torch.tensor([[view["c2w"] for view in records]], dtype=torch.float64)
+        lenses = torch.tensor([[view["intrinsics"] for view in records]], dtype=torch.float64)
+        height, width = records[0]["size"]
         pictures = []
-        for view in (self._views[frame] for frame in frames):
-            name = f"{view['frame']:05d}_{view['kind'].split()[0]}.png"
-            image = read_image(self._folder / "views" / name, decode_rgb)
+        for view in records:
+            file = f"{view['frame']:05d}_{view['kind'].split()[0]}.png"
+            image = read_image(folder / "views" / file, decode_rgb)
             # the render stands to the right of the photo
             pictures.append(np.asarray(image)[:height, :width])
-        return to_tensor(np.stack(pictures))
+        photos = to_tensor(np.stack(pictures))[None]
+        super().__init__(Views(photos, Cameras(c2w, lenses, (height, width))))
+        self.name = name
+        self._records = records
 
     def label(self, frame: int) -> str:
         """Return the file name of a photo; without one, text with its frame number.
@@ -304,7 +300,7 @@ class FinishedScene(Scene):
         frame: index of the view in cameras.json. The frame number in the text is the index of the
         photo in the original scene, which may differ from `frame`.
         """
-        view = self._views[frame]
+        view = self._records[frame]
         return str(view.get("photo") or f"frame {view['frame']}")
 
 
@@ -318,10 +314,9 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
     try:
         record = json.loads(path.read_bytes())
         views = record["views"]
+        # all pictures are read: a missing one fails now, not when a user asks for another input
         scene = FinishedScene(str(record["scene"]), folder, views)
         inputs = tuple(place for place, view in enumerate(views) if view["kind"] == "input")
-        # a missing picture fails now, not when a user asks for another input
-        scene.images(range(len(views)))
         red, green, blue = map(float, record.get("background") or NEUTRAL)
         photos = views_in((torch.eye(4).double(), torch.ones(())), scene, inputs)
     except (ValueError, KeyError, TypeError, IndexError) as error:
