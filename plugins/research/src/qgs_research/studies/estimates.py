@@ -85,11 +85,6 @@ class Estimate:
         }
 
 
-def sign_of(column: Column) -> int:
-    """Return 1 if higher values of a metric are better, otherwise -1."""
-    return 1 if column.better == "higher" else -1
-
-
 def shown(column: Column, value: float | None, sign: str = "") -> str:
     """Format a value with one digit more than `qgs eval` shows; None as a dash.
 

@@ -10,7 +10,7 @@ from scipy.stats import spearmanr
 from qgs.evaluate.results import as_json
 from qgs.files import read_records, write_text
 from qgs.wording import listed
-from qgs_research.studies.estimates import CONFIDENCE, Estimate, interval_shown, shown, sign_of
+from qgs_research.studies.estimates import CONFIDENCE, Estimate, interval_shown, shown
 from qgs_research.studies.hypotheses import MAIN, parsed
 from qgs_research.studies.runs import Plan
 from qgs_research.studies.scores import Scores
@@ -149,7 +149,7 @@ def _verdict(results: Results) -> str:
         return f"Not known yet: {results.reference} and another variant share no finished seed."
     # One training per side cannot distinguish a better model from a better seed.
     tested = [name for name, estimate in found.items() if not estimate.too_small]
-    sign = sign_of(results.column)
+    sign = 1 if results.column.better == "higher" else -1
     worse = all(found[name].clear(-sign) for name in tested)
     tries = 1 if worse else len(tested)
     judged = results.differences(evaluation, 1 - (1 - CONFIDENCE) / tries)
