@@ -73,12 +73,8 @@ def washed(picture: Picture, strength: float = 0.6) -> Picture:
     return np.asarray(Image.blend(grey, Image.new("RGB", grey.size, "white"), strength))
 
 
-def _oversampled(picture: Picture) -> Image.Image:
-    """Return `picture`, OVERSAMPLING times as large; `_reduced` restores the size."""
-    return ImageOps.scale(Image.fromarray(picture), OVERSAMPLING)
-
-
 def _reduced(image: Image.Image) -> Picture:
+    """Return an image that is OVERSAMPLING times too large in its right size."""
     return np.asarray(ImageOps.scale(image, 1 / OVERSAMPLING, Image.Resampling.LANCZOS))
 
 
@@ -96,7 +92,7 @@ def support_picture(
     # near ones cover far ones, and the chosen ones cover all
     farthest_first = depths.argsort(descending=True).tolist()
     # colours of the photo would compete with those of the queries
-    image = _oversampled(washed(photo, 0.45))
+    image = ImageOps.scale(Image.fromarray(washed(photo, 0.45)), OVERSAMPLING)
     draw = ImageDraw.Draw(image, "RGBA")
     for query in [*(q for q in farthest_first if q not in colors), *colors]:
         color = colors.get(query)
@@ -178,14 +174,10 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
     # it is the gradient of a render's sum by the colours
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
-        rgb = model.render(_painted(gaussians, colors), cameras).rgb
+        painted = replace(gaussians, colors=colors, sh=None, features=None)
+        rgb = model.render(painted, cameras).rgb
         (gradient,) = torch.autograd.grad(rgb.sum(), colors)
     return gradient.mean(-1)
-
-
-def _painted(gaussians: Gaussians, colors: Tensor) -> Gaussians:
-    """Return the Gaussians with `colors` as their colours from all directions."""
-    return replace(gaussians, colors=colors, sh=None, features=None)
 
 
 def notable_queries(
@@ -245,13 +237,14 @@ def query_picture(
     paint = torch.tensor([q.color for q in chosen]).view(-1, 3).to(shown.colors) / 255
     colors = paint.repeat_interleave(per_query, 0)[None]
     # a query whose Gaussians are nearly clear is still seen
-    visible = replace(_painted(shown, colors), opacities=shown.opacities.clamp_min(0.5))
+    opacities = shown.opacities.clamp_min(0.5)
+    visible = replace(shown, colors=colors, opacities=opacities, sh=None, features=None)
     # over black, so that its colour and alpha can be mixed with the scene
     painted = model.render(visible, cameras, torch.zeros(3))
     alpha = painted.alpha[0, 0, 0].cpu().numpy()[..., None]
     color = painted.rgb[0, 0].permute(1, 2, 0).cpu().numpy() * 255
     picture = (scene * (1 - alpha) + color).clip(0, 255).round().astype(np.uint8)
-    image = _oversampled(picture)
+    image = ImageOps.scale(Image.fromarray(picture), OVERSAMPLING)
     draw = ImageDraw.Draw(image, "RGBA")
     for query, means in zip(chosen, shown.means[0].split(per_query), strict=False):
         front = to_camera(means[None], cameras)[0, 0, :, 2] > 1e-3
