@@ -8,7 +8,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image, ImageOps
 
-from qgs.drawing.images import Picture, png_bytes
+from qgs.drawing.images import Picture
 
 Color = tuple[int, int, int]
 
@@ -64,11 +64,11 @@ def page_environment() -> Environment:
 
 def data_uri(image: Picture, photo: bool = False) -> str:
     """Return a picture as a data URI for HTML: WebP for a large `photo`, otherwise PNG."""
-    if not (photo and max(image.shape) > EXACT):
-        return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
+    kind = "webp" if photo and max(image.shape) > EXACT else "png"
     buffer = BytesIO()
-    Image.fromarray(image).save(buffer, "WEBP", quality=90, method=2)
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
+    # PNG has no loss, and no use for these options
+    Image.fromarray(image).save(buffer, kind, quality=90, method=2)
+    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
 def enlarged(picture: Picture, side: int) -> Picture:
