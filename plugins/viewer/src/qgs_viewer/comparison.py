@@ -153,7 +153,7 @@ class Model:
         views = self.recipe.views
         if views.scale != "search":
             return views
-        key = (scene.name, tuple(inputs), tuple(compared))
+        key = (scene.name, inputs, compared)
         if key not in self.scales:
             self.scales[key] = find_scale(self.network.eval(), scene, inputs, compared, views)
         return constant_scale(views, self.scales[key].factor)
