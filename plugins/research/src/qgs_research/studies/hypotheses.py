@@ -1,6 +1,7 @@
 """Parser of hypotheses such as `A@noisy - A < B@noisy - B` into coefficients of means."""
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
@@ -37,7 +38,7 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     if len(sides) != 3:
         raise OptionError(f"`{text}` needs exactly one `<` or `>`", _FORM)
     left, comparison, right = sides
-    terms: dict[tuple[str, str], int] = {}
+    sums = Counter[tuple[str, str]]()
     for side, factor in ((left, 1), (right, -1)):
         matches = [*_TERM.finditer(side)]
         # A side has only terms, with a sign before each except the first.
@@ -48,15 +49,14 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
             _check_known("variant", variant, variants, text)
             if evaluation:
                 _check_known("evaluation", evaluation, evaluations, text)
-            term = (variant, evaluation or MAIN)
-            terms[term] = terms.get(term, 0) + (-factor if sign == "-" else factor)
+            sums[variant, evaluation or MAIN] += -factor if sign == "-" else factor
     # A sum that does not cancel would depend on the data set, not on the variants.
-    if sum(terms.values()):
+    if sums.total():
         raise OptionError(
             f"the sides of `{text}` have different sums, counting 1 per variant and -1 after a `-`",
             "write a variant on each side, or a difference, such as `A@noisy - A < B@noisy - B`",
         )
-    terms = {term: coefficient for term, coefficient in terms.items() if coefficient}
+    terms = {term: coefficient for term, coefficient in sums.items() if coefficient}
     if not terms:
         raise OptionError(f"both sides of `{text}` are equal, so nothing is compared", _FORM)
     return Contrast(terms, -1 if comparison == "<" else 1)
