@@ -130,7 +130,7 @@ def anchors(models: Shown, detail: Detail) -> Section:
     """
     rows = {}
     for model in models:
-        if not model.scene.has_anchors:
+        if model.scene.support(0) is None:
             continue
         # of the first input
         camera = model.samples[0].inputs.cameras[:, :1]
@@ -234,11 +234,17 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
     # one scale for truth and models, or pictures could not be compared
     near, far = depth_range(torch.cat(list(depths.values())))
     most = depth_range(torch.cat(list(errors.values())))[1]
-    kinds: dict[str, dict[str, list[Tile]]] = {"Render": colors, "Error": {}, "Depth": {}}
-    for name, maps in errors.items():
-        kinds["Error"][name] = [Tile(shaded(error, 0.0, most, ERROR_MAP)) for error in maps]
-    for name, maps in depths.items():
-        kinds["Depth"][name] = [Tile(depth_picture(depth, near, far)) for depth in maps]
+    kinds = {
+        "Render": colors,
+        "Error": {
+            name: [Tile(shaded(error, 0.0, most, ERROR_MAP)) for error in maps]
+            for name, maps in errors.items()
+        },
+        "Depth": {
+            name: [Tile(depth_picture(depth, near, far)) for depth in maps]
+            for name, maps in depths.items()
+        },
+    }
     shown = zip(ranks, *colors.values(), strict=True)
     inputs = [f"frame {sample.short_label(frame)}" for frame in sample.input_frames]
     return {
