@@ -85,7 +85,7 @@ class Panel:
             hint = "Number of lines to the patches that the query attends to most."
             patches = gui.add_slider("patches", 0, 96, 1, self.choice.patches, hint=hint)
             self._bind("patches", patches)
-            if self.scene.has_anchors:
+            if self.scene.support(0) is not None:
                 self._bind("anchors", gui.add_checkbox("all anchors", True))
             self._text = gui.add_markdown("")
             blank = np.full((8, 8, 3), 255, np.uint8)

@@ -94,11 +94,6 @@ class QueryScene:
         each = self.gaussians.count // self.queries
         return slice(query * each, (query + 1) * each)
 
-    @property
-    def has_anchors(self) -> bool:
-        """True if every query has an anchor, a point in space; False if none has."""
-        return self.support(0) is not None
-
     def support(self, layer: int) -> SpatialSupport | None:
         """Return the support ellipsoids of all N queries in the viewer's world, (1, N), float64.
 
