@@ -111,7 +111,8 @@ def write_files(results: Results) -> Path:
     If the whole study is trained again, only the training times in results.json may differ.
     """
     study = results.plan.study
-    head = "\n\n".join(filter(None, [f"# {study.title}", study.settings.question]))
+    title = study.settings.title or study.file.stem.replace("_", " ")
+    head = "\n\n".join(filter(None, [f"# {title}", study.settings.question]))
     table = results.plan.folder / "table.md"
     write_text(table, f"{head}\n\n{study_summary(results).markdown}")
     write_text(results.plan.folder / "results.json", as_json(record(results)))

@@ -159,11 +159,6 @@ class Study:
     variants: Mapping[str, MapNode]
     evaluations: Mapping[str, MapNode]
 
-    @property
-    def title(self) -> str:
-        """Heading of the study: its title, or the name of its file."""
-        return self.settings.title or self.file.stem.replace("_", " ")
-
 
 def read_study(file: str | Path) -> Study:
     """Read the study in `file`, which is a path or the name of a study that comes with qgs.
