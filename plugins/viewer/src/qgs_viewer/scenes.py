@@ -10,6 +10,7 @@ from qgs.data.samples import Sample
 from qgs.evaluate.plan import EvaluationPlan
 from qgs.geometry.poses import largest_distance
 from qgs.model import QueryGaussianModel
+from qgs.reconstruction.result import sample_cameras
 from qgs.types import Cameras, Gaussians
 from qgs.wording import listed, one_line
 from qgs_viewer.comparison import Model
@@ -135,9 +136,6 @@ def ratio(sample: Sample, own: Sample) -> float:
 
     Both samples show the same views, in worlds of two models.
     """
-    lengths = []
-    for one in (sample, own):
-        c2w = torch.cat([one.inputs.cameras.c2w, one.targets.cameras.c2w], 1)
-        lengths.append(float(largest_distance(c2w)))
+    length, own_length = (float(largest_distance(sample_cameras(one).c2w)) for one in (sample, own))
     # cameras at one point have no distance to compare
-    return lengths[0] / lengths[1] if lengths[1] else 1.0
+    return length / own_length if own_length else 1.0
