@@ -242,12 +242,12 @@ def mirrored_views(views: Views) -> Views:
 
 
 def halved(views: Views) -> Views:
-    """Return views (1, V) with images of half the height and width, without depth maps."""
+    """Return views (1, V) without depth maps, with images of half the height and width."""
     height, width = views.cameras.size
     intrinsics = views.cameras.intrinsics / 2
     cameras = views.cameras.replace(intrinsics=intrinsics, size=(height // 2, width // 2))
-    images, masks = map_tensors(lambda x: F.avg_pool2d(x[0], 2)[None], (views.images, views.masks))
-    return replace(views, images=images, cameras=cameras, masks=masks, depths=None)
+    images, masks = map_tensors(lambda x: F.avg_pool3d(x, (1, 2, 2)), (views.images, views.masks))
+    return replace(views, images=images, cameras=cameras, masks=masks)
 
 
 def collate(samples: Sequence[Sample]) -> Batch:

@@ -197,7 +197,7 @@ class SampleStream(Dataset[Batch | Exception]):
         epoch, place = divmod(number + attempt, len(self._scenes[0]))
         order = self._orders.get(epoch, lambda: self._draw_epoch(epoch))
         size = np.random.default_rng([self.seed, 2, step]).integers(len(self._openers))
-        scene = self._scenes[size][int(order[place])]
+        scene = self._scenes[int(size)][int(order[place])]
         # The first attempt always draws from (seed, 1, number), also if other samples failed.
         key = [self.seed, 1, number]
         rng = np.random.default_rng([*key, attempt] if attempt else key)

@@ -1,7 +1,7 @@
 """Registry of components. A plugin is imported when a recipe or a command needs it."""
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoints
 from pathlib import Path
@@ -94,11 +94,6 @@ class Registry:
 def available_plugins() -> EntryPoints:
     """Return the entry points of all installed plugins, without importing them."""
     return extensions.installed(ENTRY_POINT_GROUP)
-
-
-def load_registry(names: Iterable[str]) -> Registry:
-    """Load the built-in components and the plugins `names`; raise PluginError if one fails."""
-    return Registry({"qgs": BUILTIN, **{name: load_plugin(name) for name in names}})
 
 
 def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin]) -> Registry:

@@ -47,7 +47,7 @@ REACH = 6.0
 """Largest depth that the search tries for the point that cameras look at, in multiples of the
 smallest depth of this point in training."""
 SIDE = 128
-"""Length of the shorter side in pixels above which the search halves photos, to save time."""
+"""Length of the shorter side in pixels up to which photos are never halved."""
 PENALTY = 5.0
 """Penalty in dB on the score of a factor that makes depths smaller than in training. It is PENALTY
 times ln(limit / factor), with the limit from `search_range`. It applies only if the
@@ -117,10 +117,10 @@ def find_scale(
 ) -> FoundScale:
     """Search for the factor at which `model` renders photos of `scene` best.
 
-    The inputs and `further_photos` are scored, at half their size if they are larger than SIDE. The
-    coarse search tries factors with ratio STEP over `search_range`, and goes on past an end of the
-    range while the best factor is there. The fine search tries thirds of a step around the best
-    factor, then the vertex of a parabola through the three best scores in log scale.
+    The inputs and `further_photos` are scored, at `half` their size to save time. The coarse search
+    tries factors with ratio STEP over `search_range`, and goes on past an end of the range while
+    the best factor is there. The fine search tries thirds of a step around the best factor, then
+    the vertex of a parabola through the three best scores in log scale.
 
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
     given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
@@ -134,8 +134,7 @@ def find_scale(
         given = tuple(frame for frame in given if frame not in further)
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
     frames = given if len(given) > 1 else given + further
-    if min(scene.cameras.size) > SIDE:
-        sample = half(sample, model) or sample
+    sample = half(sample, model) or sample
     low, high, nearest = search_range(model.trained_on or Domain(), scene, frames)
     # Even steps in log scale: what counts is the ratio to the right factor.
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
@@ -291,15 +290,14 @@ def find_size(
     """Decide at which image size `model` is better: that of `scene`, or half its height and width.
 
     The judges are `further_photos`, or the inputs if there are none. Renderings are compared at the
-    smaller size. Of equally good sizes, the larger one is taken. Returns None if the scene has less
-    than SIDE pixels, or if the model cannot take half.
+    smaller size. Of equally good sizes, the larger one is taken. Returns None if `half` does.
     model: in evaluation mode. inputs, compared: frames, see `find_scale`. views: with the scale
         that was found.
     """
     judges = further_photos(scene, inputs, compared) or inputs
     whole = make_sample(scene, inputs, judges, views, mirror=False)
     small = half(whole, model)
-    if small is None or min(scene.cameras.size) < SIDE:
+    if small is None:
         return None
     photos = small.targets.images[0]
     device = next(model.parameters()).device
@@ -317,8 +315,12 @@ def find_size(
 
 
 def half(sample: Sample, model: QueryGaussianModel) -> Sample | None:
-    """Return `sample` with images of half the height and width; None if `model` takes none."""
+    """Return `sample` with images of half the height and width.
+
+    Returns None if their shorter side has at most SIDE pixels, or if `model` takes no such images.
+    """
     multiple = model.encoder.size_multiple(model.encoder.config)
-    if multiple is None or any(side % (2 * multiple) for side in sample.inputs.cameras.size):
+    size = sample.inputs.cameras.size
+    if multiple is None or min(size) <= SIDE or any(side % (2 * multiple) for side in size):
         return None
     return replace(sample, inputs=halved(sample.inputs), targets=halved(sample.targets))

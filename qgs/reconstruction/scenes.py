@@ -18,7 +18,7 @@ from qgs.recipe.registry import load_usable_plugins
 from qgs.types import Cameras, Size, Views
 from qgs.wording import listed, warn_once
 
-LEAST = 64
+LEAST = 128
 """Shorter side of training images in pixels from which on photos are read at twice this size."""
 LARGEST = 256
 """Shorter side in pixels up to which photos are read at twice the size of training."""

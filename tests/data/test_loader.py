@@ -126,12 +126,6 @@ def test_samples_of_a_step_have_one_image_size_and_one_number_of_inputs():
         batch.inputs.cameras.size == shape[3:] for batch, shape in zip(seen, shapes, strict=True)
     )
     assert_same(seen[5:], found(5, workers=1))
-    must_refuse(
-        "patches of 8 pixels do not divide images of 16 x 20",
-        tiny,
-        "tokengs",
-        "training.image_sizes=[[16,20]]",
-    )
 
 
 class Grouped(Lines):

@@ -46,7 +46,7 @@ class Painter(torch.nn.Linear):
     [({8: 0.1, 16: 0.2}, 8), ({8: 0.2, 16: 0.1}, 16), ({8: 0.1, 16: 0.1}, 16)],
 )
 def test_the_better_size_is_taken_and_the_larger_of_equal_ones(errors, best, monkeypatch):
-    monkeypatch.setattr("qgs.reconstruction.scale.SIDE", 16)
+    monkeypatch.setattr("qgs.reconstruction.scale.SIDE", 8)
     found = find_size(Painter(errors), Grey(), (1, 4), (2,), ViewsConfig())
     assert found.halved == (best == 8)
     assert found.gaussians == (best, best)
@@ -59,8 +59,8 @@ def test_the_better_size_is_taken_and_the_larger_of_equal_ones(errors, best, mon
     ("trained", "stored", "expected"),
     [
         (16, (30, 40), (16, 24)),
-        (64, (118, 180), (112, 176)),
-        (64, (300, 400), (128, 176)),
+        (64, (118, 180), (64, 96)),
+        (128, (200, 300), (192, 304)),
         (128, (300, 400), (256, 336)),
         (256, (300, 400), (256, 336)),
     ],
@@ -72,4 +72,4 @@ def test_photos_are_never_enlarged_nor_larger_than_256(tmp_path, trained, stored
     scene, _ = chosen_scene(recipe, str(tmp_path), None, None)
     assert scene.cameras.size == expected
     half = [side // 2 for side in expected]
-    assert trained < 64 or not any(side % 8 for side in half)
+    assert trained < 128 or not any(side % 8 for side in half)

@@ -10,7 +10,7 @@ from qgs_dev.checks.fields import run_training_step
 from refusals import problems_of
 
 from qgs.recipe import resolve
-from qgs.recipe.registry import load_registry
+from qgs.recipe.registry import load_plugin
 
 RECIPE = yaml.safe_load("""
 recipe: 1
@@ -34,7 +34,8 @@ PRIME = 11
 def choices(path):
     """Every component of a slot, with its default options and with its plugin's examples."""
     found = []
-    for name, installed in load_registry(RECIPE["plugins"]).plugins.items():
+    for name in ("qgs", *RECIPE["plugins"]):
+        installed = load_plugin(name)
         cases = [case for case in cases_of(installed) if case.slot == path.split(".")[-1]]
         found += [(f"{name}/{case.component.name}", case) for case in cases]
     return found

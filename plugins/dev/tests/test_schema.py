@@ -10,7 +10,7 @@ from commands import done
 from qgs_dev.schema import recipe_schema
 from tables import read_json, rows
 
-from qgs.recipe.registry import load_registry
+from qgs.recipe.registry import Registry, load_plugin
 
 COMMITTED = Path(__file__).parents[3] / "recipes/recipe.schema.json"
 SHIPPED = "c3g datasets dinov2 ellipsoid globalsplat gslrm landmark locus lpips mvsplat rooms"
@@ -48,7 +48,7 @@ model: {queries: {count: {schedule: constant, value: 1}}}
 
 @pytest.fixture(scope="module")
 def schema():
-    return recipe_schema(load_registry(SHIPPED.split()))
+    return recipe_schema(Registry({name: load_plugin(name) for name in ["qgs", *SHIPPED.split()]}))
 
 
 def test_the_committed_schema_is_fresh_and_a_schema(schema):

@@ -24,12 +24,16 @@ def list_components(
 
     All installed plugins are imported; for a NAME such as rooms/locus-64, only the plugin `rooms`.
     """
-    from qgs.recipe.registry import load_registry, load_usable_plugins
+    from qgs.recipe.registry import Registry, load_plugin, load_usable_plugins
     from qgs_dev.tables import details, overview
 
     plugin, slash, _ = (name or "").partition("/")
     # A name such as rooms/locus-64 needs one plugin only; importing all takes seconds.
-    registry, broken = (load_registry([plugin]), []) if slash else load_usable_plugins()
+    if slash:
+        registry = Registry({name: load_plugin(name) for name in ("qgs", plugin)})
+        broken = list[str]()
+    else:
+        registry, broken = load_usable_plugins()
     for part in details(name, registry) if name else overview(registry):
         Console().print(part, highlight=False)
     for message in broken:

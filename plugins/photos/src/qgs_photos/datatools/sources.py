@@ -10,7 +10,7 @@ from upath import UPath
 from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
-from qgs.recipe.registry import Registry, load_registry, load_usable_plugins
+from qgs.recipe.registry import Registry, load_plugin, load_usable_plugins
 from qgs_photos.datatools.entries import bytes_of, encoded
 from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
@@ -33,7 +33,8 @@ def _imported(format: str) -> tuple[Registry, list[str]]:
     if format == "auto":
         return load_usable_plugins()
     plugin, slash, _ = format.partition("/")
-    return load_registry([*OF_FILES, *([plugin] if slash else [])]), []
+    names = [*OF_FILES, *([plugin] if slash else [])]
+    return Registry({name: load_plugin(name) for name in names}), []
 
 
 def sources(format: str = "auto") -> dict[str, type[Component]]:
