@@ -88,7 +88,8 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
         return None
     configs, schedules = found
     config, *later = configs
-    return Chosen(*vars(place).values(), name, component, config, later, schedules, installed)
+    at = (place.path, place.source, node, place.origin)
+    return Chosen(*at, name, component, config, later, schedules, installed)
 
 
 def report_failure(
