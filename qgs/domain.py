@@ -64,7 +64,7 @@ class Domain:
         halves = inputs.size[1] / 2 / inputs.intrinsics[0, :, 0].double()
         # Axes that meet behind the cameras diverge in front of them: no depth, as parallel ones.
         measured["depth"] = [depth if depth > 0 else math.inf]
-        measured["side"] = [float(min(inputs.size))]
+        measured["side"] = [min(inputs.size)]
         measured["fov"] = (2 * halves.arctan().rad2deg()).tolist()
         for name, values in measured.items():
             # Four digits are enough for a comparison that allows 25 %.

@@ -251,16 +251,16 @@ def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:
     # More pixels would take time and change little.
     step = max(min(cameras.size) // _SWEPT, 1)
     photo, *images = F.avg_pool2d(scene.images([frame, *others]), step)
-    size = photo.shape[-2:]
+    height, width = photo.shape[-2:]
     cameras = cameras.replace(intrinsics=cameras.intrinsics / step)
     pose = cameras.c2w[frame]
-    rays_HW3 = pixel_directions(cameras.intrinsics[frame], size) @ pose[:3, :3].T
+    rays_HW3 = pixel_directions(cameras.intrinsics[frame], (height, width)) @ pose[:3, :3].T
     points_DHW3 = pose[:3, 3] + rays_HW3 * planes[:, None, None, None]
     costs = []
     for other, image in zip(others, images, strict=True):
         seen = to_camera(points_DHW3.reshape(1, -1, 3), cameras[None, [other]])[0, 0]
         seen[seen[:, 2] <= 1e-6 * extent] = torch.nan
-        grid = to_pixels(seen, cameras.intrinsics[other]) / seen.new_tensor(size[::-1]) * 2 - 1
+        grid = to_pixels(seen, cameras.intrinsics[other]) / seen.new_tensor([width, height]) * 2 - 1
         grid = grid.nan_to_num(9.0).float().reshape(*points_DHW3.shape[:3], 2)
         shown = F.grid_sample(image.expand(len(planes), -1, -1, -1), grid, align_corners=False)
         cost = (shown - photo).abs().mean(1, keepdim=True).clamp(max=_MOST_COST)

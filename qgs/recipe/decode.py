@@ -1,5 +1,7 @@
 """Decoding of a component's entry in a recipe: its class, and its options as a Config."""
 
+from __future__ import annotations
+
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,7 +48,7 @@ class Chosen(Place):
         written = {name: s.model_dump(mode="json") for name, s in self.schedules.items()}
         return self.config.model_dump(mode="json") | written
 
-    def equals(self, other: "Chosen") -> bool:
+    def equals(self, other: Chosen) -> bool:
         """Return whether `other` is the same component with the same options."""
         return self.component is other.component and self.options == other.options
 

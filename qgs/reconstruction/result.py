@@ -95,7 +95,8 @@ class Reconstruction:
         lines = [f"Reconstruction of {self.sample.scene}: {self.gaussians.count:,} Gaussians"]
         for score in self.scores:
             lines.append(f"{score.kind} {self.sample.short_label(score.frame)} {score.psnr:.2f} dB")
-        lines += [found.text for found in (self.scale, self.size) if found]
+        if self.scale:
+            lines.append(self.scale.text)
         return "\n  ".join([*lines, *self.remarks])
 
     def _repr_png_(self) -> bytes:

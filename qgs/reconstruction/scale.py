@@ -160,7 +160,7 @@ def find_scale(
         factor=trial.factor(best),
         psnr=trial.tried[best],
         further=further,
-        names=[scene.frame_name(frame) for frame in further],
+        names=[*map(scene.frame_name, further)],
         tried=sorted((trial.factor(place), found) for place, found in trial.tried.items()),
     )
 

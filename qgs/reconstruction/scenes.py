@@ -19,9 +19,9 @@ from qgs.types import Cameras, Size, Views
 from qgs.wording import listed, warn_once
 
 LEAST = 128
-"""Shorter side of training images in pixels from which on photos are read at twice this size."""
+"""Shorter side of training images in pixels from which on photos are read at up to LARGEST."""
 LARGEST = 256
-"""Shorter side in pixels up to which photos are read at twice the size of training."""
+"""Shorter side of photos in pixels, at most, that no --size asks for."""
 HOLDOUT = 8
 """Every HOLDOUT-th photo of a user's scene is held out to score the result (Mip-NeRF 360)."""
 FrameNames: TypeAlias = str | Sequence[int | str]
@@ -105,8 +105,8 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
     """Return the image size (H, W) at which photos of a user are resized without cropping.
 
     The shorter side is about that of the training images. For models of LEAST pixels and more it is
-    up to twice as long, but at most LARGEST, and at most that of the first photo; `find_size` then
-    decides between this size and its half. The aspect ratio is about that of the first photo.
+    LARGEST, but at most that of the first photo; `find_size` then decides between this size and its
+    half. The aspect ratio is about that of the first photo.
     multiple: number that must divide both sides of an image.
     scene: must be opened at the size of the training images. This size is returned if `multiple` is
         None, or if `scene` generates its images.
@@ -118,7 +118,7 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
     # As many pixels as in training gave up to .3 dB less on novel views than its shorter side.
     shorter = min(trained)
     if shorter >= LEAST:
-        shorter = max(shorter, min(2 * shorter, LARGEST, min(stored)))
+        shorter = max(shorter, min(LARGEST, *stored))
         # Half the size must fit too.
         multiple *= 2
     steps = shorter / min(stored) / multiple

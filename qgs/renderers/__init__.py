@@ -17,7 +17,7 @@ class AutoRenderer(Renderer):
     name = "auto"
     camera_gradients = GsplatRenderer.camera_gradients
     # Refused on the CPU too, so that results do not depend on the device.
-    problems = GsplatRenderer.problems
+    problems = GsplatRenderer.problems  # type: ignore[assignment]
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None

@@ -9,9 +9,10 @@ from qgs_zoo.dinov2.vit import PATCH
 from qgs_zoo.mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
 from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
 from qgs_zoo.mvsplat.head import WorldHead
-from qgs_zoo.mvsplat.mvsplat import Sweep, expected_disparity
+from qgs_zoo.mvsplat.mvsplat import expected_disparity
 from qgs_zoo.mvsplat.pixels import OnRays
 from qgs_zoo.mvsplat.sweep import (
+    Sweep,
     inverse_depth_candidates,
     relative_poses,
 )

@@ -1,9 +1,10 @@
 """Tensors of a golden file of MVSplat, computed by the components of qgs."""
 
 from qgs_zoo.mvsplat.head import RayHead
-from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, Sweep
+from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder
 from qgs_zoo.mvsplat.pixels import OnRays
 from qgs_zoo.mvsplat.sweep import (
+    Sweep,
     cyclic_neighbours,
     inverse_depth_candidates,
     relative_poses,
