@@ -29,7 +29,6 @@ WORDS = {
     "turn": "their axes differ by {} degrees",
     "depth": "the point they look at is {} away",
     "fov": "their field of view is {} degrees wide",
-    "side": "the shorter side of the photos has {} pixels",
 }
 """Phrases for messages, by name of a measurement of a sample's cameras; lengths in model units."""
 REMEDY = "try another scale of the world, other input views, or train on views like these"
@@ -64,7 +63,6 @@ class Domain:
         halves = inputs.size[1] / 2 / inputs.intrinsics[0, :, 0].double()
         # Axes that meet behind the cameras diverge in front of them: no depth, as parallel ones.
         measured["depth"] = [depth if depth > 0 else math.inf]
-        measured["side"] = [min(inputs.size)]
         measured["fov"] = (2 * halves.arctan().rad2deg()).tolist()
         for name, values in measured.items():
             # Four digits are enough for a comparison that allows 25 %.

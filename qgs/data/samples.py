@@ -246,7 +246,7 @@ def halved(views: Views) -> Views:
     height, width = views.cameras.size
     intrinsics = views.cameras.intrinsics / 2
     cameras = views.cameras.replace(intrinsics=intrinsics, size=(height // 2, width // 2))
-    images, masks = map_tensors(lambda x: F.avg_pool3d(x, (1, 2, 2)), (views.images, views.masks))
+    images, masks = map_tensors(lambda x: F.avg_pool2d(x[0], 2)[None], (views.images, views.masks))
     return replace(views, images=images, cameras=cameras, masks=masks)
 
 

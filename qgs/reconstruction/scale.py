@@ -290,14 +290,16 @@ def find_size(
     """Decide at which image size `model` is better: that of `scene`, or half its height and width.
 
     The judges are `further_photos`, or the inputs if there are none. Renderings are compared at the
-    smaller size. Of equally good sizes, the larger one is taken. Returns None if `half` does.
+    smaller size. Of equally good sizes, the larger one is taken. Returns None if `half` does, and
+    for scenes with times.
     model: in evaluation mode. inputs, compared: frames, see `find_scale`. views: with the scale
         that was found.
     """
     judges = further_photos(scene, inputs, compared) or inputs
     whole = make_sample(scene, inputs, judges, views, mirror=False)
     small = half(whole, model)
-    if small is None:
+    # Inputs of other times than the compared photos are no judges.
+    if small is None or scene.times is not None:
         return None
     photos = small.targets.images[0]
     device = next(model.parameters()).device

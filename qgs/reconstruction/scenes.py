@@ -105,7 +105,7 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
     """Return the image size (H, W) at which photos of a user are resized without cropping.
 
     The shorter side is about that of the training images. For models of LEAST pixels and more it is
-    LARGEST, but at most that of the first photo; `find_size` then decides between this size and its
+    LARGEST if the first photo is that large; `find_size` then decides between this size and its
     half. The aspect ratio is about that of the first photo.
     multiple: number that must divide both sides of an image.
     scene: must be opened at the size of the training images. This size is returned if `multiple` is
@@ -117,8 +117,8 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
         return trained
     # As many pixels as in training gave up to .3 dB less on novel views than its shorter side.
     shorter = min(trained)
-    if shorter >= LEAST:
-        shorter = max(shorter, min(LARGEST, *stored))
+    if shorter >= LEAST and min(stored) >= LARGEST:
+        shorter = max(shorter, LARGEST)
         # Half the size must fit too.
         multiple *= 2
     steps = shorter / min(stored) / multiple

@@ -49,7 +49,6 @@ def test_what_is_measured():
     assert found["turn"] == pytest.approx([2 * math.degrees(math.atan(0.25))] * 2, rel=1e-3)
     assert found["depth"] == pytest.approx([math.sqrt(4.25)] * 2, rel=1e-3)
     assert found["fov"] == pytest.approx((90, 90))
-    assert found["side"] == (32, 32)
 
 
 def test_axes_that_do_not_meet_before_the_cameras_look_infinitely_far():

@@ -9,8 +9,9 @@ from photo_formats import centred, synthetic, write_nerfstudio
 from walk import Walk, arc, pinhole
 
 from qgs.contracts import ViewsConfig
+from qgs.data.samples import make_sample
 from qgs.recipe import resolve
-from qgs.reconstruction.scale import find_size
+from qgs.reconstruction.scale import find_size, half
 from qgs.reconstruction.scenes import chosen_scene
 
 
@@ -55,12 +56,23 @@ def test_the_better_size_is_taken_and_the_larger_of_equal_ones(errors, best, mon
     assert "photos/01.png, photos/04.png" in inputs
 
 
+def test_a_sample_without_targets_is_halved_and_a_moving_scene_is_not(monkeypatch):
+    monkeypatch.setattr("qgs.reconstruction.scale.SIDE", 8)
+    model = Painter({8: 0.1, 16: 0.2})
+    small = half(make_sample(Grey(), (1, 4), (), ViewsConfig(), mirror=False), model)
+    assert small.inputs.images.shape == (1, 2, 3, 8, 8)
+    assert small.targets.images.shape == (1, 0, 3, 8, 8)
+    moving = Grey()
+    moving.times = torch.arange(len(moving)).double()
+    assert find_size(model, moving, (1, 4), (2,), ViewsConfig()) is None
+
+
 @pytest.mark.parametrize(
     ("trained", "stored", "expected"),
     [
         (16, (30, 40), (16, 24)),
         (64, (118, 180), (64, 96)),
-        (128, (200, 300), (192, 304)),
+        (128, (200, 300), (128, 192)),
         (128, (300, 400), (256, 336)),
         (256, (300, 400), (256, 336)),
     ],

@@ -213,13 +213,15 @@ def view(
 
 
 def _write_page(source: Source, query: int | None, file: Path, console: Console) -> None:
-    from qgs.files import write_text
+    from qgs.files import refuse_existing, write_text
     from qgs_viewer.drawing import Choice
     from qgs_viewer.page import scene_html
 
     scene = source.scene_of(source.frames)
     scene.refuse_missing(query)
     page = scene_html(scene, Choice(query=query, layer=scene.depth))
+    # it may have come into being since the command began
+    refuse_existing(file)
     write_text(file, page)
     console.print(f"wrote {file}", soft_wrap=True)
     if scene.queries:

@@ -237,10 +237,12 @@ def open_models(
     count = ALONE if len(models) == 1 else WINDOWS
     windows = PhotoWindows(first.network.trained_on or Domain(), count)
     if size is None and (tried := _tried(first, photos, overrides)):
-        first.size = tried.size
-        if tried.size and tried.size.halved:
-            height, width = first.recipe.tree["data"]["image_size"]
-            recipes = recipes_alike(files, photos, (height // 2, width // 2), overrides)
+        found = tried.sample.inputs.cameras.size
+        height, width = first.recipe.tree["data"]["image_size"]
+        # sizes that all models take may differ from those of the first model alone
+        if tried.size and found in ((height, width), (height // 2, width // 2)):
+            first.size = tried.size
+            recipes = recipes_alike(files, photos, found, overrides)
         if tried.scale:
             sample = tried.sample
             first.scales[sample.scene, sample.input_frames, sample.target_frames] = tried.scale
@@ -255,7 +257,7 @@ def _tried(model: Model, photos: str, overrides: Sequence[str]) -> Reconstructio
     data = model.recipe.build_data()
     scene = (data.names("test") or data.names("train"))[0]
     # the evaluation names scenes that fail
-    with suppress(ValueError):
+    with suppress(Exception):
         return reconstruct(model.network, photos, scene=scene, overrides=overrides)
 
 

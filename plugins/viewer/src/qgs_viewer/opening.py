@@ -136,7 +136,7 @@ def photo_model(size: Size | None = None) -> str:
 def holds_photos(path: Path) -> bool:
     """Return True if `path` is a folder without checkpoint, or a video."""
     if path.is_dir():
-        return not (path / CHECKPOINT).is_file()
+        return not any((path / name).is_file() for name in (CHECKPOINT, "recipe.yaml"))
     return path.is_file() and path.suffix.lower() in _VIDEOS
 
 
@@ -261,7 +261,7 @@ def open_made(folder: Path) -> Source:
         size = parse_size(words[words.index("--size") + 1])
         # qgs scene PHOTOS
         views = read_photos(words[2], size=size, frames=evenly(record["refined_on"], PHOTOS))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, LookupError) as error:
         notes.append(f"The photos of the scene are not shown: {one_line(error)}")
     shown = QueryScene(gaussians, views, background=(0.0, 0.0, 0.0))
     return FixedSource(folder.name, notes, shown)

@@ -109,7 +109,7 @@ def verdict(views: Sequence[ScoredView]) -> str:
     coverage, quality, copied = means(views)
     if not coverage:
         return "The inputs see nothing of the scored views. Do not trust any part."
-    word = next(word for word, least in QUALITY.items() if quality >= least)
+    word = next((word for word, least in QUALITY.items() if quality >= least), "Wrong")
     if quality <= copied:
         word = "Wrong"
     place = f"where the inputs look, at {100 * coverage:.0f} % of the scored views"
