@@ -25,13 +25,12 @@ from qgs.evaluate.results import Evaluation
 from qgs.model import QueryGaussianModel
 from qgs.model_text import heading
 from qgs.recipe import Recipe, resolve
-from qgs.reconstruction.reconstruct import reconstruct
-from qgs.reconstruction.result import Reconstruction
 from qgs.reconstruction.scale import (
     FoundScale,
     FoundSize,
     constant_scale,
     find_scale,
+    find_size,
     photo_settings,
 )
 from qgs.reconstruction.scenes import (
@@ -227,38 +226,39 @@ def open_models(
     files = checkpoints(names)
     recipes = recipes_alike(files, photos, size, overrides)
     models = list[Model]()
+    fixed = size is not None
     for name, path in files.items():
         with CheckpointFile(path) as file:
             models.append(Model(name, path, file.model(device), recipes[name], file.step))
+            own = photos is not None and is_training_data(photos, file.recipe.data_config)
+            fixed = fixed or own or size_multiple(file.recipe) is None
     if photos is None:
         return models
     first = models[0]
     # those of the first model for all, so that one protocol judges them
     count = ALONE if len(models) == 1 else WINDOWS
     windows = PhotoWindows(first.network.trained_on or Domain(), count)
-    if size is None and (tried := _tried(first, photos, overrides)):
-        found = tried.sample.inputs.cameras.size
+    if not fixed:
+        first.size = _found_size(first, windows)
+    if first.size and first.size.halved:
         height, width = first.recipe.tree["data"]["image_size"]
-        # sizes that all models take may differ from those of the first model alone
-        if tried.size and found in ((height, width), (height // 2, width // 2)):
-            first.size = tried.size
-            recipes = recipes_alike(files, photos, found, overrides)
-        if tried.scale:
-            sample = tried.sample
-            first.scales[sample.scene, sample.input_frames, sample.target_frames] = tried.scale
+        recipes = recipes_alike(files, photos, (height // 2, width // 2), overrides)
     for model in models:
         model.windows = windows
         model.recipe = recipes[model.name]
     return models
 
 
-def _tried(model: Model, photos: str, overrides: Sequence[str]) -> Reconstruction | None:
-    """Reconstruct the first scene of `photos` by `model`; None if this fails."""
+def _found_size(model: Model, windows: PhotoWindows) -> FoundSize | None:
+    """Return the better size of photos for `model` in a window; None without a choice."""
     data = model.recipe.build_data()
-    scene = (data.names("test") or data.names("train"))[0]
     # the evaluation names scenes that fail
     with suppress(Exception):
-        return reconstruct(model.network, photos, scene=scene, overrides=overrides)
+        scene = data.scenes("test" if data.names("test") else "train")[0]
+        for window in windows.windows(scene, model.recipe.views)[:1]:
+            views = model.views_of(scene, *window)
+            return find_size(model.network.eval(), scene, *window, views)
+    return None
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
