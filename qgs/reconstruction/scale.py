@@ -24,6 +24,7 @@ from qgs.geometry.poses import look_at_depth, scaled
 from qgs.metrics.baselines import pose_distance
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
+from qgs.reconstruction.scenes import LEAST
 from qgs.types import Gaussians, Views
 from qgs.wording import listed
 
@@ -46,8 +47,6 @@ smallest depth of its training."""
 REACH = 6.0
 """Largest depth that the search tries for the point that cameras look at, in multiples of the
 smallest depth of this point in training."""
-SIDE = 128
-"""Length of the shorter side in pixels up to which photos are never halved."""
 PENALTY = 5.0
 """Penalty in dB on the score of a factor that makes depths smaller than in training. It is PENALTY
 times ln(limit / factor), with the limit from `search_range`. It applies only if the
@@ -319,10 +318,10 @@ def find_size(
 def half(sample: Sample, model: QueryGaussianModel) -> Sample | None:
     """Return `sample` with images of half the height and width.
 
-    Returns None if their shorter side has at most SIDE pixels, or if `model` takes no such images.
+    Returns None if their shorter side has at most LEAST pixels, or if `model` takes no such images.
     """
     multiple = model.encoder.size_multiple(model.encoder.config)
     size = sample.inputs.cameras.size
-    if multiple is None or min(size) <= SIDE or any(side % (2 * multiple) for side in size):
+    if multiple is None or min(size) <= LEAST or any(side % (2 * multiple) for side in size):
         return None
     return replace(sample, inputs=halved(sample.inputs), targets=halved(sample.targets))

@@ -19,7 +19,8 @@ from qgs.types import Cameras, Size, Views
 from qgs.wording import listed, warn_once
 
 LEAST = 128
-"""Shorter side of training images in pixels from which on photos are read at up to LARGEST."""
+"""Shorter side in pixels: models trained on at least so many read photos of up to LARGEST pixels,
+and photos of no more are never halved."""
 LARGEST = 256
 """Shorter side of photos in pixels, at most, that no --size asks for."""
 HOLDOUT = 8

@@ -47,7 +47,7 @@ class Painter(torch.nn.Linear):
     [({8: 0.1, 16: 0.2}, 8), ({8: 0.2, 16: 0.1}, 16), ({8: 0.1, 16: 0.1}, 16)],
 )
 def test_the_better_size_is_taken_and_the_larger_of_equal_ones(errors, best, monkeypatch):
-    monkeypatch.setattr("qgs.reconstruction.scale.SIDE", 8)
+    monkeypatch.setattr("qgs.reconstruction.scale.LEAST", 8)
     found = find_size(Painter(errors), Grey(), (1, 4), (2,), ViewsConfig())
     assert found.halved == (best == 8)
     assert found.gaussians == (best, best)
@@ -57,7 +57,7 @@ def test_the_better_size_is_taken_and_the_larger_of_equal_ones(errors, best, mon
 
 
 def test_a_sample_without_targets_is_halved_and_a_moving_scene_is_not(monkeypatch):
-    monkeypatch.setattr("qgs.reconstruction.scale.SIDE", 8)
+    monkeypatch.setattr("qgs.reconstruction.scale.LEAST", 8)
     model = Painter({8: 0.1, 16: 0.2})
     small = half(make_sample(Grey(), (1, 4), (), ViewsConfig(), mirror=False), model)
     assert small.inputs.images.shape == (1, 2, 3, 8, 8)
