@@ -275,32 +275,18 @@ def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
 
 
 @kernel
-def _sum_parts(given, g, slopes):
-    """Write the gradients of splat `g`, summed over P stripes of an image, to `slopes` (10,).
-
-    given: gradients (P, G, 10) of G splats in each stripe.
-    """
-    slopes[:] = given[0, g]
-    for part in range(1, given.shape[0]):
-        for i in range(slopes.shape[0]):
-            slopes[i] += given[part, g, i]
-
-
-@kernel
 def project_backward_unit(
     means, scales, quats, c2w, lenses, bounds, limits, splats, given, wants_cameras,
     of_means, of_scales, of_quats, of_opacities, of_cameras,
 ):  # fmt: skip
     """Compute gradients of the inputs of `project_unit` from the gradients of its splats.
 
-    given: gradients (V, P, G, 10) of the rasteriser: views, stripes of an image, Gaussians. They
-        are first summed over stripes. Writes the gradients of_means (G, 3), of_scales (G, 3),
-        of_quats (G, 4) and of_opacities (G,). If `wants_cameras` is true, it adds the gradients of
-        cameras to of_cameras (V, 16), in the order of `_add_camera`.
+    given: gradients (V, G, 10) of the rasteriser: views, Gaussians. Writes the gradients of_means
+        (G, 3), of_scales (G, 3), of_quats (G, 4) and of_opacities (G,). If `wants_cameras` is true,
+        it adds the gradients of cameras to of_cameras (V, 16), in the order of `_add_camera`.
     """
     _, _, dilation, _, margin, height, width = limits
     zeros = (ZERO, ZERO, ZERO)
-    slopes = np.empty(given.shape[3], np.float32)
     for g in range(bounds[0], bounds[1]):
         rows, quat, norm = _rotation(quats[g])
         scale = _vector(scales[g])
@@ -312,7 +298,7 @@ def project_backward_unit(
             splat = splats[v, g]
             if not splat[6] > ZERO:
                 continue
-            _sum_parts(given[v], g, slopes)
+            slopes = given[v, g]
             of_opacity += slopes[6]
             pose, offset, seen, turned, x_axis, y_axis = _view(
                 c2w[v], lenses[v], means[g], factor, margin, height, width

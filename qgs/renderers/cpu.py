@@ -142,13 +142,14 @@ class _Splat(torch.autograd.Function):
             part, bounds = chunk
             project_backward_unit(
                 means[scene], scales[scene], quats[scene], c2w[scene], lenses[scene], bounds,
-                projection, rows[scene], grads[scene], wants_cameras, of_means[scene],
+                projection, rows[scene], summed[scene], wants_cameras, of_means[scene],
                 of_scales[scene], of_quats[scene], of_opacities[scene], of_cameras[scene, part],
             )  # fmt: skip
 
         in_threads(blend, product(range(batch), range(views), stripes))
+        summed = grads.sum(2)
         in_threads(project, product(range(batch), chunks))
-        of_colors = grads[..., -3:].sum(2)
+        of_colors = summed[..., -3:]
         if colors.shape[1] < views:
             of_colors = of_colors.sum(1, keepdims=True)
         of_inputs = [torch.from_numpy(of_colors), *of_inputs]
