@@ -86,8 +86,8 @@ class _Splat(torch.autograd.Function):
         splats = tensors[0].new_empty((batch, views, opacities.shape[1], kernels.SPLAT_FIELDS))
         sums = splats.new_empty((batch, views, kernels.SUMS, *size))
         rows, out = _arrays(splats, sums)
-        projection, blending = _limits(config, size)
-        chunks, stripes = _parts(rows, size)
+        ctx.plan = _planned(config, size, rows)
+        projection, blending, chunks, stripes = ctx.plan
 
         def project(scene: int, chunk: _Part) -> None:
             own = [array[scene] for array in geometry]
@@ -105,7 +105,6 @@ class _Splat(torch.autograd.Function):
         in_threads(project, product(range(batch), chunks))
         in_threads(blend, product(range(batch), range(views), stripes))
         ctx.save_for_backward(*tensors, splats, sums)
-        ctx.config = config
         return sums
 
     @staticmethod
@@ -116,10 +115,8 @@ class _Splat(torch.autograd.Function):
 
         saved = ctx.saved_tensors
         colors, means, scales, quats, opacities, c2w, lenses, rows, sums = _arrays(*saved)
-        size = sums.shape[-2:]
         batch, views, count, _ = rows.shape
-        projection, blending = _limits(ctx.config, size)
-        chunks, stripes = _parts(rows, size)
+        projection, blending, chunks, stripes = ctx.plan
         # Each stripe sums its own gradients, in an order that does not depend on threads.
         grads = np.zeros((batch, views, len(stripes), count, kernels.GRADIENTS), np.float32)
         given = slopes[0].contiguous().numpy()
@@ -161,25 +158,22 @@ class _Splat(torch.autograd.Function):
         return *of_inputs, F.pad(pose, (0, 0, 0, 1)), lens, None, None
 
 
-def _limits(config: RendererConfig, size: Size) -> list[tuple[Any, ...]]:
-    """Return the options that the kernels of projection and of blending take, as float32."""
-    projection = (config.near, config.far, config.dilation, config.alpha_min, CLAMP_MARGIN, *size)
-    blending = (config.alpha_min, config.alpha_cap, config.transmittance_min)
-    return [tuple(map(np.float32, options)) for options in (projection, blending)]
-
-
 def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
     return tuple(tensor.detach().numpy() for tensor in tensors)
 
 
-def _parts(splats: Any, size: Size) -> tuple[list[_Part], list[_Part]]:
-    """Return the units of parallel work: numbered ranges of Gaussians, and of rows of tiles.
+def _planned(config: RendererConfig, size: Size, splats: Any) -> tuple[Any, ...]:
+    """Return options for the kernels of projection and of blending, and units of parallel work.
 
-    The rows of an image are one range, unless there are few images.
+    The options are float32. The units are numbered ranges of Gaussians, and of rows of tiles. The
+    rows of an image are one range, unless there are few images.
     """
+    projection = (config.near, config.far, config.dilation, config.alpha_min, CLAMP_MARGIN, *size)
+    blending = (config.alpha_min, config.alpha_cap, config.transmittance_min)
+    options = [tuple(map(np.float32, limits)) for limits in (projection, blending)]
     batch, views, count, _ = splats.shape
     chunks = pairwise([*range(0, count, _CHUNK), count])
     rows = -(-size[0] // _TILE)
     stripes = min(rows, -(-_MIN_UNITS // max(batch * views, 1)))
     edges = [rows * part // stripes for part in range(stripes + 1)]
-    return list(enumerate(chunks)), list(enumerate(pairwise(edges)))
+    return *options, list(enumerate(chunks)), list(enumerate(pairwise(edges)))
