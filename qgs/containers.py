@@ -56,16 +56,17 @@ def map_tensors(function: Callable[[Tensor], Any], value: Any) -> Any:
     return getattr(value, "_make", type(value))([item for _, item in mapped])  # _make: namedtuple
 
 
-def concatenated(parts: Sequence[_C], dim: int) -> _C:
+def concatenated(parts: Sequence[_C], dim: int, join: Callable[..., Tensor] = torch.cat) -> _C:
     """Concatenate `parts`, containers or tuples of containers, tensor by tensor along `dim`.
 
-    Raises ValueError if a tensor is in some parts and missing (None) in others.
+    join: function of a list of tensors and `dim` that concatenates these tensors. Raises ValueError
+        if a tensor is in some parts and missing (None) in others.
     """
     found = [dict(named_tensors(part)) for part in parts]
     for other in found:
         if some := sorted(other.keys() ^ found[0].keys()):
             raise ValueError(f"{', '.join(some)} must be in all concatenated parts or in none")
-    joined = [torch.cat([tensors[name] for tensors in found], dim) for name in found[0]]
+    joined = [join([tensors[name] for tensors in found], dim) for name in found[0]]
     # `map_tensors` comes to the tensors in the order of their names.
     tensors = iter(joined)
     return map_tensors(lambda _: next(tensors), parts[0])

@@ -6,10 +6,9 @@ copies images on one thread, because threads of torch would wait for cores that 
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -277,27 +276,11 @@ def stack_views(views: Sequence[Views]) -> Views:
     If only some views have masks or depths, the others get masks of 1 and depths of 0 (unknown).
     Raises ValueError if only some views have times.
     """
-    others: list[dict[str, Any]] = [
-        {"cameras": v.cameras, "times": v.times, "target_time": v.target_time} for v in views
-    ]
-    images = np.concatenate([v.images.numpy() for v in views])
-    masks = _stacked([v.masks for v in views], views, torch.ones_like)
-    depths = _stacked([v.depths for v in views], views, torch.zeros_like)
-    return Views(torch.from_numpy(images), masks=masks, depths=depths, **concatenated(others, 0))
-
-
-def _stacked(
-    maps: Sequence[Tensor | None], views: Sequence[Views], missing: Callable[[Tensor], Tensor]
-) -> Tensor | None:
-    """Join maps (b, V, 1, H, W) along the first axis; return None if all are None.
-
-    missing: function that makes a map in place of None, such as `torch.zeros_like`; its argument is
-        one channel of the images.
-    """
-    if all(part is None for part in maps):
-        return None
-    whole = [
-        (missing(view.images[:, :, :1]) if part is None else part).numpy()
-        for part, view in zip(maps, views, strict=True)
-    ]
-    return torch.from_numpy(np.concatenate(whole))
+    for name, missing in (("masks", torch.ones_like), ("depths", torch.zeros_like)):
+        lacking = [getattr(view, name) is None for view in views]
+        if not all(lacking):
+            views = [
+                view.replace(**{name: missing(view.images[:, :, :1])}) if lacks else view
+                for view, lacks in zip(views, lacking, strict=True)
+            ]
+    return concatenated(views, 0, lambda parts, dim: torch.from_numpy(np.concatenate(parts, dim)))
