@@ -40,8 +40,11 @@ def tuning_loss(recipe: Recipe) -> Photometric:
     losses = recipe.build_losses(pretrained=False).values()
     follow(losses, END)
     for loss in losses:
-        if isinstance(loss, Photometric) and any(loss.weights()):
-            return loss
+        if isinstance(loss, Photometric):
+            options = loss.config
+            terms = options.mse_weight or options.l1_weight or options.ssim_weight
+            if options.weight and terms:
+                return loss
     return Photometric(Photometric.Config())
 
 

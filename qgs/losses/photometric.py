@@ -41,11 +41,6 @@ class Photometric(Loss):
         if config.ssim_weight and config.padding == "valid":
             yield from too_small(context, WINDOW, "padding", "SSIM without padding")
 
-    def weights(self) -> tuple[float, float, float]:
-        """Return the factors of MSE, L1 and SSIM, each multiplied by the option `weight`."""
-        c = self.config
-        return c.weight * c.mse_weight, c.weight * c.l1_weight, c.weight * c.ssim_weight
-
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
