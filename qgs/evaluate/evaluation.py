@@ -198,12 +198,9 @@ class _Scorer:
             found.append(self._values(sample))
             views.append((sample.input_frames, sample.target_frames))
             names |= sample.names
-        means: dict[str, float] = {}
-        for key in found[0]:
-            each = [values[key] for values in found if key in values]
-            # A value that one sample lacks would be a mean over other samples.
-            if len(each) == len(found):
-                means[key] = sum(each) / len(each)
+        # A value that one sample lacks would be a mean over other samples.
+        shared = [key for key in found[0] if all(key in values for values in found)]
+        means = {key: sum(values[key] for values in found) / len(found) for key in shared}
         return SceneScore(scene, views, means, names)
 
     def _values(self, sample: Sample) -> dict[str, float]:

@@ -271,8 +271,7 @@ def differing_options(
     Maps the dotted path of each option to its two values as YAML. None stands for an option that a
     recipe does not have.
     """
-    ours = {key: inline(value) for key, value in flat(a).items()}
-    theirs = {key: inline(value) for key, value in flat(b).items()}
+    ours, theirs = ({key: inline(value) for key, value in flat(x).items()} for x in (a, b))
     pairs = {key: (ours.get(key), theirs.get(key)) for key in ours | theirs}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
