@@ -84,27 +84,19 @@ class QueryGaussianModel(nn.Module):
         """Number of decoder layers that an evaluation runs, including repetitions by feedback."""
         return len(self.decoder) + self.feedback.rounds * self.feedback.layers
 
-    def forward(
-        self,
-        views: Views | Photos,
-        layers: Collection[int] | None = None,
-        state: QueryState | None = None,
-    ) -> Prediction:
+    def forward(self, views: Views | Photos, layers: Collection[int] | None = None) -> Prediction:
         """Reconstruct every scene of `views`, whose cameras are in the model's frame.
 
         layers: numbers of layers after which Gaussians are decoded, in addition to the last layer;
-            `predict` explains numbers and default. state: the initial query state; None computes it
-            by the model's `queries`. Raises ValueError for `Photos` if encoder, queries or feedback
-            read cameras.
+            `predict` explains numbers and default. Raises ValueError for `Photos` if encoder,
+            queries or feedback read cameras.
         """
         # NumPy's cameras are float64, the weights hardly ever.
         views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))
         if isinstance(views, Photos):
             views = self._without_cameras(views)
         memory = self.encoder(views)
-        # Tuning at test time brings its own state.
-        initial = self.queries(memory, views) if state is None else state
-        return self.predict(views, memory, initial, layers)
+        return self.predict(views, memory, self.queries(memory, views), layers)
 
     def _without_cameras(self, photos: Photos) -> Views:
         """Return `photos` typed as Views; raise ValueError if the model needs cameras."""

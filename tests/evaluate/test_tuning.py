@@ -85,10 +85,12 @@ def test_a_forward_pass_starts_from_the_given_state():
     start = model.queries.start(1)
     shifted = start.replace(fields={"anchor.center": start["anchor.center"] + 1})
     with torch.no_grad():
-        plain, given, moved = (
-            model(inputs, state=s).gaussians.means for s in (None, start, shifted)
+        plain = model(inputs).gaussians.means
+        memory = model.encoder(inputs)
+        given, moved = (
+            model.predict(inputs, memory, state).gaussians.means for state in (start, shifted)
         )
     assert_equal(plain, given)
     assert not torch.allclose(plain, moved)
     reason = "the memory has 1 scenes, but the initial state has 2"
-    must_refuse(reason, model, inputs, state=model.queries.start(2))
+    must_refuse(reason, model.predict, inputs, memory, model.queries.start(2))
