@@ -25,7 +25,8 @@ from qgs.checkpoint.tensors import (
     shapes_of,
     write_tensors,
 )
-from qgs.contracts.schedule import END, follow, steps_followed
+from qgs.contracts import Component
+from qgs.contracts.schedule import END, follow
 from qgs.domain import KEY, Domain
 from qgs.files import AnyPath
 from qgs.machine import TooLargeError
@@ -177,8 +178,9 @@ def save(
         )
     # Copied, since safetensors refuses tensors that share memory or are strided.
     tensors = copied(weights or unique_tensors(model))
-    step = steps_followed(model.modules())
-    followed = {} if step in (None, END) else {"step": str(step)}
+    # The step at which scheduled options have their present values, the same in all components.
+    steps = {x.followed for x in model.modules() if isinstance(x, Component) and x.schedules}
+    followed = {"step": str(steps.pop())} if steps - {END} else {}
     write_checkpoint(path, tensors, model.recipe, model.releases, followed | dict(extra or {}))
 
 

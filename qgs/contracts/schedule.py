@@ -54,9 +54,3 @@ def follow(parts: Iterable[object], step: int) -> None:
         if isinstance(part, Component) and part.schedules:
             part.config = at_step(part.config, part.schedules, step)
             part.followed = step
-
-
-def steps_followed(parts: Iterable[object]) -> int | None:
-    """Return the step last passed to `follow` for `parts`; None if no option has a schedule."""
-    found = (x.followed for x in parts if isinstance(x, Component) and x.schedules)
-    return next(found, None)
