@@ -224,18 +224,32 @@ def scene_depth(scene: Scene) -> float:
     """Return the depth of the scene in front of its cameras, positive, in the scene's unit.
 
     The depth is the first of these that exists: depth of the point that all cameras look at
-    (`look_at_depth`), median depth of a plane sweep over some photos, largest distance between
-    cameras, 1. The result is deterministic.
+    (`look_at_depth`), `seen_depth` of some photos, largest distance between cameras, 1. The result
+    is deterministic.
     """
     c2w = scene.cameras.c2w.double()
     extent = float(largest_distance(c2w))
     depth = float(look_at_depth(c2w))
-    if not depth and extent:
+    if not depth:
         chosen = {int((k + 0.5) * len(scene) / _PHOTOS) for k in range(_PHOTOS)}
-        planes = extent * torch.logspace(-6, 2, _PLANES, base=2).double()
-        depths = torch.cat([_depths(scene, frame, planes, extent) for frame in sorted(chosen)])
-        depth = float(depths.median()) if len(depths) else 0.0
+        depth = seen_depth(scene, sorted(chosen))
     return depth or extent or 1.0
+
+
+def seen_depth(scene: Scene, frames: Frames) -> float:
+    """Return the median depth of what `frames` show, in the scene's unit; 0 if it is unknown.
+
+    It comes from depth maps, else from a plane sweep, else it is the depth of the point that the
+    cameras look at.
+    """
+    c2w = scene.cameras.c2w.double()
+    depths = scene.depths(frames)
+    if depths is None:
+        extent = float(largest_distance(c2w))
+        planes = extent * torch.logspace(-6, 2, _PLANES, base=2).double()
+        depths = torch.cat([_depths(scene, frame, planes, extent) for frame in frames])
+    known = depths[depths > 0]
+    return float(known.median() if len(known) else look_at_depth(c2w[list(frames)]))
 
 
 def _depths(scene: Scene, frame: int, planes: Tensor, extent: float) -> Tensor:

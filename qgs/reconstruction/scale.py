@@ -6,6 +6,9 @@ Camera positions of photos may be in any unit, but a model needs the unit of its
 model runs on the inputs at several factors, and the factor with the best PSNR of rendered photos is
 chosen. Inputs alone mislead: if the factor is too small, the model can reproduce the inputs by
 surfaces close to the cameras. So a few photos that are not inputs are scored too.
+
+Most factors need no trial: depth maps or a plane sweep show how far away the things are that the
+inputs show, and in training their depth was about 1.
 """
 
 import math
@@ -18,9 +21,10 @@ import torch
 import torch.nn.functional as F
 
 from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.data.inputs import seen_depth
 from qgs.data.samples import Sample, halved, make_sample
-from qgs.domain import TOLERANCE, Domain
-from qgs.geometry.poses import look_at_depth, scaled
+from qgs.domain import Domain
+from qgs.geometry.poses import scaled
 from qgs.metrics.baselines import pose_distance
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
@@ -41,16 +45,9 @@ BELOW = 2.0
 """Ratio of the smallest baseline in training to the smallest that the search tries."""
 ABOVE = 4.0
 """Ratio of the largest baseline that the search tries to the largest in training."""
-NEAREST = 0.8
-"""Smallest depth of the point that cameras look at. It is used if the model does not record the
-smallest depth of its training."""
-REACH = 6.0
-"""Largest depth that the search tries for the point that cameras look at, in multiples of the
-smallest depth of this point in training."""
-PENALTY = 5.0
-"""Penalty in dB on the score of a factor that makes depths smaller than in training. It is PENALTY
-times ln(limit / factor), with the limit from `search_range`. It applies only if the
-model is given all scored photos."""
+DEPTHS = (0.4, 2.0)
+"""Smallest and largest median depth of what the inputs show at the factors that are tried, if this
+depth is known. On real photos, the best factors gave 0.39 to 2.05."""
 POOR = 14.0
 """PSNR in dB that the best factor must reach. If it does not, no scale fits, and novel views have
 about 12 dB."""
@@ -62,7 +59,7 @@ class FoundScale:
 
     further: scored frames that are not inputs. names: file names of these frames.
     psnr: mean PSNR in dB of inputs and further photos, where further photos have twice the weight.
-    tried: pairs of a tried factor and its mean PSNR.
+    tried: pairs of a tried factor and its mean PSNR. depth: `seen_depth` of the inputs.
     """
 
     factor: float
@@ -70,17 +67,18 @@ class FoundScale:
     further: Frames
     names: Sequence[str]
     tried: Sequence[tuple[float, float]]
+    depth: float
 
     @property
     def poor(self) -> str:
-        """Remark if no factor gave a good result, or if only inputs were scored; else ""."""
+        """Remark if no factor gave a good result, or if inputs alone tell the scale; else ""."""
         # NaN is poor too.
         if not self.psnr >= POOR:
             return (
                 f"no scale fits: the best gives only {self.psnr:.1f} dB; choose inputs that "
                 "overlap more (frames), or set the scale (--scale, views.scale_factor)"
             )
-        if self.further:
+        if self.further or self.depth:
             return ""
         return (
             "the scale was found on input photos only and may be wrong: add photos between them, "
@@ -122,7 +120,7 @@ def find_scale(
     the vertex of a parabola through the three best scores in log scale.
 
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
-    given to the model. With one or two inputs, scores of small factors are lowered by PENALTY.
+    given to the model.
     model: must be in evaluation mode; the search runs on its device. compared: frames
         kept for the scores of the result, which the search does not use.
     """
@@ -134,7 +132,8 @@ def find_scale(
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
     frames = given if len(given) > 1 else given + further
     sample = half(sample, model) or sample
-    low, high, nearest = search_range(model.trained_on or Domain(), scene, frames)
+    depth = seen_depth(scene, inputs)
+    low, high = search_range(model.trained_on or Domain(), scene, frames, depth)
     # Even steps in log scale: what counts is the ratio to the right factor.
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))
@@ -147,11 +146,11 @@ def find_scale(
         [1 / len(given) for _ in given] + [2 / len(further) for _ in further],
         low,
         ratio ** (1 / 3),
-        0.0 if further else nearest,
     )
     best = trial.best(range(0, 3 * count, 3))
     if ratio > 1:
-        while (end := trial.past(best)) and len(trial.tried) < MOST:
+        # Inputs alone would lead further and further away from a depth that is known.
+        while (further or not depth) and (end := trial.past(best)) and len(trial.tried) < MOST:
             best = trial.best(end)
         best = trial.best([best + place for place in (-2, -1, 1, 2)])
         best = trial.best([best + trial.vertex(best)])
@@ -161,6 +160,7 @@ def find_scale(
         further=further,
         names=[*map(scene.frame_name, further)],
         tried=sorted((trial.factor(place), found) for place, found in trial.tried.items()),
+        depth=depth,
     )
 
 
@@ -178,30 +178,30 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
     return tuple(sorted(frame for _, frame in sorted(zip(far, left, strict=True))[:FURTHER]))
 
 
-def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
-    """Return the least factor and the largest factor to try, and a limit for PENALTY.
+def search_range(
+    trained: Domain, scene: Scene, frames: Frames, depth: float
+) -> tuple[float, float]:
+    """Return the least factor and the largest factor to try.
 
-    PENALTY may lower the scores of factors below this limit. At the limit, the point that the
-    cameras look at is TOLERANCE times as far as the nearest such point in training. The limit is 0
-    if the depth of the point is unknown.
-    trained: baselines and depths of cameras in the model's training. frames: the inputs.
+    At these factors, the baseline of the inputs and the depth of what they show are about those of
+    training.
+    trained: baselines in the model's training. frames: the inputs. depth: median depth of what they
+        show; 0 if it is unknown.
     """
-    depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
     baseline = float(torch.cdist(centres, centres).max())
-    found: list[float] = []
-    low, high = trained.ranges.get("baseline", BASELINES)
-    if baseline > 0 and high > 0:
-        # A training may have seen baselines near 0, which no search needs to reach.
-        found += [max(low, high / 10) / baseline / BELOW, high / baseline * ABOVE]
-    near = trained.ranges.get("depth", (NEAREST, math.inf))[0]
-    near = near if 0 < near < math.inf else NEAREST
-    nearest = 0.0
-    if depth > 0:
-        found += [near / TOLERANCE / depth, near * REACH / depth]
-        nearest = near * TOLERANCE / depth
     # Cameras on one point leave nothing to search: no factor changes what they see.
-    return min(found, default=1.0), max(found, default=1.0), nearest
+    if not baseline:
+        return 1.0, 1.0
+    least, most = trained.ranges.get("baseline", BASELINES)
+    # A training may have seen baselines near 0, which no search needs to reach.
+    low = max(least, most / 10) / baseline / BELOW
+    high = most / baseline * ABOVE
+    # A training in another unit has depths outside of DEPTHS.
+    if depth and low * depth < DEPTHS[1] and high * depth > DEPTHS[0]:
+        low = max(low, DEPTHS[0] / depth)
+        high = min(high, DEPTHS[1] / depth)
+    return low, high
 
 
 @dataclass
@@ -210,8 +210,7 @@ class _Trial:
 
     A place p is an exponent: it stands for the factor low * step ** p.
     views: (1, V), whose cameras have the factor 1; the first `inputs` of them are given to the
-        model. weights: weights of the views in the mean PSNR. nearest: factor below which PENALTY
-        lowers the score. tried: mean PSNR in dB by place.
+        model. weights: weights of the views in the mean PSNR. tried: mean PSNR in dB by place.
     """
 
     model: QueryGaussianModel
@@ -220,15 +219,13 @@ class _Trial:
     weights: Sequence[float]
     low: float
     step: float
-    nearest: float
     tried: dict[float, float] = field(default_factory=dict)
 
     def factor(self, place: float) -> float:
         return self.low * self.step**place
 
     def score(self, place: float) -> float:
-        below = self.nearest / self.factor(place)
-        found = self.tried[place] - PENALTY * math.log(max(below, 1.0))
+        found = self.tried[place]
         return -math.inf if math.isnan(found) else found
 
     def best(self, places: Iterable[float]) -> float:

@@ -1,6 +1,7 @@
 """The search for the scale of photos: which photos it judges, and which factors it tries."""
 
 import pytest
+import torch
 from commands import done
 from tables import must_refuse
 from walk import Walk
@@ -41,13 +42,31 @@ def test_without_further_photos_an_input_is_judged_or_inputs_alone():
 
 
 def test_the_range_follows_the_unit_and_the_training():
-    trained = Domain({"baseline": [0.1, 0.4], "depth": [0.8, 3.0]}, 4)
-    low, high, nearest = scale.search_range(trained, Walk(), (1, 4))
-    assert low < 0.8 / 3 < high
-    assert nearest == pytest.approx(1.0 / 3, rel=1e-3)  # the cameras of Walk look 3 away
+    baseline = float((Walk.cameras.c2w[1] - Walk.cameras.c2w[4])[:3, 3].norm())
+    trained = Domain({"baseline": [0.1, 0.4]}, 4)
+    wide = (0.1 / 2 / baseline, 0.4 * 4 / baseline)
+    for depth, expected in (
+        (0.0, wide),
+        (3.0, (0.4 / 3, 2 / 3)),
+        (1.0, (0.4, wide[1])),
+        (100.0, wide),  # the training has another unit
+    ):
+        found = scale.search_range(trained, Walk(), (1, 4), depth)
+        assert found == pytest.approx(expected, rel=1e-5)
     still = Walk()
     still.cameras = Walk.cameras[[2, 2]]
-    assert scale.search_range(Domain(), still, (0, 1)) == (1.0, 1.0, 0.0)
+    assert scale.search_range(Domain(), still, (0, 1), 0.0) == (1.0, 1.0)
+
+
+def test_depth_maps_keep_a_search_on_inputs_alone_near_their_depth(monkeypatch):
+    monkeypatch.setattr(Walk, "depths", lambda self, frames: torch.tensor([0.0, 2.0, 2.0]))
+    views = ViewsConfig(inputs=2, scale="search")
+    model = qgs.compose("tiny/tokengs.yaml", ["model.queries.count=12"]).eval()
+    found = scale.find_scale(model, Walk(), (1, 4), (0, 2, 3, 5), views)
+    assert found.depth == 2
+    assert "inputs" not in found.poor.split(";")[0]
+    factors = [factor for factor, _ in found.tried]
+    assert 0.3 * 0.4 / 2 < min(factors) <= max(factors) < 2 / 2 * 1.7
 
 
 def test_training_and_evaluation_refuse_a_search(tmp_path):
