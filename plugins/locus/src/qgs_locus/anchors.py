@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -38,7 +38,7 @@ class NormalCenters(ComponentConfig):
     """Draw the initial anchor centres from a normal distribution around `mean`."""
     mean: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Mean of the centres, world units."""
-    std: float = Field(default=1.0, ge=0)
+    std: NonNegativeFloat = 1.0
     """Standard deviation of each coordinate, world units."""
 
     def sample(self, count: int) -> Tensor:
@@ -54,7 +54,7 @@ class FrustumCenters(ComponentConfig):
     distributed over the image and over the logarithm of depth."""
     depth: Ascending = (0.3, 3.0)
     """[nearest, farthest] depth z of a centre, world units."""
-    slope: float = Field(default=0.6, gt=0)
+    slope: PositiveFloat = 0.6
     """Largest |x / z| and |y / z| of a centre. This is half of the frustum's width and height at
     depth 1."""
 
@@ -104,7 +104,7 @@ class AnchoredQueries(CentredQueries):
     class Config(CentredQueries.Config):
         radius: bool = True
         """Give anchors a support radius. With false, they have a centre only."""
-        init_radius: float = Field(default=1.0, gt=0)
+        init_radius: PositiveFloat = 1.0
         """Initial radius of each anchor, world units. `radius_bound` tells whether `radius_min` is
         its lower bound or is added to it."""
 

@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -48,15 +48,15 @@ class RayBiasedCrossAttention(ContentCrossAttention):
         bandwidth: Literal["radius", "fixed"] = "radius"
         """Bandwidth sigma of the bias: `sigma0` times the anchor's radius ("radius"), or `sigma0`
         for all anchors ("fixed")."""
-        sigma0: float = Field(default=0.1, gt=0)
+        sigma0: PositiveFloat = 0.1
         """Bandwidth sigma as a multiple of the anchor's radius. With `bandwidth: fixed`, sigma
         itself, world units."""
-        sigma_sq_min: float = Field(default=1e-3, gt=0)
+        sigma_sq_min: PositiveFloat = 1e-3
         """Lower bound of sigma^2 = (sigma0 r)^2, world units squared. r is the anchor's
         radius."""
         bias_min: float = Field(default=-20.0, lt=0)
         """Lower bound of the bias b, before it is multiplied by gamma."""
-        direction_eps: float = Field(default=1e-6, gt=0)
+        direction_eps: PositiveFloat = 1e-6
         """Lower bound of the length by which a patch's mean ray direction is divided to normalise
         it."""
         gamma_init: float = -2.25

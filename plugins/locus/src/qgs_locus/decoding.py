@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Literal
 
-from pydantic import Field
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from qgs.contracts import Centers, ComponentConfig, Fields, Problem, RecipeContext, without_effect
@@ -26,9 +26,9 @@ class OffsetOptions(ComponentConfig):
     offset: Literal["posact", "linear"] = "posact"
     """Displacement for a raw offset t: posact(t) = sign(t) (exp|t| - 1) (LocusGS release), or t
     itself ("linear", LocusGS paper)."""
-    input_limit: float | None = Field(default=100.0, gt=0)
+    input_limit: PositiveFloat | None = 100.0
     """Limit of raw offsets, from -input_limit to input_limit, with `offset: posact`. Null: none."""
-    output_limit: float | None = Field(default=1000.0, gt=0)
+    output_limit: PositiveFloat | None = 1000.0
     """Limit of displacements, from -output_limit to output_limit, with `offset: posact`. Null means
     no limit."""
 

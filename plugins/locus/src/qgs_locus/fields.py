@@ -5,7 +5,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import NonNegativeFloat
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Fields, FieldSpec
@@ -29,7 +29,7 @@ class RadiusOptions(ComponentConfig):
     """Support radius r = max(softplus(rho), radius_min) ("floor", LocusGS release) or r =
     softplus(rho) + radius_min ("offset", paper). All components with this option must have the same
     value."""
-    radius_min: float = Field(default=1e-3, ge=0)
+    radius_min: NonNegativeFloat = 1e-3
     """Least support radius, world units. All components with this option must have the same
     value."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Literal
 
-from pydantic import Field
+from pydantic import PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import Fields, ModelDims, Problem, RecipeContext, Refinement, without_effect
@@ -32,10 +32,10 @@ class AnchorRefinement(Refinement):
         center_step: Literal["posact", "linear"] = "posact"
         """Step of a centre for an output t of its MLP: posact(t) = sign(t) (exp|t| - 1) (LocusGS
         release), or t itself ("linear", LocusGS paper)."""
-        input_limit: float | None = Field(default=100.0, gt=0)
+        input_limit: PositiveFloat | None = 100.0
         """Limit of outputs of the MLP of centres, from -input_limit to input_limit, with
         `center_step: posact`. Null means no limit."""
-        output_limit: float | None = Field(default=1000.0, gt=0)
+        output_limit: PositiveFloat | None = 1000.0
         """Limit of steps along each axis, from -output_limit to output_limit in world units, with
         `center_step: posact`. Null means no limit."""
         zero_init: bool = False

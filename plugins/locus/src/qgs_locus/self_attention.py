@@ -4,7 +4,7 @@ import math
 from typing import Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from qgs.contracts import AttentionWeights, ModelDims
@@ -47,9 +47,9 @@ class AnchorAwareSelfAttention(ContentSelfAttention):
         paper)."""
         features: int = Field(default=128, ge=2, multiple_of=2)
         """Number of sines plus number of cosines for each axis."""
-        temperature: float = Field(default=10_000.0, gt=0)
+        temperature: PositiveFloat = 10_000.0
         """Approximate ratio of the longest to the shortest wavelength of the sines."""
-        divisor_eps: float = Field(default=1e-6, ge=0)
+        divisor_eps: NonNegativeFloat = 1e-6
         """Small number that is added to the divisor of each sine's argument (LocusGS release)."""
 
     config: Config

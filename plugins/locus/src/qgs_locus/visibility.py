@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from pydantic import Field
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext
@@ -24,9 +24,9 @@ class AnchorVisibility(Loss):
     renderings = "none"
 
     class Config(VisibilityOptions):
-        weight: float = Field(default=0.1, ge=0)
+        weight: NonNegativeFloat = 0.1
         """Weight of this loss in the objective."""
-        z_guard: float = Field(default=1e-3, gt=0)
+        z_guard: PositiveFloat = 1e-3
         """A camera-frame z between -z_guard and z_guard, world units, counts as z_guard in the
         perspective division."""
 

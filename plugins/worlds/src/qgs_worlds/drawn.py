@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, NonNegativeInt
 from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
@@ -32,9 +32,9 @@ class DrawnConfig(SceneSource.Config):
     """Number of cameras in each scene."""
     samples: int = Field(default=2, ge=1, le=8)
     """Number of rays per pixel along each axis; 2 means 2 x 2 rays per pixel."""
-    seed: int = Field(default=0, ge=0)
+    seed: NonNegativeInt = 0
     """Random seed, from 0 on, which determines all scenes."""
-    cache_mb: int = Field(default=512, ge=0)
+    cache_mb: NonNegativeInt = 512
     """Memory in MiB for a cache of rendered images. 0 means that no images are kept."""
 
 

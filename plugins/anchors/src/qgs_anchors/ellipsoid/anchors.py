@@ -4,11 +4,10 @@ LocusGS is the special case of three equal radii: `from_locus` converts its weig
 """
 
 from collections.abc import Mapping
-from typing import Annotated
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import PositiveFloat
 from qgs_locus.anchors import CentredQueries
 from qgs_locus.fields import CENTER, CENTER_FIELD, raw_radius_of
 from torch import Tensor, nn
@@ -17,8 +16,6 @@ from qgs.contracts import Fields, ModelDims
 from qgs.types import QueryState, SpatialSupport
 from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
 
-Radius = Annotated[float, Field(gt=0)]
-
 
 class EllipsoidQueries(CentredQueries):
     """N learned queries for all scenes: features, anchor centres, rotations, three raw radii."""
@@ -26,7 +23,7 @@ class EllipsoidQueries(CentredQueries):
     name = "anchored"
 
     class Config(CentredQueries.Config):
-        init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
+        init_radii: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)
         """Initial radii of each anchor along the axes of the world frame, world units.
         `radius_bound` tells whether `radius_min` is their lower bound or is added to them."""
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 from qgs_locus.decoding import RadiusScaledCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, radius_field, support_radius
 from qgs_locus.refinement import AnchorRefinement
@@ -79,7 +79,7 @@ class ColoredHead(GaussianHead):
         gaussians_per_query: int = Field(default=4, ge=1)
         """K, the number of Gaussians of each query. It must equal the option `cells` of the
         queries."""
-        scale_cap: float = Field(default=0.8, gt=0)
+        scale_cap: PositiveFloat = 0.8
         """Largest scale, in radii of the anchor. A raw scale of 0 gives 1/e of the largest."""
 
     config: Config

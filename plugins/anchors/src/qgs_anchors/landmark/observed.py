@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, ValidationInfo, field_validator
 from qgs_locus.fields import (
     CENTER,
     CENTER_FIELD,
@@ -97,20 +97,20 @@ class ObservedQueries(Queries):
         per_token: int = Field(default=1, ge=1)
         """Number of queries for each token if `count` is null. Each query adds a learned vector of
         its own to the token."""
-        near: float = Field(default=0.2, gt=0)
+        near: PositiveFloat = 0.2
         """Least initial depth of an anchor, world units."""
         far: float = Field(default=3.0, gt=0, validate_default=True)
         """Largest initial depth of an anchor, world units."""
         sweep: int | None = Field(default=None, ge=2)
         """D, the number of depths at which photos are compared to find the depth of an anchor. Null
         predicts the depth from the token alone."""
-        window: float = Field(default=1.5, gt=0)
+        window: PositiveFloat = 1.5
         """Side of the squares of photos that a sweep compares. The unit is sqrt(A / S), with A the
         area of the query's footprint and S the option `tokens`."""
-        radius: float = Field(default=1.0, gt=0)
+        radius: PositiveFloat = 1.0
         """Initial radius of an anchor. The unit is sqrt(A) z / f, with A the area of the query's
         footprint in pixels, z the anchor's depth and f the focal length in pixels."""
-        std: float = Field(default=0.3, ge=0)
+        std: NonNegativeFloat = 0.3
         """Standard deviation of the initial learned vectors, which are added to the tokens."""
         cells: int | None = Field(default=None, ge=1)
         """K, the number of cells into which a footprint is divided. Queries store the mean colour

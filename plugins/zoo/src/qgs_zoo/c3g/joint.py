@@ -7,7 +7,7 @@ the M image tokens, then the N queries.
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import DecoderLayer, Head, LayerParts, ModelDims, memory_fields
@@ -90,10 +90,10 @@ class C3GHead(Head):
     class Config(NormConfig):
         gaussians_per_query: int = Field(default=1, ge=1)
         """K, the number of Gaussians decoded from each query."""
-        scale_unit: float = Field(default=0.001, gt=0)
+        scale_unit: PositiveFloat = 0.001
         """Unit of scales of Gaussians: a scale in world units is `scale_unit` times softplus(raw
         scale)."""
-        quat_eps: float = Field(default=1e-8, gt=0)
+        quat_eps: PositiveFloat = 1e-8
         """Lower bound of the length by which a raw quaternion is divided when it is normalised."""
 
     config: Config

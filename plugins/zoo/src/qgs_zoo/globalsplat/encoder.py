@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from einops import rearrange
-from pydantic import Field
+from pydantic import Field, NonNegativeInt
 from torch import Tensor, nn
 
 from qgs.contracts import Fields, FieldSpec, ModelDims, PatchEncoder, memory_fields
@@ -37,10 +37,10 @@ class PosedPatches(PatchEncoder):
         """Number of channels of a token that embed the patch's Plücker rays and the camera."""
         lens_width: int = Field(default=64, ge=1)
         """Number of channels that embed focal lengths and principal point of a camera."""
-        bands: int = Field(default=4, ge=0)
+        bands: NonNegativeInt = 4
         """Number of frequencies of sines and cosines that encode a camera's position, besides the
         position itself. 0 encodes only the position itself."""
-        registers: int = Field(default=4, ge=0)
+        registers: NonNegativeInt = 4
         """Number of registers: learned tokens after those of the patches. 0 means none."""
 
     config: Config

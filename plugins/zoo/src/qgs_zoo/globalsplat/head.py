@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor, nn
 
 from qgs.containers import concatenated
@@ -51,22 +51,22 @@ class MergingHead(Head):
     class Config(ComponentConfig):
         candidates: int = Field(default=16, ge=1)
         """Number of candidate Gaussians of each token, a power of two."""
-        level: float = Field(default=3.0, ge=0)
+        level: NonNegativeFloat = 3.0
         """Base-2 logarithm of the number of Gaussians per token. At a fractional level, the
         Gaussians of both adjacent whole levels are rendered and blended."""
         sh_degree: int = Field(default=3, ge=0, le=3)
         """Degree of the spherical harmonics. 0 means colours that do not depend on the viewing
         direction."""
-        init_std: float = Field(default=0.02, gt=0)
+        init_std: PositiveFloat = 0.02
         """Standard deviation of the initial weights, which have a truncated normal distribution."""
-        position_std: float | None = Field(default=None, gt=0)
+        position_std: PositiveFloat | None = None
         """Standard deviation of the initial weights that give positions. Null means `init_std`."""
         scale_bias: float = -2.0
         """Number added to raw log scales before they are bounded."""
-        scale_min: float = Field(default=1e-4, gt=0)
+        scale_min: PositiveFloat = 1e-4
         """Sets the smallest scale of a candidate Gaussian in world units, which is `scale_min` / e
         with e = 2.718."""
-        scale_max: float = Field(default=0.05, gt=0)
+        scale_max: PositiveFloat = 0.05
         """Sets the largest scale of a candidate Gaussian in world units, which is `scale_max` times
         e^2 = 7.389."""
         opacity_bias: float = -5.0

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from qgs.contracts import (
@@ -39,11 +39,11 @@ class Frustum(Loss):
     renderings = "none"
 
     class Config(Loss.Config):
-        weight: float = Field(default=0.01, ge=0)
+        weight: NonNegativeFloat = 0.01
         """Weight of the loss in the objective."""
-        softness: float = Field(default=0.05, gt=0)
+        softness: PositiveFloat = 0.05
         """Width of the smooth transition of the loss at the border of a frustum, in world units."""
-        near: float = Field(default=0.05, ge=0)
+        near: NonNegativeFloat = 0.05
         """Depth (camera-frame z) of the near plane of a frustum, in world units."""
 
     config: Config
@@ -64,9 +64,9 @@ class Regularisers(Loss):
     renderings = "none"
 
     class Config(Loss.Config):
-        opacity_weight: float = Field(default=0.01, ge=0)
+        opacity_weight: NonNegativeFloat = 0.01
         """Weight of the mean opacity in the loss."""
-        scale_weight: float = Field(default=0.01, ge=0)
+        scale_weight: NonNegativeFloat = 0.01
         """Weight of the mean scale, which is in world units, in the loss."""
 
     config: Config
@@ -126,10 +126,10 @@ class TwoPasses(Objective):
     class Config(ComponentConfig):
         """Options, with GlobalSplat's defaults."""
 
-        alpha_weight: float = Field(default=1e-3, ge=0)
+        alpha_weight: NonNegativeFloat = 1e-3
         """Weight of the loss `alpha_consistency`, the mean difference between alphas of the
         renderings of both predictions."""
-        depth_weight: float = Field(default=1e-2, ge=0)
+        depth_weight: NonNegativeFloat = 1e-2
         """Weight of the loss `depth_consistency`, the mean difference in world units between depths
         of the renderings of both predictions."""
 

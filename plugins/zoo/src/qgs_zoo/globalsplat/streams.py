@@ -6,7 +6,7 @@ In each round, both streams attend to the features of the photos, and are then m
 from collections.abc import Iterable
 
 import torch
-from pydantic import Field
+from pydantic import Field, NonNegativeInt, PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -46,10 +46,10 @@ class SlotQueries(LearnedQueries):
 
         count: int = Field(default=2057, ge=1)
         """N, the number of all tokens, including `extra`."""
-        extra: int = Field(default=9, ge=0)
+        extra: NonNegativeInt = 9
         """Number of tokens that decode no Gaussians (GlobalSplat: 4 auxiliary tokens, 1 token for
         scale, 4 registers)."""
-        std: float = Field(default=0.02, gt=0)
+        std: PositiveFloat = 0.02
         """Standard deviation of the initial tokens, which are normally distributed."""
 
     config: Config
@@ -101,9 +101,9 @@ class Round(DecoderLayer):
         memory_width: int | None = Field(default=None, ge=1)
         """Width of the encoder's features. With `globalsplat/patches` it is rgb_width + ray_width.
         Null means the model's width."""
-        blocks: int = Field(default=2, ge=0)
+        blocks: NonNegativeInt = 2
         """Number of ViT blocks in each of the two streams."""
-        block_layer_scale: float = Field(default=0.01, gt=0)
+        block_layer_scale: PositiveFloat = 0.01
         """Initial value of every LayerScale factor in the ViT blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width of the streams' MLPs, as a multiple of the model's width (rounded down)."""

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -72,7 +72,7 @@ class Transformer(PatchEncoder):
         """Number of blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width of the MLPs, as a multiple of the model's width (rounded down)."""
-        init_std: float = Field(default=0.02, gt=0)
+        init_std: PositiveFloat = 0.02
         """Standard deviation of the initial weights of linear layers, which are normally
         distributed."""
 
@@ -160,10 +160,10 @@ class AlongRays(Centers):
     reads = PATCH_FIELD
 
     class Config(ComponentConfig):
-        near: float = Field(default=0.0, ge=0)
+        near: NonNegativeFloat = 0.0
         """Least distance of a Gaussian's mean from the camera, in world units. 0 is the camera's
         centre."""
-        far: float = Field(default=500.0, gt=0)
+        far: PositiveFloat = 500.0
         """Largest distance of a Gaussian's mean from the camera, in world units (paper: 500 for
         scenes)."""
         measure: Literal["distance", "depth"] = "distance"
@@ -211,7 +211,7 @@ class PixelHead(Head):
         """Largest logarithm of a scale in world units. Null means no limit."""
         opacity_bias: float = -2.0
         """Number added to the logits of opacities."""
-        init_std: float = Field(default=0.02, gt=0)
+        init_std: PositiveFloat = 0.02
         """Standard deviation of the initial weights, which are normally distributed."""
 
     config: Config

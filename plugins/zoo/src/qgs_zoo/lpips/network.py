@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import NonNegativeFloat
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -143,7 +143,7 @@ class LpipsLoss(_WithNetwork, Loss):
     renderings = "each"
 
     class Config(VggOptions, Loss.Config):
-        weight: float = Field(default=0.5, ge=0)
+        weight: NonNegativeFloat = 0.5
         """Weight of the loss in the objective."""
 
     config: Config

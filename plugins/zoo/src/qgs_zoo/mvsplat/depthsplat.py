@@ -9,7 +9,7 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, OptionError
@@ -35,7 +35,6 @@ from qgs_zoo.mvsplat.unet import (
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 
 Width: TypeAlias = Annotated[int, Field(ge=1)]
-Block: TypeAlias = Annotated[int, Field(ge=0)]
 
 GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
 """Number of a raw Gaussian's channels for opacity, position in the pixel, scale and quaternion. The
@@ -63,7 +62,9 @@ class DepthSplatConfig(ComponentConfig):
     With two or three views, each view is compared with all others."""
     vit: VitConfig
     """Sizes and weights of DINOv2. `{}` is a ViT-S with random initial weights."""
-    blocks: tuple[Block, Block, Block, Block] = Field(default=(2, 5, 8, 11), validate_default=True)
+    blocks: tuple[NonNegativeInt, NonNegativeInt, NonNegativeInt, NonNegativeInt] = Field(
+        default=(2, 5, 8, 11), validate_default=True
+    )
     """Indices of the ViT blocks whose tokens are read. The first block has index 0. Published
     values for a ViT-L: 4, 11, 17, 23."""
     dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)

@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Fields, Head, Problem, RecipeContext
@@ -85,10 +85,10 @@ class RayHead(PixelHead):
     reads = PIXEL_FIELDS
 
     class Config(ComponentConfig):
-        scale_min: float = Field(default=0.5, gt=0)
+        scale_min: PositiveFloat = 0.5
         """Least scale of a Gaussian. The unit is 0.1 times the sum of width and height of a pixel
         at the Gaussian's depth."""
-        scale_max: float = Field(default=15.0, gt=0)
+        scale_max: PositiveFloat = 15.0
         """Largest scale of a Gaussian. The unit is 0.1 times the sum of width and height of a pixel
         at the Gaussian's depth."""
         opacity_exponent: float = Field(default=0.0, ge=-10, le=10)
@@ -119,9 +119,9 @@ class WorldHead(PixelHead):
     reads: ClassVar[Fields] = {TURN: PIXEL_FIELDS[TURN]}
 
     class Config(ComponentConfig):
-        scale_min: float = Field(default=1e-10, gt=0)
+        scale_min: PositiveFloat = 1e-10
         """Least scale of a Gaussian, in world units."""
-        scale_max: float = Field(default=3.0, gt=0)
+        scale_max: PositiveFloat = 3.0
         """Largest scale of a Gaussian, in world units. DepthSplat's demos at 512 x 960 use 0.1."""
 
     config: Config

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import PositiveFloat, ValidationInfo, field_validator
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -206,10 +206,10 @@ def _each(part: Callable[..., Tensor], given: Sequence[tuple[Tensor, ...]]) -> l
 class DepthRange(ComponentConfig):
     """Range of depths in a plane sweep."""
 
-    near: float = Field(gt=0)
+    near: PositiveFloat
     """Least depth in the sweep, in world units. Published models use 1 (MVSplat) or 0.5
     (DepthSplat), with `views.frame: given`."""
-    far: float = Field(gt=0)
+    far: PositiveFloat
     """Largest depth in the sweep, in world units. Published models use 100, but DepthSplat uses 200
     on DL3DV."""
 

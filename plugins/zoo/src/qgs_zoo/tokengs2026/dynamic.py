@@ -6,7 +6,7 @@ The queries follow TokenGS 2026.6.
 from collections.abc import Iterable
 
 import torch
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, NonNegativeInt
 from torch import Tensor, nn
 
 from qgs.containers import map_tensors
@@ -46,10 +46,10 @@ class DynamicQueries(Queries):
         count: int = Field(default=1280, ge=1)
         """N, the number of static and dynamic queries together (TokenGS: 1024 static + 256
         dynamic)."""
-        dynamic: int = Field(default=256, ge=0)
+        dynamic: NonNegativeInt = 256
         """Number of dynamic queries, which are the last of the N queries. 0 marks no query as
         dynamic, and adds the embedding of the time to all queries."""
-        std: float = Field(default=0.02, ge=0)
+        std: NonNegativeFloat = 0.02
         """Standard deviation of the queries' initial features, which are normally distributed."""
         time_channels: int = Field(default=2, ge=0, multiple_of=2)
         """Number of channels that encode the requested time. 0 ignores the time."""
@@ -135,7 +135,7 @@ class DynamicObjective(Objective):
     judges_inputs = False
 
     class Config(ComponentConfig):
-        weight: float = Field(default=0.3, ge=0)
+        weight: NonNegativeFloat = 0.3
         """Weight of the losses of dynamic Gaussians rendered alone. 0 skips these losses. TokenGS
         uses 0.3 for 5,000 steps, then a decay to 0 over 10,000 steps."""
 

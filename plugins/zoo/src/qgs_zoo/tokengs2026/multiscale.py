@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field, NonNegativeFloat, field_validator
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -229,7 +229,7 @@ class LatentBottleneck(MultiscaleReadout):
         1. The largest number must be `depth`."""
         latents: int = Field(ge=1)
         """L, the number of learned latents (TokenGS: 4096)."""
-        latent_std: float = Field(default=0.02, ge=0)
+        latent_std: NonNegativeFloat = 0.02
         """Standard deviation of the initial latents, which are normally distributed."""
         latent_depth: int = Field(default=12, ge=1, le=256)
         """Number of transformer blocks that update the latents. Sizes of their MLPs and initial
