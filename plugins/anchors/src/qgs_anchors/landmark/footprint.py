@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, PositiveFloat
+from pydantic import PositiveFloat, PositiveInt
 from qgs_locus.decoding import RadiusScaledCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, radius_field, support_radius
 from qgs_locus.refinement import AnchorRefinement
@@ -76,7 +76,7 @@ class ColoredHead(GaussianHead):
     name = "colored"
 
     class Config(GaussianHead.Config, RadiusOptions):
-        gaussians_per_query: int = Field(default=4, ge=1)
+        gaussians_per_query: PositiveInt = 4
         """K, the number of Gaussians of each query. It must equal the option `cells` of the
         queries."""
         scale_cap: PositiveFloat = 0.8

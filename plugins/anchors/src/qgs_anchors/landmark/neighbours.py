@@ -1,7 +1,7 @@
 """`landmark/neighbours`: each query attends to the queries with nearest anchors."""
 
 import torch
-from pydantic import Field
+from pydantic import PositiveInt
 from qgs_locus.fields import CENTER, CENTER_FIELD
 from torch import Tensor, nn
 
@@ -34,10 +34,10 @@ class NeighbourAttention(ContentSelfAttention):
     unlearned = ("place_mlp.fc2.bias",)
 
     class Config(ContentSelfAttention.Config):
-        count: int = Field(default=16, ge=1)
+        count: PositiveInt = 16
         """k, the number of nearest anchors that each query reads. If there are fewer anchors, it
         reads all."""
-        hidden: int = Field(default=32, ge=1)
+        hidden: PositiveInt = 32
         """Hidden width of the MLP that maps a relative position to one logit per head."""
 
     config: Config

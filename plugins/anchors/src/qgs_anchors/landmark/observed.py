@@ -5,7 +5,14 @@ from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, NonNegativeFloat, PositiveFloat, ValidationInfo, field_validator
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    ValidationInfo,
+    field_validator,
+)
 from qgs_locus.fields import (
     CENTER,
     CENTER_FIELD,
@@ -86,15 +93,15 @@ class ObservedQueries(Queries):
     reads = memory_fields("features", "grid")
 
     class Config(RadiusOptions):
-        count: int | None = Field(default=256, ge=1)
+        count: PositiveInt | None = 256
         """N, the number of queries, spread evenly over the input photos. The footprint of
         a query is the part of a photo that the query represents. If photos divide into N equal
         tiles with nearly square cells, each footprint is a tile; otherwise it is a square around
         the query's point. Null puts `per_token` queries at the centre of each token's patch."""
-        tokens: int = Field(default=1, ge=1)
+        tokens: PositiveInt = 1
         """S, the number of points in the footprint of a query at which the query samples tokens
         and depths. It has an effect only if `count` is a number."""
-        per_token: int = Field(default=1, ge=1)
+        per_token: PositiveInt = 1
         """Number of queries for each token if `count` is null. Each query adds a learned vector of
         its own to the token."""
         near: PositiveFloat = 0.2
@@ -112,7 +119,7 @@ class ObservedQueries(Queries):
         footprint in pixels, z the anchor's depth and f the focal length in pixels."""
         std: NonNegativeFloat = 0.3
         """Standard deviation of the initial learned vectors, which are added to the tokens."""
-        cells: int | None = Field(default=None, ge=1)
+        cells: PositiveInt | None = None
         """K, the number of cells into which a footprint is divided. Queries store the mean colour
         of each cell for the head `landmark/colored`. Null stores no colours. The option `count`
         decides the rows: null splits 8 cells into 2, 3 and 3, a number into 2 rows of 4."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -44,14 +44,14 @@ class RenderedFeedback(Feedback):
     class Config(ComponentConfig):
         rounds: int = Field(default=2, ge=1, le=16)
         """Number of rounds in evaluation, and the largest number of rounds in a training step."""
-        least: int = Field(default=1, ge=1)
+        least: PositiveInt = 1
         """Smallest number of rounds in a training step. Each step takes a random number of rounds
         from `least` to `rounds`."""
-        layers: int = Field(default=2, ge=1)
+        layers: PositiveInt = 2
         """Number of decoder layers, counted from the last, that each feedback round runs again."""
-        shrink: int = Field(default=2, ge=1)
+        shrink: PositiveInt = 2
         """Render the input photos at 1/`shrink` of their size."""
-        cells: int = Field(default=2, ge=1)
+        cells: PositiveInt = 2
         """Number of cells along each side of a token's patch. Each cell stores mean errors."""
 
     config: Config

@@ -7,7 +7,7 @@ the M image tokens, then the N queries.
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field, PositiveFloat
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import DecoderLayer, Head, LayerParts, ModelDims, memory_fields
@@ -88,7 +88,7 @@ class C3GHead(Head):
     name = "head"
 
     class Config(NormConfig):
-        gaussians_per_query: int = Field(default=1, ge=1)
+        gaussians_per_query: PositiveInt = 1
         """K, the number of Gaussians decoded from each query."""
         scale_unit: PositiveFloat = 0.001
         """Unit of scales of Gaussians: a scale in world units is `scale_unit` times softplus(raw

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, PositiveInt, ValidationInfo, field_validator
 from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, ModelDims, OptionError
@@ -36,11 +36,11 @@ in DINOv2."""
 class VitConfig(ComponentConfig):
     """Sizes of the transformer, by default those of ViT-S, and its file of weights."""
 
-    width: int = Field(default=384, ge=1)
+    width: PositiveInt = 384
     """Width of tokens: 384 for ViT-S, 768 for ViT-B, 1024 for ViT-L."""
     depth: int = Field(default=12, ge=1, le=256)
     """Number of blocks: 12 for ViT-S and ViT-B, 24 for ViT-L."""
-    heads: int = Field(default=6, ge=1)
+    heads: PositiveInt = 6
     """Number of attention heads: 6 for ViT-S, 12 for ViT-B, 16 for ViT-L, of 64 channels each."""
     weights: str | None = None
     """File of pretrained weights: .safetensors, .pth or .pt. Null starts with random weights."""
@@ -191,7 +191,7 @@ class DinoMultiViewViT(MultiViewViT):
     name = "multiview_vit"
 
     class Config(MultiViewViT.Config):
-        patch_size: int = Field(default=16, ge=1)
+        patch_size: PositiveInt = 16
         """Side of a patch, in pixels of the photos before resizing. It must divide both sides of
         the image."""
         vit: VitConfig

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from einops import rearrange
-from pydantic import Field, NonNegativeInt
+from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import Fields, FieldSpec, ModelDims, PatchEncoder, memory_fields
@@ -31,11 +31,11 @@ class PosedPatches(PatchEncoder):
     class Config(PatchEncoder.Config):
         """Options, with GlobalSplat's defaults except for `patch_size`."""
 
-        rgb_width: int = Field(default=512, ge=1)
+        rgb_width: PositiveInt = 512
         """Number of channels of a token that embed the patch's colours."""
-        ray_width: int = Field(default=256, ge=1)
+        ray_width: PositiveInt = 256
         """Number of channels of a token that embed the patch's Plücker rays and the camera."""
-        lens_width: int = Field(default=64, ge=1)
+        lens_width: PositiveInt = 64
         """Number of channels that embed focal lengths and principal point of a camera."""
         bands: NonNegativeInt = 4
         """Number of frequencies of sines and cosines that encode a camera's position, besides the

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.containers import concatenated
@@ -49,7 +49,7 @@ class MergingHead(Head):
     scheduled = frozenset({"level"})
 
     class Config(ComponentConfig):
-        candidates: int = Field(default=16, ge=1)
+        candidates: PositiveInt = 16
         """Number of candidate Gaussians of each token, a power of two."""
         level: NonNegativeFloat = 3.0
         """Base-2 logarithm of the number of Gaussians per token. At a fractional level, the

@@ -6,7 +6,7 @@ In each round, both streams attend to the features of the photos, and are then m
 from collections.abc import Iterable
 
 import torch
-from pydantic import Field, NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -44,7 +44,7 @@ class SlotQueries(LearnedQueries):
     class Config(ComponentConfig):
         """Options, with GlobalSplat's defaults."""
 
-        count: int = Field(default=2057, ge=1)
+        count: PositiveInt = 2057
         """N, the number of all tokens, including `extra`."""
         extra: NonNegativeInt = 9
         """Number of tokens that decode no Gaussians (GlobalSplat: 4 auxiliary tokens, 1 token for
@@ -98,7 +98,7 @@ class Round(DecoderLayer):
     class Config(ComponentConfig):
         """Options, with GlobalSplat's defaults."""
 
-        memory_width: int | None = Field(default=None, ge=1)
+        memory_width: PositiveInt | None = None
         """Width of the encoder's features. With `globalsplat/patches` it is rgb_width + ray_width.
         Null means the model's width."""
         blocks: NonNegativeInt = 2

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -199,7 +199,7 @@ class PixelHead(Head):
     name = "pixel_head"
 
     class Config(ComponentConfig):
-        gaussians_per_query: int = Field(default=64, ge=1)
+        gaussians_per_query: PositiveInt = 64
         """K, the number of Gaussians of each token, on an even grid over its patch. The square of
         the encoder's `patch_size` gives one Gaussian per pixel."""
         position_channels: Literal[1, 3] = 3

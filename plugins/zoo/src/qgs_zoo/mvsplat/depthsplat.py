@@ -5,11 +5,11 @@ of the image size. Scale 0 means the first plane sweep, scale 1 the second.
 """
 
 from collections.abc import Sequence
-from typing import Annotated, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
+from pydantic import Field, NonNegativeInt, PositiveInt, ValidationInfo, field_validator
 from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, OptionError
@@ -34,8 +34,6 @@ from qgs_zoo.mvsplat.unet import (
 )
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 
-Width: TypeAlias = Annotated[int, Field(ge=1)]
-
 GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
 """Number of a raw Gaussian's channels for opacity, position in the pixel, scale and quaternion. The
 channels for harmonics come after these."""
@@ -47,7 +45,7 @@ class DepthSplatConfig(ComponentConfig):
     features: int = Field(default=128, ge=32, multiple_of=32)
     """Channels of the multi-view features and of the networks that process the first sweep. The
     networks that process a second sweep have half as many."""
-    cnn: tuple[Width, Width, Width] = WIDTHS
+    cnn: tuple[PositiveInt, PositiveInt, PositiveInt] = WIDTHS
     """Channels of the three stages of the CNN."""
     candidates: int = Field(default=128, ge=16, multiple_of=8)
     """Number of depths in the first sweep, evenly spaced in inverse depth from `far` to `near`. The
@@ -57,7 +55,7 @@ class DepthSplatConfig(ComponentConfig):
     of the first sweep."""
     stride: Literal[4, 8] = 4
     """Side, in pixels of the image, of the square for which the first sweep finds a depth."""
-    neighbours: int = Field(default=2, ge=1)
+    neighbours: PositiveInt = 2
     """Number of nearest views with which each view is compared if there are more than three views.
     With two or three views, each view is compared with all others."""
     vit: VitConfig
@@ -67,14 +65,14 @@ class DepthSplatConfig(ComponentConfig):
     )
     """Indices of the ViT blocks whose tokens are read. The first block has index 0. Published
     values for a ViT-L: 4, 11, 17, 23."""
-    dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)
+    dpt: tuple[PositiveInt, PositiveInt, PositiveInt, PositiveInt] = (48, 96, 192, 384)
     """Channels of the two DPT heads, for depths and for Gaussians, at 1/2, 1/4, 1/8 and 1/16 of the
     image size. Published values for a ViT-B: 96, 192, 384, 768; for a ViT-L: 128, 256, 512,
     1024."""
     full_features: int = Field(default=64, ge=4, multiple_of=4)
     """Channels of the full-size features from which Gaussians are predicted. The DPT head that
     corrects depths has half as many. Published values: 96 for a ViT-B, 128 for a ViT-L."""
-    regressor: int = Field(default=64, ge=1)
+    regressor: PositiveInt = 64
     """Number of channels between the two consecutive networks that predict Gaussians."""
 
     @field_validator("blocks")

@@ -6,7 +6,7 @@ The queries follow TokenGS 2026.6.
 from collections.abc import Iterable
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from qgs.containers import map_tensors
@@ -43,7 +43,7 @@ class DynamicQueries(Queries):
     reads_cameras = False
 
     class Config(ComponentConfig):
-        count: int = Field(default=1280, ge=1)
+        count: PositiveInt = 1280
         """N, the number of static and dynamic queries together (TokenGS: 1024 static + 256
         dynamic)."""
         dynamic: NonNegativeInt = 256
@@ -53,7 +53,7 @@ class DynamicQueries(Queries):
         """Standard deviation of the queries' initial features, which are normally distributed."""
         time_channels: int = Field(default=2, ge=0, multiple_of=2)
         """Number of channels that encode the requested time. 0 ignores the time."""
-        patch_size: int = Field(default=8, ge=1)
+        patch_size: PositiveInt = 8
         """Side P of the convolution, P x P pixels, that embeds the time. Its input is a patch in
         which every pixel holds the encoded time. The release uses the encoder's patch size."""
 

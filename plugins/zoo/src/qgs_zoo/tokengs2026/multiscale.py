@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 import torch
-from pydantic import Field, NonNegativeFloat, field_validator
+from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -227,7 +227,7 @@ class LatentBottleneck(MultiscaleReadout):
         blocks: tuple[int, ...] = Field(default=(6, 8, 10, 12), min_length=1)
         """Numbers of the ViT blocks whose outputs are read, in ascending order. The first block is
         1. The largest number must be `depth`."""
-        latents: int = Field(ge=1)
+        latents: PositiveInt
         """L, the number of learned latents (TokenGS: 4096)."""
         latent_std: NonNegativeFloat = 0.02
         """Standard deviation of the initial latents, which are normally distributed."""
