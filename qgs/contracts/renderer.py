@@ -4,11 +4,12 @@ from abc import abstractmethod
 from typing import Annotated, ClassVar, TypeAlias
 
 import torch
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, PositiveFloat
 from torch import Tensor
 
 from qgs.containers import check_shapes
-from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec, OptionError
+from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec
+from qgs.contracts.settings import Far
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import seen_colors
 from qgs.types import Cameras, Gaussians, Rendering
@@ -19,9 +20,9 @@ Channel: TypeAlias = Annotated[float, Field(ge=0, le=1)]
 class RendererConfig(ComponentConfig):
     """Splatting options of every renderer (defaults: TokenGS, LocusGS and gsplat 1.5.3)."""
 
-    near: float = Field(default=0.025, gt=0)
+    near: PositiveFloat = 0.025
     """Nearest camera-frame z, in world units, at which Gaussians are rendered."""
-    far: float = Field(default=125.0, gt=0, validate_default=True)
+    far: Far = 125.0
     """Farthest camera-frame z, in world units, at which Gaussians are rendered."""
     dilation: float = Field(default=0.3, ge=0)
     """Variance in pixel^2 added to the diagonal of each Gaussian's projected covariance. 0 adds
@@ -36,18 +37,6 @@ class RendererConfig(ComponentConfig):
     transmittance to this value or below, and all Gaussians behind."""
     background: tuple[Channel, Channel, Channel] = (0.5, 0.5, 0.5)
     """Background colour, RGB in [0, 1]."""
-
-    @field_validator("far")
-    @classmethod
-    def _far_is_behind_near(cls, far: float, info: ValidationInfo) -> float:
-        near = info.data.get("near")
-        # If `near` is invalid itself, the data lack it.
-        if near is not None and far <= near:
-            raise OptionError(
-                f"far must be more than near, got near {near:g} and far {far:g}",
-                f"set far above {near:g}, or near below {far:g}",
-            )
-        return far
 
 
 class Renderer(Component, torch.nn.Module):

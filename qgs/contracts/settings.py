@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import AfterValidator, Field, PositiveInt
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, ValidationInfo
 
 from qgs.contracts.component import ComponentConfig, OptionError
 from qgs.precision import Precision
@@ -22,6 +22,22 @@ def ascending(ends: tuple[float, float]) -> tuple[float, float]:
 
 Ascending: TypeAlias = Annotated[tuple[float, float], AfterValidator(ascending)]
 """Range [min, max] of positive numbers."""
+
+
+def behind_near(far: float, info: ValidationInfo) -> float:
+    """Return `far` unchanged. Raises OptionError unless it is more than the option `near`."""
+    near = info.data.get("near")
+    # If `near` is invalid itself, the data lack it.
+    if near is not None and far <= near:
+        raise OptionError(
+            f"far must be more than near, got near {near:g} and far {far:g}",
+            f"set far above {near:g}, or near below {far:g}",
+        )
+    return far
+
+
+Far: TypeAlias = Annotated[PositiveFloat, AfterValidator(behind_near), Field(validate_default=True)]
+"""Option `far`, above 0 and above the option `near`, which comes before it."""
 
 
 class ViewsConfig(ComponentConfig):

@@ -10,8 +10,6 @@ from pydantic import (
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
-    ValidationInfo,
-    field_validator,
 )
 from qgs_locus.fields import (
     CENTER,
@@ -28,13 +26,13 @@ from torch import Tensor, nn
 from qgs.contracts import (
     Fields,
     ModelDims,
-    OptionError,
     Problem,
     Queries,
     RecipeContext,
     memory_fields,
     without_effect,
 )
+from qgs.contracts.settings import Far
 from qgs.geometry.constants import constant
 from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs import Mlp
@@ -106,7 +104,7 @@ class ObservedQueries(Queries):
         its own to the token."""
         near: PositiveFloat = 0.2
         """Least initial depth of an anchor, world units."""
-        far: float = Field(default=3.0, gt=0, validate_default=True)
+        far: Far = 3.0
         """Largest initial depth of an anchor, world units."""
         sweep: int | None = Field(default=None, ge=2)
         """D, the number of depths at which photos are compared to find the depth of an anchor. Null
@@ -123,17 +121,6 @@ class ObservedQueries(Queries):
         """K, the number of cells into which a footprint is divided. Queries store the mean colour
         of each cell for the head `landmark/colored`. Null stores no colours. The option `count`
         decides the rows: null splits 8 cells into 2, 3 and 3, a number into 2 rows of 4."""
-
-        @field_validator("far")
-        @classmethod
-        def _far_is_behind_near(cls, far: float, info: ValidationInfo) -> float:
-            near = info.data.get("near")
-            if near is not None and far <= near:
-                raise OptionError(
-                    f"far must be more than near, got near {near:g} and far {far:g}",
-                    "give the depths at which the scene begins and ends",
-                )
-            return far
 
     config: Config
 

@@ -4,7 +4,6 @@
 its patch, and `gslrm/along_rays` puts the Gaussians' means on the rays of the pixels.
 """
 
-from collections.abc import Iterable
 from typing import Literal
 
 import torch
@@ -21,11 +20,10 @@ from qgs.contracts import (
     Head,
     ModelDims,
     PatchEncoder,
-    Problem,
     Queries,
-    RecipeContext,
     memory_fields,
 )
+from qgs.contracts.settings import Far
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.geometry.transforms import unit
@@ -163,7 +161,7 @@ class AlongRays(Centers):
         near: NonNegativeFloat = 0.0
         """Least distance of a Gaussian's mean from the camera, in world units. 0 is the camera's
         centre."""
-        far: PositiveFloat = 500.0
+        far: Far = 500.0
         """Largest distance of a Gaussian's mean from the camera, in world units (paper: 500 for
         scenes)."""
         measure: Literal["distance", "depth"] = "distance"
@@ -171,12 +169,6 @@ class AlongRays(Centers):
         `depth`: along the camera's axis (repository gs-lrm-unofficial)."""
 
     config: Config
-
-    @classmethod
-    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        if config.far <= config.near:
-            reason = f"far must be beyond near, got near {config.near:g} and far {config.far:g}"
-            yield Problem("far", reason, "give the distances at which the scene begins and ends")
 
     @full_precision
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:

@@ -11,18 +11,18 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import PositiveFloat, ValidationInfo, field_validator
+from pydantic import PositiveFloat
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from qgs.contracts import (
     ComponentConfig,
     Encoder,
-    OptionError,
     Problem,
     RecipeContext,
     memory_fields,
 )
+from qgs.contracts.settings import Far
 from qgs.geometry.constants import constant
 from qgs.precision import full_precision
 from qgs.types import Cameras, ImageMemory, Views
@@ -209,20 +209,9 @@ class DepthRange(ComponentConfig):
     near: PositiveFloat
     """Least depth in the sweep, in world units. Published models use 1 (MVSplat) or 0.5
     (DepthSplat), with `views.frame: given`."""
-    far: PositiveFloat
+    far: Far
     """Largest depth in the sweep, in world units. Published models use 100, but DepthSplat uses 200
     on DL3DV."""
-
-    @field_validator("far")
-    @classmethod
-    def _far_is_beyond_near(cls, far: float, info: ValidationInfo) -> float:
-        near = info.data.get("near", 0)
-        if far <= near:
-            raise OptionError(
-                f"far must be beyond near, got near {near:g} and far {far:g}",
-                "give the depths at which the scene begins and ends",
-            )
-        return far
 
 
 class SweepEncoder(Encoder):
