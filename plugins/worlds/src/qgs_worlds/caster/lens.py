@@ -5,13 +5,13 @@ import math
 import numpy as np
 
 
-def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
+def lens(fov: float, across: int, size: tuple[int, int]) -> np.ndarray:
     """Return intrinsics fx, fy, cx, cy in pixels for images of `size` (H, W).
 
-    fov: horizontal field of view in degrees.
+    fov: field of view in degrees over `across` pixels.
     """
     height, width = size
-    focal = width / 2 / math.tan(math.radians(fov) / 2)
+    focal = across / 2 / math.tan(math.radians(fov) / 2)
     return np.array([focal, focal, width / 2, height / 2])
 
 

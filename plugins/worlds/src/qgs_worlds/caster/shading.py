@@ -146,10 +146,7 @@ def _glow(lights, view):
     """
     if lights.shape[0] == 0 or lights[0].lamp > 0:
         return 0.0
-    near = max(dot(view, lights[0].place), 0.0) ** 2
-    near *= near
-    near *= near
-    return 0.5 * near * near
+    return 0.5 * max(dot(view, lights[0].place), 0.0) ** 16
 
 
 @inner

@@ -55,7 +55,8 @@ class RoomScene(DrawnScene):
         sizes = rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
         self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]
         self.c2w = camera_path(rng, self.size, config.views_per_scene)
-        self.lens = lens(rng.uniform(*config.fov), config.image_size)
+        size = config.image_size
+        self.lens = lens(rng.uniform(*config.fov), size[1], size)
 
     @cached_property
     def tables(self) -> "Room":

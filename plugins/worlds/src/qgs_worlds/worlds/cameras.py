@@ -40,8 +40,7 @@ class Rig(NamedTuple):
 
     def lens(self, size: tuple[int, int]) -> np.ndarray:
         """Return intrinsics fx, fy, cx, cy in pixels for images of `size` (H, W)."""
-        focal = lens(self.fov, (max(size), max(size)))[0]
-        return np.array([focal, focal, size[1] / 2, size[0] / 2])
+        return lens(self.fov, max(size), size)
 
     def sight(self, place: Place) -> tuple[np.ndarray, float]:
         """Return centre and radius, in metres, of a ball around most of what the cameras see.

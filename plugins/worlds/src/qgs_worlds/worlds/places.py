@@ -1,7 +1,6 @@
 """Kinds of scenes: rooms with openings, outdoor scenes, and objects on plain ground."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random
 
@@ -40,10 +39,6 @@ class Place:
     targets: list[Point]
     distance: tuple[float, float]
     top: float
-
-
-def _level(x: float, y: float) -> float:
-    return 0.0
 
 
 def _toward(angle: float, away: float) -> tuple[float, float]:
@@ -106,7 +101,7 @@ def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) ->
     lift = 0.0
     if things.style.tilted and pick < 0.3:
         lift = rng.uniform(0.2, max(ceiling - 2.2 * size, 0.3))
-    return placed(thing, (at[0], at[1], lift), any_angle(rng), size, _level)
+    return placed(thing, (at[0], at[1], lift), any_angle(rng), size)
 
 
 def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
@@ -168,8 +163,8 @@ def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
 
 
 def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
-    ground = _level
-    level = 0.0
+    field = maps[0]
+    amplitude = level = 0.0
     shapes = [_ground(things, spread(rng, 1, 4))]
     if rng.random() < 0.6:
         amplitude = spread(rng, 0.15, 1.5)
@@ -178,10 +173,10 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         half = (_TERRAIN, _TERRAIN, amplitude)
         body = Primitive(s.HEIGHT, (0.0, 0.0, 0.0), half, extra=float(index))
         shapes.append(things.skinned(body, spread(rng, 1, 4))._replace(faces=1))
-        ground = _on(maps[index], amplitude)
+        field = maps[index]
         # cameras stay on the middle half
-        middle = len(maps[index]) // 4
-        level = amplitude * float(maps[index][middle:-middle, middle:-middle].max())
+        middle = len(field) // 4
+        level = amplitude * float(field[middle:-middle, middle:-middle].max())
     fixed = len(shapes)
     # far things shape the horizon
     for _ in range(2 + count // 4):
@@ -191,23 +186,15 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         # denser in the middle, where cameras look
         away = 9 * rng.random() ** 0.7
         x, y = _toward(any_angle(rng), away)
-        at = (x, y, 0.0 if rng.random() < 0.85 else rng.uniform(0.3, 3))
-        near += placed(things.draw(), at, any_angle(rng), spread(rng, 0.25, 2), ground)
+        lift = 0.0 if rng.random() < 0.85 else rng.uniform(0.3, 3)
+        ground = height_of(field, np.float32(x / _TERRAIN), np.float32(y / _TERRAIN))
+        at = (x, y, lift + amplitude * ground)
+        near += placed(things.draw(), at, any_angle(rng), spread(rng, 0.25, 2))
     shapes += near
     low = (-12.0, -12.0, level + 0.3)
     high = (12.0, 12.0, level + 7)
     eyes = (level + 0.6, level + 2.2)
     return Place("outdoors", shapes, fixed, low, high, eyes, _middles(near), (1.2, 11.0), level + 4)
-
-
-def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
-    """Return a function that gives the height of a terrain in metres at a point (x, y).
-
-    field: height map with values in [-1, 1]. amplitude: height of the value 1, in metres.
-    """
-    return lambda x, y: (
-        amplitude * height_of(field, np.float32(x / _TERRAIN), np.float32(y / _TERRAIN))
-    )
 
 
 def _far(rng: Random, things: Things, angle: float) -> Thing:
@@ -271,7 +258,7 @@ def _objects(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
             y += spot[1]
         at = (x, y, level if math.hypot(x, y) < wide else 0.0)
         size = spread(rng, 0.1, 0.5)
-        shapes += placed(things.draw(), at, any_angle(rng), size, _level)
+        shapes += placed(things.draw(), at, any_angle(rng), size)
     low = (-3.5, -3.5, level + 0.2)
     high = (3.5, 3.5, level + 3)
     eyes = (level + 0.25, level + 1.6)

@@ -1,7 +1,6 @@
 """Random objects: composites of primitives, cut primitives, rows, frames, bars and wires."""
 
 import math
-from collections.abc import Callable
 from random import Random
 from typing import NamedTuple
 
@@ -216,14 +215,10 @@ def lowest(thing: Thing) -> float:
     return min(shape.body.center[2] - shape.body.reach() for shape in thing)
 
 
-def placed(
-    thing: Thing, to: Point, turn: float, size: float, on: Callable[[float, float], float]
-) -> Thing:
-    """Return an object scaled by `size`, turned about z by `turn` and placed above the ground.
+def placed(thing: Thing, to: Point, turn: float, size: float) -> Thing:
+    """Return an object scaled by `size`, turned about z by `turn` radians and placed at `to`.
 
-    to: x, y, and the height of the object's lowest point above the ground, in metres. turn:
-    radians. on: function of x, y that returns the z of the ground.
+    to: x, y, and the height of the object's lowest point, in metres.
     """
-    low = lowest(thing) * size
-    place = (to[0], to[1], to[2] + on(to[0], to[1]) - low)
+    place = (to[0], to[1], to[2] - lowest(thing) * size)
     return [shape.moved(place, about_z(turn), size) for shape in thing]
