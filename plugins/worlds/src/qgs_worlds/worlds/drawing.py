@@ -19,7 +19,7 @@ from qgs_worlds.caster.tables import World
 from qgs_worlds.worlds import materials
 from qgs_worlds.worlds.cameras import CLEARANCE, Rig, draw_cameras
 from qgs_worlds.worlds.places import PLACES, SHARES, Place
-from qgs_worlds.worlds.things import PLAIN, VARIED, Things, any_angle, spread
+from qgs_worlds.worlds.things import MAPS, PLAIN, VARIED, Things, any_angle, spread
 
 if TYPE_CHECKING:
     from qgs_worlds.worlds.source import WorldsConfig
@@ -30,8 +30,6 @@ _SUNNY = {"indoors": 0.5, "outdoors": 0.75, "objects": 0.45}
 
 Light = tuple[float, Sequence[float], np.ndarray, int]
 """Row of LIGHT: 1 for a lamp, 0 for the sun; position or direction; RGB; 1 if it casts shadows."""
-# Height maps of a world.
-_MAPS = 4
 # Size in pixels of the images that determine exposure and depth of a scene.
 _THUMB = (10, 10)
 
@@ -64,10 +62,10 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     numbers = np.random.default_rng(key)
     # four generators, so that each option changes only its own part
     plan, skin, shine, camera = (Random(int(numbers.integers(1 << 62))) for _ in range(4))
-    maps = materials.height_maps(int(numbers.integers(1 << 31)), _MAPS)
+    maps = materials.height_maps(int(numbers.integers(1 << 31)), MAPS)
     varied = config.shapes == "varied"
     kind = plan.choices([*PLACES], SHARES)[0] if varied else "indoors"
-    things = Things(plan, VARIED if varied else PLAIN, materials.COUNT, _MAPS)
+    things = Things(plan, VARIED if varied else PLAIN)
     count = round(spread(plan, 4, config.complexity))
     place = PLACES[kind](plan, things, count, maps)
     shapes = packed(place.shapes)

@@ -11,10 +11,8 @@ from numpy.typing import ArrayLike
 from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.textures import chance, noise
-from qgs_worlds.worlds.things import spread
+from qgs_worlds.worlds.things import TEXTURES, spread
 
-# textures of a world
-COUNT = 14
 # points of a height map along each axis
 _SIDE = 33
 _PLAIN_PATTERNS = (s.STRIPES, s.CHECKER, s.TILES, s.DOTS)
@@ -56,13 +54,13 @@ class Palette:
 
 
 def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
-    """Return a table of TEXTURE with COUNT random rows.
+    """Return a table of TEXTURE with TEXTURES random rows.
 
     varied: True for noise, False for uniform surfaces and simple patterns. highlights: True makes
     some varied textures shiny, without other changes.
     """
     palette = Palette(rng)
-    table = np.zeros(COUNT, s.TEXTURE)
+    table = np.zeros(TEXTURES, s.TEXTURE)
     for field in ("period", "stretch", "pattern_period", "aspect"):
         table[field] = 1.0
     table["gain"] = 0.5

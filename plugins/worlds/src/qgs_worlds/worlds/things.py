@@ -17,6 +17,10 @@ from qgs_worlds.caster.shapes import (
     rotated,
 )
 
+# textures and height maps of a world
+TEXTURES = 14
+MAPS = 4
+
 Thing = list[Shape]
 
 
@@ -60,15 +64,12 @@ VARIED = Style(
 class Things:
     """Generator of random objects, about 2 units in size, around the origin.
 
-    textures: number of textures to choose from; a shape uses one texture, or six consecutive
-    textures, one for each face. maps: number of height maps to choose from.
+    A shape uses one of the TEXTURES of a world, or six consecutive textures, one for each face.
     """
 
-    def __init__(self, rng: Random, style: Style, textures: int, maps: int) -> None:
+    def __init__(self, rng: Random, style: Style) -> None:
         self.rng = rng
         self.style = style
-        self.maps = maps
-        self._textures = textures
 
     def texture(self) -> tuple[int, int]:
         """Return random textures for a shape: index of the first, and their number, 1 or 6.
@@ -77,7 +78,7 @@ class Things:
         """
         faces = 6 if self.rng.random() < 0.3 else 1
         # five more textures follow the first one if there are six faces
-        return self.rng.randrange(self._textures - 5), faces
+        return self.rng.randrange(TEXTURES - 5), faces
 
     def skinned(self, body: Primitive, scale: float = 1.0) -> Shape:
         """Return the primitive `body` as a shape with random textures.
@@ -85,7 +86,7 @@ class Things:
         scale: metres per unit of a texture.
         """
         first, faces = self.texture()
-        return Shape(body, None, first, faces, self.rng.randrange(self._textures), scale)
+        return Shape(body, None, first, faces, self.rng.randrange(TEXTURES), scale)
 
     def draw(self) -> Thing:
         """Return a random object: a composite, a row, a frame, a wire or bars."""
@@ -118,7 +119,7 @@ class Things:
             b = c = a
             extra = rng.uniform(0.1, 0.4)
         if kind == s.HEIGHT:
-            extra = rng.randrange(self.maps)
+            extra = rng.randrange(MAPS)
         return Primitive(kind, center, (a, b, c), self._turn(), extra)
 
     def _cut(self, body: Primitive) -> Primitive | None:
@@ -148,7 +149,7 @@ class Things:
             # parts of a thing often have the same texture
             skin = skin if rng.random() < 0.4 else self.texture()
             hole = self._cut(body) if cut else None
-            inner = skin[0] if rng.random() < 0.5 else rng.randrange(self._textures)
+            inner = skin[0] if rng.random() < 0.5 else rng.randrange(TEXTURES)
             thing.append(Shape(body, hole, *skin, inner))
         return thing
 
