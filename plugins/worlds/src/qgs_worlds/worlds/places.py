@@ -159,7 +159,7 @@ def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
     if rng.random() < 0.6:
         level = z + rng.uniform(-0.3, 0.4) * high
         bars.append(rod((x, y - wide, level), (x, y + wide, level), radius, True))
-    return [Shape(bar, None, texture, 1, 0, 0.3) for bar in bars]
+    return [Shape(bar, texture=texture, scale=0.3) for bar in bars]
 
 
 def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
@@ -227,7 +227,7 @@ def _far(rng: Random, things: Things, angle: float) -> Thing:
         aside, behind = (rng.uniform(-0.5, 0.5) * high for _ in range(2))
         half = tuple(rng.uniform(0.35, 0.9) * high for _ in range(3))
         leaves = Primitive(s.ELLIPSOID, (x + aside, y + behind, rng.uniform(1.7, 2.6) * high), half)
-        tree.append(Shape(leaves, None, crown, 1, 0, rng.uniform(0.5, 2)))
+        tree.append(Shape(leaves, texture=crown, scale=rng.uniform(0.5, 2)))
     return tree
 
 

@@ -171,10 +171,7 @@ class Things:
     def _rods(self, points: list[Point], pairs: list[tuple[int, int]], radius: float) -> Thing:
         square = self.rng.random() < 0.5
         skin = self.texture()
-        return [
-            Shape(rod(points[a], points[b], radius, square), None, skin[0], 1, 0, 1.0)
-            for a, b in pairs
-        ]
+        return [Shape(rod(points[a], points[b], radius, square), texture=skin[0]) for a, b in pairs]
 
     def _frame(self) -> Thing:
         """Return the edges of a random box, as rods."""
