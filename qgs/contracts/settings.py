@@ -40,6 +40,22 @@ Far: TypeAlias = Annotated[PositiveFloat, AfterValidator(behind_near), Field(val
 """Option `far`, above 0 and above the option `near`, which comes before it."""
 
 
+def dividing_width(heads: int, info: ValidationInfo) -> int:
+    """Return `heads` unchanged. Raises OptionError unless it divides the option `width`."""
+    # If the width is invalid itself, the data lack it.
+    width = info.data.get("width", heads)
+    if width % heads:
+        reason = f"{heads} heads do not divide the width {width}"
+        raise OptionError(reason, f"write a divisor of {width}")
+    return heads
+
+
+Heads: TypeAlias = Annotated[
+    int, Field(ge=1, validate_default=True), AfterValidator(dividing_width)
+]
+"""Option `heads`, from 1 on. It divides the option `width`, which comes before it."""
+
+
 class ViewsConfig(ComponentConfig):
     """Settings for choosing views of a scene and for moving their cameras to the model's frame.
 
@@ -65,7 +81,7 @@ class ViewsConfig(ComponentConfig):
     multiplies them by `scale_factor`. "auto" computes one factor per scene, which brings the point
     nearest to all optical axes to depth 1. "search" takes the factor at which a trained model
     renders a user's photos best, and works only for these."""
-    scale_factor: float = Field(default=0.15, gt=0)
+    scale_factor: PositiveFloat = 0.15
     """Factor for all camera positions, see `scale`. It has no effect if `scale` is "auto" or
     "search"."""
     mirror: float = Field(default=0.5, ge=0, le=1)

@@ -5,18 +5,18 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationInfo, WithJsonSchema, create_model, field_validator
+from pydantic import Field, WithJsonSchema, create_model
 
 from qgs.contracts import (
     LAYER_SLOTS,
     ComponentConfig,
     EvaluationConfig,
     ModelDims,
-    OptionError,
     Plugin,
     TrainingConfig,
     ViewsConfig,
 )
+from qgs.contracts.settings import Heads
 from qgs.recipe.decode import Parts, decode_place, report, validated
 from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.files import merge
@@ -31,18 +31,8 @@ class ModelSettings(ComponentConfig):
 
     width: int = Field(default=1024, ge=1, le=65_536)
     """Number of features of a token and of a query (D in the papers)."""
-    heads: int = Field(default=16, ge=1, validate_default=True)
+    heads: Heads = 16
     """Number of attention heads (h in the papers). It must divide the width."""
-
-    @field_validator("heads")
-    @classmethod
-    def _divides_the_width(cls, heads: int, info: ValidationInfo) -> int:
-        # If the width is invalid itself, the data lack it.
-        width = info.data.get("width", heads)
-        if width % heads:
-            reason = f"{heads} heads do not divide the width {width}"
-            raise OptionError(reason, f"set model.heads to a divisor of {width}")
-        return heads
 
 
 class DecoderSettings(ComponentConfig):

@@ -6,17 +6,17 @@ and no mask token. It is new code that follows facebookresearch/dinov2 (Apache-2
 tokens of all views.
 """
 
-import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field, PositiveInt, ValidationInfo, field_validator
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
-from qgs.contracts import ComponentConfig, ModelDims, OptionError
+from qgs.contracts import ComponentConfig, ModelDims
+from qgs.contracts.settings import Heads
 from qgs.tokengs import NORM_EPS
 from qgs.tokengs.blocks import LayerScale, Mlp
 from qgs.tokengs.encoder import MultiViewViT
@@ -40,20 +40,10 @@ class VitConfig(ComponentConfig):
     """Width of tokens: 384 for ViT-S, 768 for ViT-B, 1024 for ViT-L."""
     depth: int = Field(default=12, ge=1, le=256)
     """Number of blocks: 12 for ViT-S and ViT-B, 24 for ViT-L."""
-    heads: PositiveInt = 6
+    heads: Heads = 6
     """Number of attention heads: 6 for ViT-S, 12 for ViT-B, 16 for ViT-L, of 64 channels each."""
     weights: str | None = None
     """File of pretrained weights: .safetensors, .pth or .pt. Null starts with random weights."""
-
-    @field_validator("heads")
-    @classmethod
-    def _heads_divide_the_width(cls, heads: int, info: ValidationInfo) -> int:
-        width = info.data.get("width", heads)
-        if width % heads:
-            raise OptionError(
-                f"{heads} heads do not divide a width of {width}", f"write {math.gcd(heads, width)}"
-            )
-        return heads
 
 
 class Block(nn.Module):
