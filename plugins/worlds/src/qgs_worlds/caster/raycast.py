@@ -240,25 +240,6 @@ def _trace_primitive(primitive, heights, o, base, step, steps, spans):
 
 
 @inner
-def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
-    """Update the hits of rays in `area` where a room's shape is nearer than all earlier shapes.
-
-    body: primitive of the shape, which has no cut. The other arguments are those of `_trace_shape`.
-    """
-    above, below, first, last = area
-    kind = body.kind
-    extent = triple(body.extent)
-    along_row = steps[first:last]
-    lo = upright(body, minus(o, body.center))
-    ls = upright(body, narrow(rays[1]))
-    for row in range(above, below):
-        lb = upright(body, _row_base(rays, top + (row + 0.5) / samples))
-        depths = t[row, first:last]
-        codes = code[row, first:last]
-        _cover_row(depths, codes, own, kind, extent, along_row, lo, lb, ls)
-
-
-@inner
 def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch):
     """Update the hit of each ray for which this shape is nearer than all earlier shapes.
 
@@ -268,8 +249,20 @@ def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, are
     the rays. scratch: working memory.
     """
     above, below, first, last = area
+    body = shape.body
     step = narrow(rays[1])
     along_row = steps[first:last]
+    # a room's shape is upright and has no cut
+    if body.kind >= s.BLOCK:
+        extent = triple(body.extent)
+        lo = upright(body, minus(o, body.center))
+        ls = upright(body, step)
+        for row in range(above, below):
+            lb = upright(body, _row_base(rays, top + (row + 0.5) / samples))
+            depths = t[row, first:last]
+            codes = code[row, first:last]
+            _cover_row(depths, codes, own, body.kind, extent, along_row, lo, lb, ls)
+        return
     spans = scratch[:, :, : last - first]
     # without a second primitive there is no cut
     spans[1, 0] = NONE
@@ -277,7 +270,7 @@ def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, are
     spans[1, 3] = ZERO
     for row in range(above, below):
         base = _row_base(rays, top + (row + 0.5) / samples)
-        _trace_primitive(shape.body, heights, o, base, step, along_row, spans[0])
+        _trace_primitive(body, heights, o, base, step, along_row, spans[0])
         if shape.cut.kind != s.NOTHING:
             _trace_primitive(shape.cut, heights, o, base, step, along_row, spans[1])
         _closest(t[row, first:last], code[row, first:last], own, spans[0], spans[1])
@@ -314,8 +307,5 @@ def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
             continue
         area = (above, below, first, last)
         own = np.float32(8 * i)
-        if shape.body.kind >= s.BLOCK:
-            _trace_metric(t, code, top, samples, shape.body, own, o, rays, steps, area)
-        else:
-            _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch)
+        _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch)
     return t, code, rays
