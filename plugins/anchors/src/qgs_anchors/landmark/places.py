@@ -12,7 +12,7 @@ from torch import Tensor
 
 from qgs.geometry.constants import constant
 from qgs.precision import full_precision
-from qgs.types import Cameras
+from qgs.types import Cameras, Size
 
 EPS = 1e-4
 """Tolerance of comparisons, in pixels or in logarithms of aspect ratios."""
@@ -34,7 +34,7 @@ def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
 
 
 def patches(
-    grid: tuple[int, int, int], each: int, size: tuple[int, int], device: torch.device
+    grid: tuple[int, int, int], each: int, size: Size, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Put `each` points at the centre of every patch of a grid (V, rows, columns).
 
@@ -48,7 +48,7 @@ def patches(
 
 
 def spread(
-    count: int, views: int, size: tuple[int, int], aspect: float, device: torch.device
+    count: int, views: int, size: Size, aspect: float, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Spread N = `count` points evenly over photos of size (H, W).
 
@@ -83,12 +83,12 @@ def spread(
     return view_N, place_N2, torch.where(tiled, tile_2, square_2)
 
 
-def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tensor:
+def _square(count: int, views: int, size: Size, like: Tensor) -> Tensor:
     """Return the side `side_of` of a square as fractions (2,) of a photo's width and height."""
     return side_of(count, views, size) / constant([size[1], size[0]], like)
 
 
-def side_of(count: int, views: int, size: tuple[int, int]) -> float:
+def side_of(count: int, views: int, size: Size) -> float:
     """Return the side in pixels of `count` equal squares with the total area of all photos."""
     return math.sqrt(views * math.prod(size) / count)
 

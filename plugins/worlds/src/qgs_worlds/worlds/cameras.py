@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.random import Generator
 
 from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.caster.lens import lens, look_along
@@ -73,7 +74,7 @@ Motion: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 def draw_cameras(
-    rng: np.random.Generator,
+    rng: Generator,
     place: Place,
     world: tuple[np.ndarray, np.ndarray],
     count: int,
@@ -123,7 +124,7 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
     return max(close, sky - 0.3, 2.0 if near < CLEARANCE else 0.0)
 
 
-def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
+def _still(rng: Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
     """Return cameras within about 1 cm of one point; used if all random paths fail.
 
     The point is the one of 64 random points that is farthest from fixed shapes.
@@ -138,7 +139,7 @@ def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: in
     )
 
 
-def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
+def _draw(rng: Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
     """Return random cameras that have not been tested for collisions.
 
     shrink: factor from 0 to 1 by which the camera path is made shorter.
@@ -170,7 +171,7 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
 
 
 def _stand(
-    rng: np.random.Generator, place: Place, target: np.ndarray, varied: bool
+    rng: Generator, place: Place, target: np.ndarray, varied: bool
 ) -> tuple[np.ndarray, float]:
     """Return a random camera centre with a view of the target, and its distance to the target."""
     low, high = np.log(place.distance)
@@ -193,7 +194,7 @@ def _stand(
     return base, max(float(np.linalg.norm(base - target)), 0.3)
 
 
-def _walk(rng: np.random.Generator, path: Path) -> Motion:
+def _walk(rng: Generator, path: Path) -> Motion:
     """Return camera centres on a bent line, and the points that the cameras look at.
 
     If the field of view is wide, cameras may look ahead, not only at the target.
@@ -208,7 +209,7 @@ def _walk(rng: np.random.Generator, path: Path) -> Motion:
     return eyes, target + ahead * (eyes - base)
 
 
-def _orbit(rng: np.random.Generator, path: Path) -> Motion:
+def _orbit(rng: Generator, path: Path) -> Motion:
     """Return camera centres around the target, which all cameras look at.
 
     Height and distance change a little along the path.
@@ -225,7 +226,7 @@ def _orbit(rng: np.random.Generator, path: Path) -> Motion:
     return eyes, np.tile(target, (len(s), 1))
 
 
-def _round(rng: np.random.Generator, path: Path) -> Motion:
+def _round(rng: Generator, path: Path) -> Motion:
     """Return camera centres near one point, and the points that the cameras look at.
 
     The viewing direction turns from camera to camera, by so little that views overlap.
@@ -237,7 +238,7 @@ def _round(rng: np.random.Generator, path: Path) -> Motion:
     return eyes, eyes + way
 
 
-def _gather(rng: np.random.Generator, path: Path) -> Motion:
+def _gather(rng: Generator, path: Path) -> Motion:
     """Return random camera centres around one point; all cameras look at the target."""
     base, target, length, s, _ = path
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)

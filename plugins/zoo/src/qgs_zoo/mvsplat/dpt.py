@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from qgs_zoo.mvsplat.unet import resized, two_convolutions, zeroed
+from qgs_zoo.mvsplat.unet import conv3, resized, two_convolutions, zeroed
 
 LEVELS = 3
 """Number of resolutions (1/2, 1/4, 1/8) at which other networks' maps are appended to ViT maps."""
@@ -21,8 +21,8 @@ class ResidualUnit(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv1 = conv3(channels, channels)
+        self.conv2 = conv3(channels, channels)
 
     def forward(self, x_XFhw: Tensor) -> Tensor:
         return x_XFhw + self.conv2(self.conv1(x_XFhw.relu()).relu())
