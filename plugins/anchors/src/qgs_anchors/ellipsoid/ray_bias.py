@@ -74,7 +74,7 @@ class EllipsoidBias(AttentionBias):
         """
         center_n3, *matrices, factor_n1, lower_n1 = queries_nF.split([3, 9, 9, 1, 1], -1)
         cofactors_n33, ball_n33 = (matrix.unflatten(-1, (3, 3)) for matrix in matrices)
-        m_M3, d_M3, unit_M3 = (tokens_GM[rows : rows + 3].mT for rows in (0, 3, 6))
+        m_M3, d_M3, unit_M3 = (x_3M.mT for x_3M in tokens_GM.split(3))
         # Not expanded into products: far from the cameras, m and mu x d nearly cancel.
         e_nM3 = m_M3 - torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1)
         moment_nM = _times(cofactors_n33, e_nM3).square().sum(-1)

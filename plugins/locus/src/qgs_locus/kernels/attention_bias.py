@@ -104,8 +104,10 @@ class AttentionBias(ABC):
         for part_nF, part_nM in zip(*_parts(queries_nF, gradient_nM), strict=True):
             # A backward pass runs with gradients off.
             with torch.enable_grad():
-                leaves = part_nF.detach(), tokens_GM.detach()
-                leaves = leaves[0].requires_grad_(of_queries), leaves[1].requires_grad_(of_tokens)
+                leaves = (
+                    part_nF.detach().requires_grad_(of_queries),
+                    tokens_GM.detach().requires_grad_(of_tokens),
+                )
                 value_nM = self.value(*leaves)
             given = [leaf for leaf in leaves if leaf.requires_grad], part_nM.to(value_nM)
             found.append(torch.autograd.grad(value_nM, *given, materialize_grads=True))

@@ -51,13 +51,12 @@ class JointLayer(DecoderLayer):
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         """Return updated queries and image tokens. No token attends to masked queries."""
-        # Image tokens come first, so that slices separate them from queries.
+        # Image tokens come first, so that one cut separates them from queries.
         tokens = memory.features.shape[1]
         x_BTD = torch.cat([memory.features, state.features], 1)
         x_BTD = x_BTD + self.attention(self.norm(x_BTD), state.mask)
         x_BTD = x_BTD + self.mlp(self.mlp_norm(x_BTD))
-        queries_BND = x_BTD[:, tokens:]
-        tokens_BMD = x_BTD[:, :tokens]
+        tokens_BMD, queries_BND = x_BTD.tensor_split([tokens], 1)
         return state.replace(features=queries_BND), memory.replace(features=tokens_BMD)
 
     def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:

@@ -75,10 +75,8 @@ class DepthSplatEncoder(SweepEncoder):
         neighbours = nearest_neighbours(views.cameras.c2w, self.config.neighbours)
         sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
         depths, raw_BVCHW = self.network(views.images, sweep)
-        raw_BVCHW = at_least_float32(raw_BVCHW)
-        first = GAUSSIAN_CHANNELS
-        gaussian = raw_BVCHW[:, :, :first]
-        sh_BV3KHW = raw_BVCHW[:, :, first:].unflatten(2, (3, -1))
+        gaussian, sh_BVCHW = at_least_float32(raw_BVCHW).tensor_split([GAUSSIAN_CHANNELS], 2)
+        sh_BV3KHW = sh_BVCHW.unflatten(2, (3, -1))
         # The pixel's colour is added to the constant: an untrained network copies the photo.
         constant = sh_BV3KHW[:, :, :, :1] + ((views.images - 0.5) / SH_C0)[:, :, :, None]
         sh_BV3KHW = torch.cat([constant, sh_BV3KHW[:, :, :, 1:]], 3)

@@ -94,15 +94,15 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
 
     features: features of the pixels, view by view. rotation: camera to world.
     """
-    numbers_BMC = numbers_of(features_BMD)
     degree = degree_of(features_BMD.shape[-1])
     views = rotation_BV33.shape[1]
     first = sum(CHANNELS)
-    last = sum(CHANNELS) + 3 * coefficients(degree)
-    sh_BVPXK = numbers_BMC[..., first:last].unflatten(1, (views, -1)).unflatten(-1, (3, -1))
+    last = first + 3 * coefficients(degree)
+    before, sh_BMC, behind = numbers_of(features_BMD).tensor_split([first, last], -1)
+    sh_BVPXK = sh_BMC.unflatten(1, (views, -1)).unflatten(-1, (3, -1))
     world = torch.einsum("bvkl,bvpxl->bvpxk", world_harmonics(rotation_BV33, degree), sh_BVPXK)
     world = world.flatten(1, 2).flatten(2)
-    changed = torch.cat([numbers_BMC[..., :first], world, numbers_BMC[..., last:]], -1)
+    changed = torch.cat([before, world, behind], -1)
     # without the zeros that `numbers_of` appended
     return changed[..., : features_BMD.shape[-1]]
 
