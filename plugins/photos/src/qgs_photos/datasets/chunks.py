@@ -72,7 +72,7 @@ class ChunkScene(Scene):
     ) -> None:
         self.name = name
         self._file = file
-        self._config = config
+        self.config = config
         self._chunks = chunks
 
     @property
@@ -89,7 +89,7 @@ class ChunkScene(Scene):
     @cached_property
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
         """Held-out frames: every Nth if the option `holdout` is N > 0, else those in the chunk."""
-        every = self._config.holdout
+        every = self.config.holdout
         return held_out_frames(len(self), every) if every else self._record.held_out
 
     @cached_property
@@ -104,7 +104,7 @@ class ChunkScene(Scene):
         Raises ValueError for a pose or intrinsics that are invalid.
         """
         record = self._record
-        target = self._config.image_size
+        target = self.config.image_size
         require_usable(record)
         intrinsics = record.cameras[:, :4].double()
         sizes = torch.tensor(record.image_sizes)
@@ -152,13 +152,12 @@ class ChunkScene(Scene):
             intrinsics=record.intrinsics(frame, size),
             size=size,
             mask=read_mask(record, frame),
-            background=self._config.background,
         )
 
     def _pixels(self, record: Record, frame: int) -> np.ndarray:
         file = io.BytesIO(record.images[frame].numpy().tobytes())
         try:
-            image = decode_rgb(file, self._config.background)
+            image = decode_rgb(file, self.config.background)
         except OSError as error:
             raise ValueError(
                 f"{record.place(frame)} cannot be read as an image ({error}): copy or pack the "
@@ -171,13 +170,13 @@ class ChunkScene(Scene):
                 f"{record.place(frame)}: {problem.reason}: pack the data set again with "
                 "`qgs data pack`, which writes the entry 'sizes' that chunks of mixed sizes need"
             )
-        return CropResize(size, self._config.image_size).image(image)
+        return CropResize(size, self.config.image_size).image(image)
 
     def _mask(self, record: Record, frame: int) -> np.ndarray:
         mask = read_mask(record, frame)
         if mask is None:
-            return np.full(self._config.image_size, 255, np.uint8)
-        crop = CropResize((mask.shape[0], mask.shape[1]), self._config.image_size)
+            return np.full(self.config.image_size, 255, np.uint8)
+        crop = CropResize((mask.shape[0], mask.shape[1]), self.config.image_size)
         return crop.image(Image.fromarray(mask))
 
 

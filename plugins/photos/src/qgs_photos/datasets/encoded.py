@@ -17,8 +17,7 @@ class EncodedFrame:
 
     name: file name. data: bytes of the image file. c2w: camera-to-world (4, 4), float64, OpenCV
     axes. intrinsics: fx, fy, cx, cy in pixels. size: (H, W) of the photo. lens: distortion; None
-    for a pinhole camera. mask: (H, W) uint8; None for a photo without a mask. background: RGB in
-    [0, 1] behind transparent pixels.
+    for a pinhole camera. mask: (H, W) uint8; None for a photo without a mask.
     """
 
     name: str
@@ -28,7 +27,6 @@ class EncodedFrame:
     size: Size
     lens: Lens | None = None
     mask: np.ndarray | None = None
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 def encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
@@ -39,12 +37,11 @@ def encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
     """
     photo = scene.photos[frame]
     size = scene.stored_size(frame)
-    background = scene.config.background
     data = read_file(photo.path)
     # pixels are stored again only where EXIF turns them
     if photo.turns:
         file = io.BytesIO()
-        turned(decode_rgb(io.BytesIO(data), background), photo).save(file, "png")
+        turned(decode_rgb(io.BytesIO(data), scene.config.background), photo).save(file, "png")
         data = file.getvalue()
     return EncodedFrame(
         name=photo.name,
@@ -54,5 +51,4 @@ def encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
         size=size,
         lens=photo.lens,
         mask=photo.mask and np.array(turned(whole_mask(photo), photo)),
-        background=background,
     )

@@ -13,6 +13,7 @@ from torch import Tensor
 from qgs.contracts import Scene
 from qgs.data.images import CropResize, decode_rgb
 from qgs.data.photos.source import PhotoScene
+from qgs.drawing.images import png_bytes, rgb_picture
 from qgs_photos.datasets.chunks import ChunkScene
 from qgs_photos.datasets.encoded import EncodedFrame, encoded_photo
 
@@ -36,24 +37,11 @@ class Encoding:
     def image(self, pixels: np.ndarray) -> bytes:
         """Encode pixels (H, W, 3), uint8, as the bytes of a JPEG or PNG file."""
         if self.jpeg is None:
-            return encoded(pixels)
+            return png_bytes(pixels)
+        file = io.BytesIO()
         # by default Pillow would halve the resolution of colours
-        return encoded(pixels, "JPEG", quality=self.jpeg, subsampling=0)
-
-
-def encoded(pixels: np.ndarray, format: str = "PNG", **options: int) -> bytes:
-    """Encode uint8 pixels (H, W, 3) or (H, W) as the bytes of an image file.
-
-    format, options: arguments of Pillow's `save`.
-    """
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format, **options)
-    return file.getvalue()
-
-
-def bytes_of(image: Tensor) -> np.ndarray:
-    """Convert an image (C, H, W) in [0, 1] to pixels (H, W, C), uint8."""
-    return np.ascontiguousarray(image.movedim(0, -1).mul(255).round().byte().numpy())
+        Image.fromarray(pixels).save(file, "JPEG", quality=self.jpeg, subsampling=0)
+        return file.getvalue()
 
 
 def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
@@ -74,19 +62,19 @@ def _stored(
     photos = isinstance(scene, PhotoScene)
     frame = encoded_photo(scene, index) if photos else scene.encoded(index)
     try:
-        pixels = np.array(decode_rgb(io.BytesIO(frame.data), frame.background))
+        pixels = np.array(decode_rgb(io.BytesIO(frame.data), scene.config.background))
     except OSError as error:
         raise ValueError(
             f"scene {scene.name!r}, frame {index} ({frame.name}) cannot be read as an image "
             f"({error}): replace the file, or leave the scene out"
         ) from error
+    if frame.lens is not None:
+        return _straightened(frame, pixels, encoding), False
     with Image.open(io.BytesIO(frame.data)) as image:
         # every reader gets three channels out of it
         plain = image.mode == "RGB" and not image.has_transparency_data
-        if frame.lens is None and plain and image.format in _KEPT_FORMATS:
+        if plain and image.format in _KEPT_FORMATS:
             return frame, True
-    if frame.lens is not None:
-        return _straightened(frame, pixels, encoding), False
     return replace(frame, data=encoding.image(pixels)), False
 
 
@@ -98,11 +86,10 @@ def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -
     crop = CropResize(frame.size, frame.size, zoom)
 
     def straight(image: np.ndarray) -> np.ndarray:
-        whole = lens.undistorted(image, frame.intrinsics)
-        return crop.image(Image.fromarray(whole)) if zoom > 1 else whole
+        return crop.image(Image.fromarray(lens.undistorted(image, frame.intrinsics)))
 
     own = torch.tensor(frame.intrinsics, dtype=torch.float64)
-    fx, fy, cx, cy = (crop.intrinsics(own) if zoom > 1 else own).tolist()
+    fx, fy, cx, cy = crop.intrinsics(own).tolist()
     return replace(
         frame,
         data=encoding.image(straight(pixels)),
@@ -118,11 +105,11 @@ def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
     fx, fy, cx, cy = cameras.intrinsics.double().tolist()
     return EncodedFrame(
         name=scene.frame_name(index),
-        data=encoding.image(bytes_of(scene.images([index])[0])),
+        data=encoding.image(rgb_picture(scene.images([index])[0])),
         c2w=cameras.c2w.double().numpy(),
         intrinsics=(fx, fy, cx, cy),
         size=cameras.size,
-        mask=None if masks is None else bytes_of(masks[0])[..., 0],
+        mask=None if masks is None else rgb_picture(masks[0])[..., 0],
     )
 
 
@@ -145,7 +132,7 @@ def chunk_entry(
         "sizes": torch.tensor([frame.size for frame in frames], dtype=torch.int32),
     }
     if any(frame.mask is not None for frame in frames):
-        masks = [b"" if frame.mask is None else encoded(frame.mask) for frame in frames]
+        masks = [b"" if frame.mask is None else png_bytes(frame.mask) for frame in frames]
         entry["masks"] = [*map(_bytes, masks)]
     if held_out:
         entry["held_out"] = torch.tensor(list(held_out))

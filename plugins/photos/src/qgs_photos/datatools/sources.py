@@ -10,8 +10,8 @@ from upath import UPath
 from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
+from qgs.drawing.images import png_bytes, rgb_picture
 from qgs.recipe.registry import Registry, load_plugin, load_usable_plugins
-from qgs_photos.datatools.entries import bytes_of, encoded
 from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
 OF_FILES = ("qgs", "datasets")
@@ -107,7 +107,7 @@ def _photo(scene: Scene, frame: int) -> Photo:
     )
     return Photo(
         listed,
-        lambda: encoded(bytes_of(scene.images([frame])[0])),
+        lambda: png_bytes(rgb_picture(scene.images([frame])[0])),
         {"mask": lambda: _read_mask(scene, frame)},
     )
 
