@@ -1,7 +1,6 @@
 """Convert any source of scenes to chunks, which training reads fast."""
 
 import json
-import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -12,7 +11,7 @@ import torch
 from upath import UPath
 
 from qgs.contracts import SceneSource, Split
-from qgs.files import replacing
+from qgs.files import is_leftover, replacing
 from qgs.paths import is_local, listing, read_json
 from qgs.wording import listed
 from qgs_photos.datasets.chunk_files import INDEX, SUFFIX, load_chunk
@@ -87,24 +86,20 @@ def _begin(folder: UPath, settings: Mapping[str, Any]) -> None:
                 "these settings to finish that packing, or give a new folder"
             )
         return
-    if held := sorted(item.name for item in listing(folder) if not _is_unfinished(item)):
+    held = [item.name for item in listing(folder) if not is_leftover(item)]  # type: ignore[arg-type]
+    if held:
         raise FileExistsError(
-            f"{folder} is not empty ({listed(held)}), and packing never overwrites: "
+            f"{folder} is not empty ({listed(sorted(held))}), and packing never overwrites: "
             "give a new folder"
         )
     write_bytes(file, json.dumps(settings).encode())
-
-
-def _is_unfinished(path: UPath) -> bool:
-    """Return whether `path` is a temporary file of `opened_replacing`, left by a killed process."""
-    return path.name.startswith(".") and path.suffix == ".tmp"
 
 
 def _packed_before(folder: UPath) -> dict[str, str]:
     """Return the chunk file of each packed scene by the scene's name; delete unfinished files."""
     files: dict[str, str] = {}
     for item in sorted(listing(folder), key=str):
-        if _is_unfinished(item):
+        if is_leftover(item):  # type: ignore[arg-type]
             item.unlink()
         elif item.suffix == SUFFIX:
             files |= {entry["key"]: item.name for entry in load_chunk(item)}
@@ -210,26 +205,18 @@ def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEnt
 
 @contextmanager
 def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
-    """Open a temporary file that replaces `path` if the `with` block ends without an error.
+    """Open a file that replaces `path` if the `with` block ends without an error.
 
-    Missing parent folders are made. On a local disk the replacement is atomic; an object store
-    shows an object only when it is complete.
+    Missing parent folders are made. On a local disk the replacement is atomic; other file systems
+    show a file only when it is complete.
     """
     if is_local(path):
         with replacing(Path(str(path))) as temporary, temporary.open("wb") as file:
             yield file
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            yield file
-        path.fs.mv(temporary.path, path.path)
-    # Ctrl-C must not leave the temporary file either
-    except BaseException:
-        if temporary.exists():
-            temporary.unlink()
-        raise
+    with path.fs.transaction, path.open("wb") as file:
+        yield file
 
 
 def write_bytes(path: UPath, data: bytes) -> None:
