@@ -15,11 +15,11 @@ from tape_source import Tape
 @pytest.fixture
 def tapes(tmp_path, install):
     install(*tape_source.INSTALLED)
-    sources._imported.cache_clear()
+    sources.sources.cache_clear()
     for name in "ab":
         tape_source.write_tape(tmp_path / f"tapes/{name}.tape")
     yield tmp_path / "tapes"
-    sources._imported.cache_clear()
+    sources.sources.cache_clear()
 
 
 def test_check(tapes):

@@ -223,11 +223,10 @@ def _opened(
     from qgs.data.recognition import recognised
     from qgs.paths import opened_path
     from qgs.recipe import resolve
-    from qgs_photos.datatools.sources import left_out, sources
+    from qgs_photos.datatools.sources import sources
 
     recipe: Any = path
     if Path(path).suffix not in {".yaml", ".yml"}:
-        print_lines(Console(), left_out())
         kind = recognised(opened_path(path), sources())
         plugin = kind.partition("/")[0]
         recipe = {"recipe": 1, "data": {"type": kind, "path": path}}

@@ -20,7 +20,7 @@ from qgs_photos.datatools.folders import dl3dv_scenes, photo_folders
 from qgs_photos.datatools.geometry import TOO_FEW, geometry_findings, judge_scene
 from qgs_photos.datatools.indices import found_indices, index_findings
 from qgs_photos.datatools.photos import Candidate, DecodedScene, Photo, decode, error_text
-from qgs_photos.datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
+from qgs_photos.datatools.sources import OF_FILES, kind_of, source_scenes, sources
 
 PHOTOS = 400
 """Number of photos to match in a data set, divided among the scenes whose poses are checked.
@@ -77,7 +77,7 @@ def check(
     # over the whole data set: faults come in batches of scenes
     wanted = 0 if options.headers_only else min(options.geometry, count)
     judged = {*np.linspace(0, max(count - 1, 0), wanted).round().astype(int).tolist()}
-    notes = left_out(options.format)
+    notes = list[str]()
     if len(judged) < count:
         some = f"poses were checked by photos in {len(judged)} of {count} scenes"
         notes.append(f"{some}; --geometry {count} checks all")

@@ -11,7 +11,8 @@ from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
 from qgs.drawing.images import png_bytes, rgb_picture
-from qgs.recipe.registry import Registry, load_plugin, load_usable_plugins
+from qgs.recipe.registry import Registry, load_plugin
+from qgs.reconstruction.scenes import installed_sources
 from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
 OF_FILES = ("qgs", "datasets")
@@ -23,37 +24,20 @@ _SIZE = (256, 256)
 
 
 @cache
-def _imported(format: str) -> tuple[Registry, list[str]]:
-    """Import plugins; return their components, and an error for each that cannot be imported.
-
-    format: "auto" imports all plugins. Every other format imports the plugins `qgs` and `datasets`;
-    PLUGIN/NAME also imports PLUGIN. Unless `format` is "auto", a plugin that cannot be imported
-    raises PluginError.
-    """
-    if format == "auto":
-        return load_usable_plugins()
-    plugin, slash, _ = format.partition("/")
-    names = [*OF_FILES, *([plugin] if slash else [])]
-    return Registry({name: load_plugin(name) for name in names}), []
-
-
 def sources(format: str = "auto") -> dict[str, type[Component]]:
     """Return the data sources that have an option `path`, by type PLUGIN/NAME.
 
-    format: "auto" searches all plugins; PLUGIN/NAME searches PLUGIN and the plugins OF_FILES, which
-    are `qgs` and `datasets`; any other format searches only these two. Raises PluginError if PLUGIN
-    cannot be imported.
+    format: "auto" searches all plugins, and warns of those that cannot be imported; PLUGIN/NAME
+    searches PLUGIN and the plugins OF_FILES, which are `qgs` and `datasets`; any other format
+    searches only these two. Raises PluginError if PLUGIN cannot be imported.
     """
-    found = _imported(format)[0].components("data")
+    if format == "auto":
+        found = installed_sources()
+    else:
+        plugin, slash, _ = format.partition("/")
+        names = [*OF_FILES, *([plugin] if slash else [])]
+        found = Registry({name: load_plugin(name) for name in names}).components("data")
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}
-
-
-def left_out(format: str = "auto") -> list[str]:
-    """Return a line of text for each installed plugin that cannot be imported.
-
-    format: "auto" tries to import all plugins; for any other format, the list is empty.
-    """
-    return [f"left out: {problem}" for problem in _imported(format)[1]]
 
 
 def kind_of(path: UPath) -> str:
