@@ -146,7 +146,7 @@ def test_what_is_refused_is_told_alike(method, tmp_path):
     for frame, name in enumerate(files):
         must_refuse(re.escape(name), getattr(read, method), [frame])
     assert finding.severity == "error"
-    assert finding.frames == (*range(len(files)),)
+    assert [frame for frame, *_ in finding.photos] == [*range(len(files))]
     assert next(iter(files)) in str(finding)
 
 

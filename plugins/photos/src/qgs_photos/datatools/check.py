@@ -215,4 +215,4 @@ def _unreadable(name: str, error: Exception) -> Finding:
 
 
 def _frames(findings: Sequence[Finding]) -> set[int]:
-    return {frame for finding in errors_of(findings) for frame in finding.frames}
+    return {frame for finding in errors_of(findings) for frame, *_ in finding.photos}

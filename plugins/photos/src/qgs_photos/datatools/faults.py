@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
+from qgs.data.images import TURN, TURNED
 from qgs.data.photos.reader import (
     UNLESS,
     FrameProblem,
@@ -30,8 +31,8 @@ def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
         listed = photo.listed
         for reason, fix in result.errors:
             yield scene.finding([frame], reason, fix)
-        for reason, fix in result.warnings:
-            yield scene.finding([frame], reason, fix, "warning")
+        if result.unturned:
+            yield scene.finding([frame], f"photos {TURNED}", TURN, "warning")
         problems = list(listed.problems)
         # a wrong size makes intrinsics look wrong
         problems += size_problems(result.size, listed.size) if result.size else ()

@@ -18,26 +18,23 @@ _FEW = 3
 class Finding:
     """A fault of a scene or a file, and how to correct it.
 
-    scene: name of the scene or of the file. reason: what is wrong. fix: what to do. frames: indices
-    of the faulty photos in the list of photos. names: file names of the faulty photos. numbers:
-    frame numbers of the faulty photos in the loaded scene; None for a photo that is not loaded.
-    frames, names and numbers are empty if the whole scene is at fault. severity: an error makes
-    results wrong; a warning marks what may make results wrong.
+    scene: name of the scene or of the file. reason: what is wrong. fix: what to do. photos: the
+    faulty photos, each with its index in the list of photos, its file name, and its frame number in
+    the loaded scene, which is None for a photo that is not loaded; empty if the whole scene is at
+    fault. severity: an error makes results wrong; a warning marks what may make results wrong.
     """
 
     scene: str
     reason: str
     fix: str
-    frames: tuple[int, ...] = ()
-    names: tuple[str, ...] = ()
     severity: Severity = "error"
-    numbers: tuple[int | None, ...] = ()
+    photos: tuple[tuple[int, str, int | None], ...] = ()
 
     @property
     def place(self) -> str:
         """Text that names the photos, such as "frames 0-3 (a.jpg to d.jpg)"; "" without photos."""
-        names = [name for name in self.names if name]
-        numbers = [number for number in self.numbers if number is not None]
+        names = [name for _, name, _ in self.photos if name]
+        numbers = [number for *_, number in self.photos if number is not None]
         if not numbers:
             return listed(names, 3)
         text = f"frame{'s' if len(numbers) > 1 else ''} {spans(numbers)}"
@@ -84,12 +81,7 @@ def _joined(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> list[
     for finding in findings:
         known = joined.setdefault(key(finding), finding)
         if known is not finding:
-            joined[key(finding)] = replace(
-                known,
-                frames=known.frames + finding.frames,
-                names=known.names + finding.names,
-                numbers=known.numbers + finding.numbers,
-            )
+            joined[key(finding)] = replace(known, photos=known.photos + finding.photos)
     return list(joined.values())
 
 

@@ -6,10 +6,10 @@ from functools import partial
 import numpy as np
 from upath import UPath
 
-from qgs.data.images import decode_alpha, decode_depth, decode_mask, read_image
+from qgs.data.images import decode_depth, read_image
 from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.reader import PhotoFrame
-from qgs.data.photos.source import folder_name, upright
+from qgs.data.photos.source import folder_name, upright, whole_mask
 from qgs.paths import read_file
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
 from qgs_photos.datatools.findings import Finding
@@ -77,9 +77,7 @@ def _photos(folder: UPath, kind: str, images: str | None) -> Photos:
 
 
 def _mask(frame: PhotoFrame) -> np.ndarray | None:
-    if frame.mask is None:
-        return None
-    return read_image(frame.mask, decode_alpha if frame.mask == frame.path else decode_mask)
+    return None if frame.mask is None else np.array(whole_mask(frame))
 
 
 def _depth(frame: PhotoFrame) -> np.ndarray | None:

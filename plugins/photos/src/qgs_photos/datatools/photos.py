@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 from PIL import Image
 
-from qgs.data.images import TURN, TURNED, decode_rgb, eight_bits, opened_image, orientation
+from qgs.data.images import decode_rgb, eight_bits, opened_image, orientation
 from qgs.data.photos.reader import PhotoFrame, Size, size_problems
 from qgs.data.photos.source import turned, turned_size
 from qgs.wording import numbered, one_line
@@ -80,15 +80,16 @@ class Decoded:
     """Result of decoding a photo.
 
     size: (H, W); None if it cannot be decoded. digest: hash of the file's bytes, by which equal
-    photos are found. errors, warnings: pairs of reason and remedy. empty_mask: whether the mask
-    leaves out the whole photo; None without a mask. edges: strength of edges in the photo and in
-    its mask, two maps of size _SQUARE; None without a mask.
+    photos are found. errors: pairs of reason and remedy. unturned: whether the photo has an EXIF
+    orientation that is ignored. empty_mask: whether the mask leaves out the whole photo; None
+    without a mask. edges: strength of edges in the photo and in its mask, two maps of size _SQUARE;
+    None without a mask.
     """
 
     size: Size | None = None
     digest: bytes = b""
     errors: Sequence[tuple[str, str]] = ()
-    warnings: Sequence[tuple[str, str]] = ()
+    unturned: bool = False
     empty_mask: bool | None = None
     edges: np.ndarray | None = None
 
@@ -105,15 +106,8 @@ class DecodedScene:
         self, frames: Sequence[int], reason: str, fix: str, severity: Severity = "error"
     ) -> Finding:
         """Return a finding about some photos. frames: their indices in `photos`."""
-        return Finding(
-            scene=self.name,
-            reason=reason,
-            fix=fix,
-            frames=tuple(frames),
-            names=tuple(self.photos[frame].listed.name for frame in frames),
-            severity=severity,
-            numbers=tuple(self.numbers[frame] for frame in frames),
-        )
+        photos = [(frame, self.photos[frame].listed.name, self.numbers[frame]) for frame in frames]
+        return Finding(self.name, reason, fix, severity, tuple(photos))
 
     @cached_property
     def numbers(self) -> Sequence[int | None]:
@@ -155,7 +149,7 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
             pixels = eight_bits(image)
             black = _is_black(pixels)
             # EXIF may stand behind the pixels
-            by_exif = orientation(image) != 1 and not photo.listed.turns
+            unturned = orientation(image) != 1 and not photo.listed.turns
     except Exception as error:
         # whatever a reader raises; the other photos go on
         reason = f"the image cannot be decoded ({error_text(error)})"
@@ -177,8 +171,7 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
         except Exception as error:
             reasons = [error_text(error)]
         errors += [(reason, f"replace the {kind}") for reason in reasons]
-    turns = [(f"photos {TURNED}", TURN)] if by_exif else []
-    return Decoded(size, digest, errors, turns, empty, edges)
+    return Decoded(size, digest, errors, unturned, empty, edges)
 
 
 def _edges(image: Image.Image) -> np.ndarray:
