@@ -113,10 +113,8 @@ class CamerasJson(PhotoReader):
                     f"{len(listed)} images: name the images, as in {_FORM}"
                 )
             find = dict
-        read = [_Camera(*pair, find) for pair in zip(cameras, listed, strict=True)]
-        if any(camera.in_parts for camera in read):
-            warn_once(f"intrinsics <= 3 in {file} are read as fractions of width and height")
-        return Listing(file, [camera.frame(folder) for camera in read])
+        pairs = zip(cameras, listed, strict=True)
+        return Listing(file, [_Camera(file, *pair, find).frame() for pair in pairs])
 
 
 def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
@@ -157,15 +155,20 @@ def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
 
 
 class _Camera:
-    """A camera in `cameras.json`.
+    """A camera in `cameras.json`, the `file`.
 
     values: the camera's entry in the file. path: the camera's photo as listed. find: function that
     returns the existing file of each listed photo; called only if the entry has no image size.
     """
 
     def __init__(
-        self, values: Mapping[str, Any], path: UPath, find: Callable[[], Mapping[UPath, UPath]]
+        self,
+        file: UPath,
+        values: Mapping[str, Any],
+        path: UPath,
+        find: Callable[[], Mapping[UPath, UPath]],
     ) -> None:
+        self.file = file
         self.values = values
         self.path = path
         self.find = find
@@ -177,7 +180,6 @@ class _Camera:
             plain = numbers(sides)
             self.size, wrong = listed_size(*(plain if plain.shape == (2,) else _NO_SIZE))
             self.problems += wrong
-        self.in_parts = False
         self.pose = self._pose()
         self.intrinsics = self._intrinsics()
 
@@ -228,7 +230,7 @@ class _Camera:
             self._wrong(f"{reason}: expected 'K', 3 x 3")
             return np.full(4, np.nan)
         if np.abs(matrix).max() <= _NORMALISED and (size := self._photo_size()):
-            self.in_parts = True
+            warn_once(f"intrinsics <= 3 in {self.file} are read as fractions of width and height")
             height, width = size
             return matrix * [width, height, width, height]
         return matrix
@@ -240,8 +242,9 @@ class _Camera:
                 self.size = read_image(self.find().get(self.path, self.path), image_size)
         return self.size
 
-    def frame(self, folder: UPath) -> PhotoFrame:
-        """Return the photo and its camera; the photo's name is its path relative to `folder`."""
+    def frame(self) -> PhotoFrame:
+        """Return the photo and its camera; the photo's name is its path from the file's folder."""
+        folder = self.file.parent
         name = "" if self.path == folder else "/".join(inside(folder, self.path))
         if not name:
             self._wrong("no image is named")
