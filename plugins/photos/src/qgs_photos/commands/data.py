@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
-from qgs.terminal import print_lines
+from qgs.terminal import print_lines, print_table
 from qgs.wording import counted
 
 if TYPE_CHECKING:
@@ -128,7 +127,7 @@ def check(
 
         result = check(opened_path(path), options, indices, progress)
     if result.scenes:
-        console.print(_table(result.scenes), markup=False)
+        print_table(console, "", _rows(result.scenes), box=None, pad_edge=False)
     print_lines(console, map(str, result.findings))
     print_lines(console, [f"note: {note}" for note in result.notes])
     errors = len(errors_of(result.findings))
@@ -140,19 +139,15 @@ def check(
         raise typer.Exit(1)
 
 
-def _table(scenes: Sequence[SceneReport]) -> Table:
-    table = Table(header_style="bold", box=None, pad_edge=False)
-    table.add_column("scene", overflow="fold", min_width=12)
-    table.add_column("format")
-    for column in ("frames", "decodable", "missing", "bad poses", "epipolar px"):
-        table.add_column(column, justify="right")
+def _rows(scenes: Sequence[SceneReport]) -> list[list[str]]:
+    rows = [["scene", "format", "frames", "decodable", "missing", "bad poses", "epipolar px"]]
     # of many scenes the worst
     for scene in sorted(scenes, key=lambda scene: -len(scene.findings))[:_ROWS]:
         counts = (scene.listed, scene.decodable, scene.missing, scene.pose_problems)
-        table.add_row(scene.name, scene.kind, *map(str, counts), scene.epipolar)
+        rows.append([scene.name, scene.kind, *map(str, counts), scene.epipolar])
     if len(scenes) > _ROWS:
-        table.add_row(f"and {len(scenes) - _ROWS} more")
-    return table
+        rows.append([f"and {len(scenes) - _ROWS} more"])
+    return rows
 
 
 @app.command("pack")
