@@ -3,10 +3,9 @@
 import math
 
 from qgs.contracts import Frames, Scene
-from qgs.data.recognition import open_for
 from qgs.data.view_samplers import held_out_frames
 from qgs.machine import available_bytes
-from qgs.reconstruction.scenes import Size, installed_sources, named_scene
+from qgs.reconstruction.scenes import Size, photo_scene
 from qgs_photos.refine.options import NONE, Options
 
 TIMED = 2048
@@ -45,7 +44,6 @@ class ScenePhotos:
     def __init__(self, path: str, options: Options) -> None:
         self.path = path
         self.name = options.scene
-        self._sources = installed_sources()
         found = self.at(None)
         self.small = self.at(sized(found, _SMALL))
         self.held_out = judged_frames(found, options.holdout)
@@ -54,9 +52,8 @@ class ScenePhotos:
         self.small.held_out = self.held_out
 
     def at(self, size: Size | None) -> Scene:
-        """Return the scene with photos of `size` (H, W); None takes the reader's default size."""
-        source, _ = open_for(self.path, size, None, self._sources)
-        return named_scene(source, self.path, self.name)
+        """Return the scene with photos of `size` (H, W); None takes the stored size."""
+        return photo_scene(self.path, size, self.name)
 
 
 def judged_frames(scene: Scene, holdout: str) -> Frames:
