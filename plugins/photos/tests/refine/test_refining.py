@@ -202,11 +202,11 @@ def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay():
     def posed(c2w):
         return replace(true, cameras=replace(true.cameras, c2w=c2w))
 
-    def found(seconds, poses):
-        return refined(posed(wrong), seconds, poses=poses).cameras.c2w
+    def found(seconds, *adjust):
+        return refined(posed(wrong), seconds, adjust=adjust).cameras.c2w
 
-    assert_equal(found(3, poses=False), wrong)
-    better = found(200, poses=True)
+    assert_equal(found(3), wrong)
+    better = found(200, "poses")
     before, after = (mean_psnr(cloud(60), posed(c2w).select([2])) for c2w in (wrong, better))
     assert after > before + 3
     assert 0 < (better - wrong)[0, [0, 1, 3, 4], :3, 3].norm(dim=-1).max() < 0.01
@@ -218,8 +218,8 @@ def test_a_darker_photo_leaves_the_gaussians_alone():
     true = photos(3)
     dark = true.images * torch.tensor([1.0, 0.6, 1])[:, None, None, None]
     plain, adjusted = (
-        refined(replace(true, images=dark), 120, exposure=exposure).gaussians
-        for exposure in (False, True)
+        refined(replace(true, images=dark), 120, adjust=adjust).gaussians
+        for adjust in ((), ("exposure",))
     )
     assert mean_psnr(adjusted, true) > mean_psnr(plain, true) + 0.5
 

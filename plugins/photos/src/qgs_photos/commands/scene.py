@@ -123,9 +123,6 @@ def scene(
     from qgs_photos.refine.refining import Extras
     from qgs_photos.refine.scene import make_scene
 
-    adjusted = adjust or []
-    exposure = Adjustment.EXPOSURE in adjusted
-    poses = Adjustment.POSES in adjusted
     options = Options(
         model=model,
         frames=frames,
@@ -136,7 +133,7 @@ def scene(
         holdout=holdout,
         scene=scene_name,
         device=choose_device(device),
-        extras=Extras(degree=degree, exposure=exposure, poses=poses),
+        extras=Extras(degree, adjust or ()),
         masks=masks,
     )
     try:

@@ -1,5 +1,7 @@
 """Optimise the pose and the exposure of each photo together with the Gaussians."""
 
+from collections.abc import Collection
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -7,11 +9,12 @@ from torch import Tensor
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras
 
-_RATES = {"poses": 3e-4, "colors": 5e-3}
+_SHAPES = {"poses": (6,), "exposure": (3, 4)}
+_RATES = {"poses": 3e-4, "exposure": 5e-3}
 # Final learning rates over the first.
 _LAST = 0.1
 # Weights of squares, so that the world and its colours stay where they are in the mean.
-_HELD = {"poses": 10.0, "colors": 0.1}
+_HELD = {"poses": 10.0, "exposure": 0.1}
 
 
 class Adjustments:
@@ -21,19 +24,17 @@ class Adjustments:
     translation divided by `size`. An exposure has 3 x 4 parameters: the deviation from the identity
     of an affine map of rendered RGB.
 
-    photos: number of photos. poses, exposure: whether to optimise the poses, the exposures. size:
-    size of the scene in world units. like: tensor whose type and device the parameters get.
+    photos: number of photos. adjust: what is optimised, "poses" and "exposure". size: size of the
+    scene in world units. like: tensor whose type and device the parameters get.
     """
 
-    def __init__(self, photos: int, poses: bool, exposure: bool, size: float, like: Tensor) -> None:
+    def __init__(self, photos: int, adjust: Collection[str], size: float, like: Tensor) -> None:
         self.size = size
-        shapes: dict[str, tuple[int, ...]] = {"poses": (6,)} if poses else {}
-        if exposure:
-            shapes["colors"] = (3, 4)
         # One tensor a photo: Adam leaves those without a gradient where they are.
         self._parts = {
             name: [like.new_zeros(shape).requires_grad_() for _ in range(photos)]
-            for name, shape in shapes.items()
+            for name, shape in _SHAPES.items()
+            if name in adjust
         }
         self._optimizers = {
             name: torch.optim.Adam(part, eps=1e-15) for name, part in self._parts.items()
@@ -58,9 +59,9 @@ class Adjustments:
 
     def seen(self, photo: int, rgb: Tensor) -> Tensor:
         """Apply the exposure of the photo with index `photo` to rendered `rgb` (1, 1, 3, H, W)."""
-        if "colors" not in self._parts:
+        if "exposure" not in self._parts:
             return rgb
-        change = self._parts["colors"][photo]
+        change = self._parts["exposure"][photo]
         turned = torch.einsum("ij,bvjhw->bvihw", change[:, :3], rgb)
         return rgb + turned + change[:, 3, None, None]
 

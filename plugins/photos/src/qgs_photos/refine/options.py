@@ -50,11 +50,10 @@ class Options:
             "--holdout": self.holdout,
             "--degree": self.extras.degree,
         }
-        adjusted = {"poses": self.extras.poses, "exposure": self.extras.exposure}
         words = ["qgs", "scene", photos]
         for name, value in values.items():
             words += [] if value is None else [name, str(value)]
-        for what, wanted in adjusted.items():
-            words += ["--adjust", what] if wanted else []
+        for what in self.extras.adjust:
+            words += ["--adjust", what]
         words += ["--masks"] if self.masks else []
         return shlex.join(words)

@@ -6,6 +6,7 @@ short steps of gradient descent cannot repair.
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -66,8 +67,8 @@ class RefinedScene:
     """Result of a refinement.
 
     gaussians: (1, G). steps, seconds: length of the optimisation. cameras: (1, V) of the photos,
-    optimised if `Extras.poses` is set. stopped_by: name of the signal that ended the optimisation
-    early; None if it was complete.
+    optimised if `Extras.adjust` has "poses". stopped_by: name of the signal that ended the
+    optimisation early; None if it was complete.
     """
 
     gaussians: Gaussians
@@ -82,13 +83,12 @@ class Extras:
     """Quantities to optimise in addition to means, shapes, opacities and colours of the Gaussians.
 
     degree: spherical harmonics up to this degree, 0 to 3, are added in steps if the first Gaussians
-    have none; 0 adds none. exposure: an affine map of the colours of each photo. poses: the pose of
-    each photo.
+    have none; 0 adds none. adjust: properties of each photo: "poses", its camera, and "exposure",
+    an affine map of its colours.
     """
 
     degree: int = 0
-    exposure: bool = False
-    poses: bool = False
+    adjust: Collection[str] = ()
 
 
 NO_EXTRAS = Extras()
@@ -191,9 +191,7 @@ class _Run:
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
         self.free = FreeGaussians(gaussians, self.rates)
         self.photos = views.images.shape[1]
-        self.adjustments = Adjustments(
-            self.photos, extras.poses, extras.exposure, self.size, gaussians.means
-        )
+        self.adjustments = Adjustments(self.photos, extras.adjust, self.size, gaussians.means)
         self.step = 0
         self.grown = 0
         # half of the time is for steps, however long a slow machine matches photos
