@@ -24,10 +24,10 @@ import torch.nn.functional as F
 from kornia.geometry.transform import warp_perspective
 from qgs_photos.datasets.view_samplers import apart
 from qgs_photos.refine import refine
-from qgs_viewer.comparison import checkpoints, recipes_alike, spread_windows
+from qgs_viewer.comparison import recipes_alike, spread_windows
 from torch import Tensor
 
-from qgs.checkpoint.model_file import CheckpointFile, load
+from qgs.checkpoint.model_file import CheckpointFile
 from qgs.data.inputs import scene_depth
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.metrics.baselines import nearest_input
@@ -72,9 +72,9 @@ def scene_rows(
     name: str, photos: Path, distance: float, options: argparse.Namespace
 ) -> Iterator[Row]:
     """Yield a row for each window of the scene in the folder `photos`."""
-    files = checkpoints([name])
-    recipe = next(iter(recipes_alike(files, str(photos), None).values()))
-    model = load(next(iter(files.values())), "cpu").eval()
+    with CheckpointFile(name) as file:
+        recipe = recipes_alike({name: file.recipe}, str(photos), None)[name]
+        model = file.model("cpu")
     scene = recipe.build_data().scenes("test")[0]
     views = recipe.views
     # Its weights are not read: only the cameras that it was trained on are asked for.

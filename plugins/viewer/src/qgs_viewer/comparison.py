@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
@@ -154,7 +154,7 @@ class Model:
             return views
         key = (scene.name, inputs, compared)
         if key not in self.scales:
-            self.scales[key] = find_scale(self.network.eval(), scene, inputs, compared, views)
+            self.scales[key] = find_scale(self.network, scene, inputs, compared, views)
         return constant_scale(views, self.scales[key].factor)
 
     @cached_property
@@ -202,14 +202,6 @@ def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
     return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 
 
-def checkpoints(names: Sequence[str]) -> dict[str, Path]:
-    """Return the checkpoint file of each model, by a short name of the model.
-
-    names: paths, URLs or shipped models, as `checkpoint_path` takes them.
-    """
-    return dict(zip(numbered_names(names), map(checkpoint_path, names), strict=True))
-
-
 def open_models(
     names: Sequence[str],
     photos: str | None,
@@ -223,26 +215,30 @@ def open_models(
     `recipes_alike`. Without `size`, the first model decides on the size of photos by `find_size`.
     Raises ValueError if models cannot be compared under one protocol.
     """
-    files = checkpoints(names)
-    recipes = recipes_alike(files, photos, size, overrides)
-    models = list[Model]()
-    fixed = size is not None
-    for name, path in files.items():
-        with CheckpointFile(path) as file:
-            models.append(Model(name, path, file.model(device), recipes[name], file.step))
-            own = photos is not None and is_training_data(photos, file.recipe.data_config)
-            fixed = fixed or own or size_multiple(file.recipe) is None
+    with ExitStack() as opened:
+        paths = map(checkpoint_path, names)
+        files = [opened.enter_context(CheckpointFile(path)) for path in paths]
+        trained = {n: file.recipe for n, file in zip(numbered_names(names), files, strict=True)}
+        recipes = recipes_alike(trained, photos, size, overrides)
+        models = [
+            Model(name, file.path, file.model(device), recipe, file.step)
+            for file, (name, recipe) in zip(files, recipes.items(), strict=True)
+        ]
     if photos is None:
         return models
     first = models[0]
     # those of the first model for all, so that one protocol judges them
     count = ALONE if len(models) == 1 else WINDOWS
     windows = PhotoWindows(first.network.trained_on or Domain(), count)
-    if not fixed:
+    fixed = any(
+        is_training_data(photos, recipe.data_config) or size_multiple(recipe) is None
+        for recipe in trained.values()
+    )
+    if size is None and not fixed:
         first.size = _found_size(first, windows)
     if first.size and first.size.halved:
         height, width = first.recipe.tree["data"]["image_size"]
-        recipes = recipes_alike(files, photos, (height // 2, width // 2), overrides)
+        recipes = recipes_alike(trained, photos, (height // 2, width // 2), overrides)
     for model in models:
         model.windows = windows
         model.recipe = recipes[model.name]
@@ -257,7 +253,7 @@ def _found_size(model: Model, windows: PhotoWindows) -> FoundSize | None:
         scene = data.scenes("test" if data.names("test") else "train")[0]
         for window in windows.windows(scene, model.recipe.views)[:1]:
             views = model.views_of(scene, *window)
-            return find_size(model.network.eval(), scene, *window, views)
+            return find_size(model.network, scene, *window, views)
     return None
 
 
@@ -297,24 +293,21 @@ def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> No
 
 
 def recipes_alike(
-    files: Mapping[str, Path],
+    trained: Mapping[str, Recipe],
     photos: str | None,
     size: Size | None,
     overrides: Sequence[str] = (),
 ) -> dict[str, Recipe]:
-    """Return the recipes of checkpoints, by name, with `photos` as their data if they are given.
+    """Return the recipes of trained models, by name, with `photos` as their data if given.
 
-    files: checkpoint by name. photos: folder or video; None keeps the data of the recipes. size:
-    (H, W) of the photos in pixels; by default a size that all models take and that crops no photo.
-    overrides: settings of `views` for photos, such as a scale.
+    trained: recipe of the training, by name. photos: folder or video; None keeps the data of the
+    recipes. size: (H, W) of the photos in pixels; by default a size that all models take and that
+    crops no photo. overrides: settings of `views` for photos, such as a scale.
 
-    Raises ValueError if recipes differ in how models are evaluated. Errors of `CheckpointFile` and
-    of the readers of photos pass through.
+    Raises ValueError if recipes differ in how models are evaluated. Errors of the readers of photos
+    pass through.
     """
-    recipes = dict[str, Recipe]()
-    for name, path in files.items():
-        with CheckpointFile(path) as file:
-            recipes[name] = file.recipe
+    recipes = dict(trained)
     if photos is not None:
         data = _data_of(photos, recipes.values(), size)
         first = next(iter(recipes.values())).tree["views"]

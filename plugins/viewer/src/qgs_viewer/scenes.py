@@ -8,9 +8,7 @@ import torch
 
 from qgs.data.samples import Sample
 from qgs.evaluate.plan import EvaluationPlan
-from qgs.geometry.poses import largest_distance
 from qgs.model import QueryGaussianModel
-from qgs.reconstruction.result import sample_cameras
 from qgs.types import Cameras, Gaussians
 from qgs.wording import listed, one_line
 from qgs_viewer.comparison import Model
@@ -129,13 +127,3 @@ def scenes_of(
     others = [network(sample.inputs).gaussians for sample in own[1:]]
     curves = curves_of(file) if file else ()
     return ModelScenes(name, network, own, [scene.gaussians, *others], scene, curves)
-
-
-def ratio(sample: Sample, own: Sample) -> float:
-    """Return the factor from lengths in the world of `own` to lengths in the world of `sample`.
-
-    Both samples show the same views, in worlds of two models.
-    """
-    length, own_length = (float(largest_distance(sample_cameras(one).c2w)) for one in (sample, own))
-    # cameras at one point have no distance to compare
-    return length / own_length if own_length else 1.0

@@ -35,7 +35,7 @@ from qgs_viewer.queries import (
     query_picture,
     support_picture,
 )
-from qgs_viewer.scenes import ModelScenes, ratio
+from qgs_viewer.scenes import ModelScenes
 
 ERROR_MAP = "inferno"
 QUERIES = 5
@@ -230,7 +230,7 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
         colors[model.name] = _photos(rgb, quality)
         errors[model.name] = (rgb.clamp(0, 1) - truth.to(rgb)).abs().mean(1, keepdim=True)
         # models may see the scene in worlds of different units
-        depths[model.name] = rendering.depth[0] * ratio(sample, own)
+        depths[model.name] = rendering.depth[0] * float(sample.world[1] / own.world[1])
     # one scale for truth and models, or pictures could not be compared
     near, far = depth_range(torch.cat(list(depths.values())))
     most = depth_range(torch.cat(list(errors.values())))[1]
