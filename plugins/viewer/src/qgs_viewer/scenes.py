@@ -38,7 +38,7 @@ class ModelScenes:
         """The camera (1, 1) of the first target view in the first sample."""
         return self.samples[0].targets.cameras[:, :1]
 
-    def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
+    def notable(self, count: int, cameras: Cameras, query: int | None) -> list[DrawnQuery]:
         """Return the query with the index `query`; if it is None, `count` well visible queries.
 
         cameras: (1, V); only the first camera is used (see `notable_queries`). Raises ValueError

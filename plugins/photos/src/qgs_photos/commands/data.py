@@ -226,7 +226,7 @@ def _opened(
         plugin = kind.partition("/")[0]
         recipe = {"recipe": 1, "data": {"type": kind, "path": path}}
         # components of qgs itself are there without being named
-        recipe["plugins"] = [] if plugin == "qgs" else [plugin]
+        recipe["plugins"] = [*{plugin} - {"qgs"}]
     source = resolve(recipe, [f"data.{option}" for option in options]).build_data()
     if image_size is not None:
         source = type(source)(source.config.model_copy(update={"image_size": image_size}))

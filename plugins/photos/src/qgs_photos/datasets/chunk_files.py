@@ -20,7 +20,7 @@ import io
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -114,8 +114,8 @@ def parse_record(file: str, data: Any) -> Record:
     """Return the scene in an entry `data` of a chunk `file`. Raises ValueError if it is invalid."""
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
-            f"{file} holds {a_type(data)}, expected a mapping with 'key', 'cameras' and 'images': "
-            "is it a chunk of RealEstate10K's format?"
+            f"{file} holds a value of type {type(data).__name__}, expected a mapping with 'key', "
+            "'cameras' and 'images': is it a chunk of RealEstate10K's format?"
         )
     where = f"{file}: scene {data['key']!r}"
     for name in ("cameras", "images", "sizes", "masks", "timestamps", "held_out", "times"):
@@ -159,12 +159,6 @@ def _expect(valid: bool, where: str, reason: str) -> None:
         raise ValueError(f"{where}: {reason}: {fix}")
 
 
-def a_type(value: object) -> str:
-    """Return the type of `value` with its article, such as "an int"."""
-    name = type(value).__name__
-    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
-
-
 def _is_plain(data: Tensor) -> bool:
     """Return whether a tensor is dense, on the CPU, and stores every number.
 
@@ -179,7 +173,7 @@ def _is_plain(data: Tensor) -> bool:
 def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
     if isinstance(data, np.ndarray):
         data = torch.from_numpy(data)
-    found = list(data.shape) if isinstance(data, Tensor) else a_type(data)
+    found = list(data.shape) if isinstance(data, Tensor) else type(data).__name__
     wanted = f"a tensor of shape {list(shape)}, as there are {shape[0]} images"
     _expect(found == list(shape), where, f"{name!r} must be {wanted}, got {found}")
     assert isinstance(data, Tensor)
@@ -191,7 +185,7 @@ def _files(where: str, name: str, data: Any) -> Sequence[Tensor]:
         isinstance(item, Tensor) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
     )
     wanted = "a list of one-dimensional uint8 tensors with the bytes of image files"
-    _expect(valid, where, f"{name!r} must be {wanted}, got {a_type(data)}")
+    _expect(valid, where, f"{name!r} must be {wanted}, got {type(data).__name__}")
     return data
 
 
@@ -280,8 +274,8 @@ def load_chunk(path: UPath) -> list[Any]:
         ) from error
     if not isinstance(data, list):
         raise ValueError(
-            f"{path} holds {a_type(data)}, expected a list of mappings: is it a chunk of "
-            "RealEstate10K's format?"
+            f"{path} holds a value of type {type(data).__name__}, expected a list of mappings: is "
+            "it a chunk of RealEstate10K's format?"
         )
     return data
 
@@ -320,6 +314,7 @@ def has_chunks(folder: UPath) -> bool:
     return any(item.name == INDEX or item.suffix == SUFFIX for item in listing(folder))
 
 
+@cache
 def stays_inside(name: str) -> bool:
     """Return whether a path, with / or \\, stays in the folder to which it is relative."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
@@ -336,9 +331,8 @@ def read_chunk_index(path: UPath) -> dict[str, str]:
         raise ValueError(
             f"{path} must map each scene's key to the name of its chunk file: correct or remove it"
         )
-    inside = {name for name in set(index.values()) if stays_inside(name)}
     for key, name in index.items():
-        if name not in inside:
+        if not stays_inside(name):
             raise ValueError(
                 f"{path} names, for the scene {name_shown(key)}, the chunk {name_shown(name)!r} "
                 "outside the folder of the index: correct the index, or remove it to list the "

@@ -3,6 +3,7 @@
 import importlib
 import math
 import signal
+from bisect import bisect_left
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -78,6 +79,7 @@ class BendingLens(Lens):
             result[block] = part.round() if pixels.dtype.kind in "iu" else part
         return result
 
+    @lru_cache(maxsize=4096)  # noqa: B019  # lenses are few, and equal ones are one
     def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
         """Return the smallest zoom of a centre crop without black pixels in an undistorted photo.
 
@@ -85,7 +87,24 @@ class BendingLens(Lens):
         cx, cy in pixels of the photo. size: (H, W) of the photo. target: (H, W) whose aspect ratio
         the crop has. Returns 1 if black pixels remain even at MOST_ZOOM.
         """
-        return _whole_zoom(intrinsics, self, size, target)
+        side = torch.linspace(-1, 1, 65).double()
+        ends = torch.ones_like(side)
+        edges = [(side, ends), (side, -ends), (ends, side), (-ends, side)]
+        border = torch.cat([torch.stack(edge, -1) for edge in edges])
+        middle = torch.tensor(size[::-1]).double() / 2
+        half = torch.tensor(target[::-1]).double() / 2
+        reach = max(target[0] / size[0], target[1] / size[1])
+        focal, centre = torch.tensor(intrinsics).double().split(2)
+
+        def whole(zoom: float) -> bool:
+            # Resampling reads a pixel beyond the crop.
+            points = middle + border * (half / reach / zoom + (zoom > 1))
+            return bool(_in_photo((points - centre) / focal, intrinsics, self, size)[1].all())
+
+        if whole(1.0) or not whole(MOST_ZOOM):
+            return 1.0
+        zooms = np.linspace(1, MOST_ZOOM, 2**16 + 1)
+        return float(zooms[bisect_left(zooms, True, hi=2**16, key=whole)])
 
 
 def bending(model: str, coefficients: Mapping[str, float]) -> BendingLens | None:
@@ -156,32 +175,3 @@ def _in_photo(
     grid = source / source.new_tensor(size[::-1]) * 2 - 1
     # beyond the reach the distortion is not one-to-one
     return grid, (directions.norm(dim=-1) < _reach(lens)) & (grid.abs() <= 1).all(-1)
-
-
-@lru_cache(maxsize=4096)
-def _whole_zoom(intrinsics: Intrinsics, lens: BendingLens, size: Size, target: Size) -> float:
-    side = torch.linspace(-1, 1, 65).double()
-    ends = torch.ones_like(side)
-    edges = [(side, ends), (side, -ends), (ends, side), (-ends, side)]
-    border = torch.cat([torch.stack(edge, -1) for edge in edges])
-    middle = torch.tensor(size[::-1]).double() / 2
-    half = torch.tensor(target[::-1]).double() / 2
-    reach = max(target[0] / size[0], target[1] / size[1])
-    focal, centre = torch.tensor(intrinsics).double().split(2)
-
-    def whole(zoom: float) -> bool:
-        # Resampling reads a pixel beyond the crop.
-        points = middle + border * (half / reach / zoom + (zoom > 1))
-        return bool(_in_photo((points - centre) / focal, intrinsics, lens, size)[1].all())
-
-    if whole(1.0) or not whole(MOST_ZOOM):
-        return 1.0
-    low = 1.0
-    high = MOST_ZOOM
-    for _ in range(16):
-        mean = (low + high) / 2
-        if whole(mean):
-            high = mean
-        else:
-            low = mean
-    return high

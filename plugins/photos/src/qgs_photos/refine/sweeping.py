@@ -109,10 +109,9 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
         focal, centre = cameras.intrinsics[0, other].split(2)
         seen_from = points @ w2c[:3, :3].T + w2c[:3, 3]
         depth = seen_from[..., 2:]
-        ahead = depth.clamp_min(1e-3 * size)
-        places = (focal * seen_from[..., :2] / ahead + centre) / ahead.new_tensor([width, height])
+        places = (focal * seen_from[..., :2] / depth + centre) / depth.new_tensor([width, height])
         places = 2 * places - 1
-        visible = (depth >= ahead)[..., 0] & (places.abs() < 1).all(-1)
+        visible = (depth[..., 0] >= 1e-3 * size) & (places.abs() < 1).all(-1)
         flat = places.flatten(0, 1)[None]
         found = F.grid_sample(views.images[:, other], flat, "bilinear", "border", False)
         cost = (found.view(*colors.shape, _DEPTHS) - colors[..., None]).abs().mean(0)
