@@ -133,19 +133,22 @@ def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
         names: Any = top.get("images")
         if not isinstance(poses, list):
             return []
+        columns = {pose: poses}
         # (4, 4) may be fx, fy, cx, cy of four cameras
         one = numbers(matrices)
         shared = one.shape in ((3, 3), (4,)) or (one.shape == (4, 4) and not one[3, :3].any())
-        matrices = [matrices] * len(poses) if shared else matrices
-        names = names if isinstance(names, list) and len(names) == len(poses) else [""] * len(poses)
-        matrices = matrices if isinstance(matrices, list) else []
-        if (count := len(matrices)) != len(poses):
-            raise ValueError(
-                f"{file} lists {len(poses)} poses ({pose}), but {count} intrinsics "
-                f"({matrix or 'K'}): list both for every camera, or write {_FORM}"
-            )
-        rows = zip(poses, matrices, names, strict=True)
-        given = [{pose: one, matrix: K, "image": name or None} for one, K, name in rows]
+        if not shared:
+            columns[matrix] = matrices if isinstance(matrices, list) else []
+            if (count := len(columns[matrix])) != len(poses):
+                raise ValueError(
+                    f"{file} lists {len(poses)} poses ({pose}), but {count} intrinsics "
+                    f"({matrix or 'K'}): list both for every camera, or write {_FORM}"
+                )
+        if isinstance(names, list) and len(names) == len(poses):
+            columns["image"] = names
+        given = [
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+        ]
     return [{**top, **camera} if isinstance(camera, Mapping) else {} for camera in given]
 
 
