@@ -1,6 +1,5 @@
 """Check all scenes of a data set in any format, and its evaluation indices."""
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -81,16 +80,13 @@ def check(
     if len(judged) < count:
         some = f"poses were checked by photos in {len(judged)} of {count} scenes"
         notes.append(f"{some}; --geometry {count} checks all")
-    held = defaultdict[str, list[SceneReport]](list)
     scenes = list[SceneReport]()
     for number, candidate in enumerate(candidates):
         progress(number, count, candidate.name)
         most = max(PHOTOS // len(judged), FEWEST) if number in judged else 0
-        report = check_scene(candidate, options, most)
-        scenes.append(report)
-        held[report.name].append(report)
+        scenes.append(check_scene(candidate, options, most))
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
-        general += index_findings(file, held)
+        general += index_findings(file, scenes)
         notes.append(f"scenes were compared with the index {file}")
     if factors := [1 / scene.depth for scene in scenes if scene.depth]:
         ends = f"{min(factors):.4g} to {max(factors):.4g}"

@@ -35,7 +35,7 @@ def chunk_scenes(path: UPath) -> Iterator[Candidate | Finding]:
     path: folder with train/ and test/, folder of chunks, or one chunk.
     """
     parts = {split: path / split for split in ("train", "test") if has_chunks(path / split)}
-    found = {split: dict[str, str]() for split in ("train", "test", "")}
+    found = defaultdict[str, dict[str, str]](dict)
     for split, part in (parts or {"": path}).items():
         yield from _folder_scenes(split, part, found[split])
     for key in sorted(found["train"].keys() & found["test"].keys()):
