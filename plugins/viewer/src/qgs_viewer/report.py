@@ -54,29 +54,27 @@ def score_rows(
     and True if its value is the best of all rows. With fewer than RANKED samples no value is
     marked.
     """
-    means: dict[str, Mapping[str, float | None]] = {}
-    sizes: dict[str, Sequence[str]] = {}
+    first = models[0].evaluation
+    table: list[tuple[str, Mapping[str, float | None], Sequence[str]]] = []
     for model in models:
-        found = model.evaluation.means()
+        found = model.evaluation
         # of the views that the evaluation has scored
-        coverage = 100 * trust.means(model.views).coverage
-        means[model.name] = {**found, "coverage": coverage}
-        sizes[model.name] = [f"{model.evaluation.gaussians:,}", f"{model.parameters:,}"]
+        means = {**found.means(), "coverage": 100 * trust.means(model.views).coverage}
+        table.append((model.name, means, [f"{found.gaussians:,}", f"{model.parameters:,}"]))
     for baseline in BASELINES:
-        own = models[0].evaluation.means(baseline)
-        means[baseline.replace("_", " ").capitalize()] = own
-    rivals = means.values() if models[0].evaluation.samples >= RANKED else ()
+        # baselines have neither Gaussians nor parameters
+        name = baseline.replace("_", " ").capitalize()
+        table.append((name, first.means(baseline), ["–", "–"]))
     rows = {}
-    for label, own in means.items():
+    for place, (label, means, sizes) in enumerate(table):
         cells = rows[label] = list[tuple[str, bool]]()
         for name, column in columns.items():
-            cell = column.shown(own.get(name))
-            best = column.best(other.get(name) for other in rivals)
+            cell = column.shown(means.get(name))
+            best = column.best(other.get(name) for _, other, _ in table)
             # cells that read alike are both best
-            marked = label in sizes and best is not None and cell == column.shown(best)
-            cells.append((cell, marked))
-        # baselines have neither Gaussians nor parameters
-        cells += [(size, False) for size in sizes.get(label, ("–", "–"))]
+            alike = best is not None and cell == column.shown(best)
+            cells.append((cell, alike and place < len(models) and first.samples >= RANKED))
+        cells += [(size, False) for size in sizes]
     return rows
 
 
