@@ -198,8 +198,10 @@ def numbered_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
     shared = os.path.commonpath([os.path.dirname(file) for file in files])
     suffix = r"\.(ya?ml|safetensors)$"
     names = [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]
-    before = [names[:index].count(name) for index, name in enumerate(names)]
-    return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
+    return [
+        f"{name} ({before + 1})" if (before := names[:index].count(name)) else name
+        for index, name in enumerate(names)
+    ]
 
 
 def open_models(
@@ -251,9 +253,9 @@ def _found_size(model: Model, windows: PhotoWindows) -> FoundSize | None:
     # the evaluation names scenes that fail
     with suppress(Exception):
         scene = data.scenes("test" if data.names("test") else "train")[0]
-        for window in windows.windows(scene, model.recipe.views)[:1]:
-            views = model.views_of(scene, *window)
-            return find_size(model.network, scene, *window, views)
+        window = windows.windows(scene, model.recipe.views)[0]
+        views = model.views_of(scene, *window)
+        return find_size(model.network, scene, *window, views)
     return None
 
 

@@ -98,8 +98,6 @@ def ink(scene: QueryScene) -> Color:
 def painted(scene: QueryScene, choice: Choice) -> Splats:
     """Return the Gaussians of `scene` in the viewer's world, coloured and faded for `choice`."""
     found = scene.splats
-    if not scene.queries:
-        return found
     colors = found.colors
     opacities = found.opacities
     # Gaussians are ordered by query, so colours repeat in blocks

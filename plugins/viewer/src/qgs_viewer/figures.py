@@ -25,12 +25,12 @@ DPI = 220
 # Pixels on the longer side of pictures that models render.
 SIDE = 512
 LISTING = "figures.md"
-FIGURES: Mapping[FigureName, Callable[[Sequence[ModelScenes], Detail], Section]] = {
-    FigureName.NOVEL_VIEWS: sections.novel_views,
-    FigureName.QUERIES: sections.queries,
-    FigureName.ANCHORS: sections.anchors,
-    FigureName.CROSS_ATTENTION: sections.attention,
-    FigureName.CURVES: sections.training_curves,
+FIGURES: Mapping[str, Callable[[Sequence[ModelScenes], Detail], Section]] = {
+    "novel_views": sections.novel_views,
+    "queries": sections.queries,
+    "anchors": sections.anchors,
+    "cross_attention": sections.attention,
+    "curves": sections.training_curves,
 }
 
 

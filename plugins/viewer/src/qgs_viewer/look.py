@@ -30,7 +30,7 @@ EXACT = 128
 
 def hex_color(color: Color) -> str:
     """Return an RGB colour as text for HTML: #rrggbb."""
-    return "#{:02x}{:02x}{:02x}".format(*color)
+    return f"#{bytes(color).hex()}"
 
 
 def categorical(index: int) -> Color:

@@ -17,7 +17,7 @@ from qgs.checkpoint.models import CHECKPOINT
 from qgs.cli.options import parse_size
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.images import decode_rgb, read_image, to_tensor
-from qgs.data.samples import make_sample, own_world, views_in
+from qgs.data.samples import make_sample, own_world
 from qgs.data.view_samplers import evenly
 from qgs.domain import Domain, verdict
 from qgs.model import QueryGaussianModel
@@ -318,7 +318,7 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
         scene = FinishedScene(str(record["scene"]), folder, views)
         inputs = tuple(place for place, view in enumerate(views) if view["kind"] == "input")
         red, green, blue = map(float, record.get("background") or NEUTRAL)
-        photos = views_in((torch.eye(4).double(), torch.ones(())), scene, inputs)
+        photos = scene.views.select([*inputs]).to(torch.float32)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(
             f"{path} does not describe a reconstruction ({type(error).__name__}: {error}); repeat "
