@@ -27,6 +27,7 @@ from qgs.data.photos.reader import (
 )
 from qgs.paths import open_file, read_json
 from qgs.wording import warn_once
+from qgs_photos.datasets.encoded import as_intrinsics
 from qgs_photos.image_files import image_files
 
 _LISTS = ("frames", "cameras", "views")
@@ -251,12 +252,11 @@ class _Camera:
         name = "" if self.path == folder else "/".join(inside(folder, self.path))
         if not name:
             self._wrong("no image is named")
-        fx, fy, cx, cy = self.intrinsics.tolist()
         return PhotoFrame(
             name=name,
             path=self.path,
             c2w=self.pose,
-            intrinsics=(fx, fy, cx, cy),
+            intrinsics=as_intrinsics(self.intrinsics),
             size=self.size,
             problems=(*self.problems,),
         )

@@ -4,6 +4,7 @@ import io
 from dataclasses import dataclass
 
 import numpy as np
+from torch import Tensor
 
 from qgs.data.images import decode_rgb
 from qgs.data.photos.reader import Intrinsics, Lens, Size
@@ -27,6 +28,12 @@ class EncodedFrame:
     size: Size
     lens: Lens | None = None
     mask: np.ndarray | None = None
+
+
+def as_intrinsics(values: np.ndarray | Tensor) -> Intrinsics:
+    """Return fx, fy, cx, cy (4,) as a tuple of numbers."""
+    fx, fy, cx, cy = values.tolist()
+    return fx, fy, cx, cy
 
 
 def encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:

@@ -15,7 +15,7 @@ from qgs.data.images import CropResize, decode_rgb
 from qgs.data.photos.source import PhotoScene
 from qgs.drawing.images import png_bytes, rgb_picture
 from qgs_photos.datasets.chunks import ChunkScene
-from qgs_photos.datasets.encoded import EncodedFrame, encoded_photo
+from qgs_photos.datasets.encoded import EncodedFrame, as_intrinsics, encoded_photo
 
 ChunkEntry: TypeAlias = dict[str, Any]
 
@@ -89,11 +89,10 @@ def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -
         return crop.image(Image.fromarray(lens.undistorted(image, frame.intrinsics)))
 
     own = torch.tensor(frame.intrinsics, dtype=torch.float64)
-    fx, fy, cx, cy = crop.intrinsics(own).tolist()
     return replace(
         frame,
         data=encoding.image(straight(pixels)),
-        intrinsics=(fx, fy, cx, cy),
+        intrinsics=as_intrinsics(crop.intrinsics(own)),
         lens=None,
         mask=None if frame.mask is None else straight(frame.mask),
     )
@@ -102,12 +101,11 @@ def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -
 def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
     cameras = scene.cameras[index]
     masks = scene.masks([index])
-    fx, fy, cx, cy = cameras.intrinsics.double().tolist()
     return EncodedFrame(
         name=scene.frame_name(index),
         data=encoding.image(rgb_picture(scene.images([index])[0])),
         c2w=cameras.c2w.double().numpy(),
-        intrinsics=(fx, fy, cx, cy),
+        intrinsics=as_intrinsics(cameras.intrinsics),
         size=cameras.size,
         mask=None if masks is None else rgb_picture(masks[0])[..., 0],
     )

@@ -64,9 +64,9 @@ class Geometry:
     def fraction(self) -> float:
         """Median distance of matches from epipolar lines, as a fraction of the photo's diagonal.
 
-        The median is over all pairs of photos; it is 0 if there are no pairs.
+        The median is over all pairs of photos; there must be some.
         """
-        return float(np.median([distance for _, distance in self.pairs])) if self.pairs else 0.0
+        return float(np.median([distance for _, distance in self.pairs]))
 
     @property
     def pixels(self) -> float:

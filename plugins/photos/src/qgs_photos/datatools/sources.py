@@ -13,6 +13,7 @@ from qgs.data.recognition import recognised
 from qgs.drawing.images import png_bytes, rgb_picture
 from qgs.recipe.registry import Registry, load_plugin
 from qgs.reconstruction.scenes import installed_sources
+from qgs_photos.datasets.encoded import as_intrinsics
 from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
 OF_FILES = ("qgs", "datasets")
@@ -80,12 +81,11 @@ def _photos(source: SceneSource, split: Split, place: int) -> Photos:
 def _photo(scene: Scene, frame: int) -> Photo:
     camera = scene.cameras[frame]
     name = scene.frame_name(frame)
-    fx, fy, cx, cy = camera.intrinsics.tolist()
     listed = PhotoFrame(
         name=name,
         path=UPath(name),
         c2w=camera.c2w.double().numpy(),
-        intrinsics=(fx, fy, cx, cy),
+        intrinsics=as_intrinsics(camera.intrinsics),
         size=camera.size,
         time=None if scene.times is None else float(scene.times[frame]),
     )

@@ -118,7 +118,7 @@ class FreeGaussians:
     def _split(self, parents: Tensor) -> None:
         """Set the opacity and scale of every parent to the values that parent and copies share."""
         shares = torch.bincount(parents, minlength=self.count) + 1
-        chosen = (shares > 1).nonzero()[:, 0]
+        chosen = shares > 1
         logits = self.values["opacity_logits"]
         opacity, shrink = shared(logits[chosen].sigmoid(), shares[chosen])
         logits[chosen] = opacity.clamp(DEAD, 1 - _OPACITY_MARGIN).logit()
