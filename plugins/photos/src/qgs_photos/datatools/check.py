@@ -124,9 +124,9 @@ def _items(path: UPath, options: Options) -> Iterator[Candidate | Finding]:
     if kind == "auto":
         is_chunk = path.is_file() and path.suffix == ".torch"
         kind = "chunks" if is_chunk else kind_of(path)
-    if kind == "chunks" and options.images is not None:
-        raise ValueError("chunks have no folders of images to choose: leave --images out")
     if kind == "chunks":
+        if options.images is not None:
+            raise ValueError("chunks have no folders of images to choose: leave --images out")
         return chunk_scenes(path)
     if kind == "dl3dv":
         return dl3dv_scenes(path, options.images)

@@ -2,6 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
 from posixpath import join
@@ -108,14 +109,14 @@ _entries = lru_cache(maxsize=1)(load_chunk)
 
 def _photos(file: UPath, place: int) -> Photos:
     record = parse_record(str(file), _entries(file)[place])
-    sizes = _listed_sizes(record)
-    # without sizes each image would be opened again to know its own
-    judged = record if sizes is None else replace(record, sizes=torch.tensor(sizes))
-    photos = [_photo(file, judged, i, sizes[i] if sizes else None) for i in range(len(record))]
-    return photos, ()
+    if record.sizes is None:
+        # without sizes each image would be opened again to know its own
+        record = replace(record, sizes=torch.tensor([_usual_size(record)] * len(record)))
+    return [_photo(file, record, frame) for frame in range(len(record))], ()
 
 
-def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
+def _photo(file: UPath, record: Record, frame: int) -> Photo:
+    size = record.image_sizes[frame]
     try:
         c2w = np.linalg.inv(record.w2c[frame].numpy())
     # a singular matrix is told as a pose with NaN
@@ -125,7 +126,7 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
         name=record.names[frame],
         path=file,
         c2w=c2w,
-        intrinsics=record.intrinsics(frame, size or (1, 1)),
+        intrinsics=record.intrinsics(frame, size),
         size=size,
         time=None if record.times is None else float(record.times[frame]),
         problems=tuple(unit_problems(record, frame)),
@@ -137,18 +138,10 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
     )
 
 
-def _listed_sizes(record: Record) -> list[Size] | None:
-    """Return (H, W) of every image, as the chunk lists it.
-
-    If the chunk lists no sizes, return for all images the most frequent size in their headers; None
-    if no header can be read.
-    """
-    if record.sizes is not None:
-        return record.image_sizes
-    stored = Counter[Size]()
+def _usual_size(record: Record) -> Size:
+    """Return the most frequent (H, W) in the headers of images; (1, 1) if none can be read."""
+    stored = Counter({(1, 1): 0})
     for frame in range(len(record)):
-        try:
+        with suppress(ValueError):
             stored[record.stored_size(frame)] += 1
-        except ValueError:
-            continue
-    return [stored.most_common(1)[0][0]] * len(record) if stored else None
+    return stored.most_common(1)[0][0]
