@@ -112,13 +112,7 @@ def check(
     from qgs_photos.datatools.findings import errors_of
 
     console = Console()
-    options = Options(
-        geometry=geometry,
-        headers_only=quick,
-        threads=threads,
-        format=format,
-        images=images,
-    )
+    options = Options(geometry, quick, threads, format, images)
     indices = [opened_path(name) for name in index or []]
     with console.status("listing scenes") as status:
 

@@ -270,11 +270,9 @@ class Overlapping(ViewSampler):
         # without held-out photos the target is one of those that inputs are chosen from
         usable = _enough(scene, views.inputs if scene.held_out else views.inputs + 1)
         frusta = self._frusta(scene)
-        found = list[Window]()
-        for target in sorted(scene.held_out) or evenly(usable, _JUDGED):
-            _, inputs = frusta.window(target, usable, views.inputs)
-            found.append((tuple(sorted(inputs)), (target,)))
-        return found
+        targets = sorted(scene.held_out) or evenly(usable, _JUDGED)
+        chosen = [frusta.window(target, usable, views.inputs)[1] for target in targets]
+        return [(tuple(sorted(i)), (target,)) for i, target in zip(chosen, targets, strict=True)]
 
     def _frusta(self, scene: Scene, factor: float = 1.0) -> Frusta:
         """Return the view frusta of a scene's cameras, from which inputs are chosen.

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from qgs.contracts import Scene
 from qgs.data.images import CropResize, decode_rgb
-from qgs.data.photos.source import PhotoScene
+from qgs.data.photos.source import PhotoScene, turned, whole_mask
 from qgs.drawing.images import png_bytes, rgb_picture
+from qgs.paths import read_file
 from qgs_photos.datasets.chunks import ChunkScene
-from qgs_photos.datasets.encoded import EncodedFrame, as_intrinsics, encoded_photo
+from qgs_photos.datasets.encoded import EncodedFrame, as_intrinsics
 
 ChunkEntry: TypeAlias = dict[str, Any]
 
@@ -56,11 +57,36 @@ def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFr
             yield _delivered(scene, index, encoding), False
 
 
+def _encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
+    """Return a photo as an encoded file, with its camera.
+
+    The bytes are those of the photo's file, encoded again only if its EXIF data rotate it. Raises
+    ValueError for a file that cannot be read.
+    """
+    photo = scene.photos[frame]
+    size = scene.stored_size(frame)
+    data = read_file(photo.path)
+    # pixels are stored again only where EXIF turns them
+    if photo.turns:
+        file = io.BytesIO()
+        turned(decode_rgb(io.BytesIO(data), scene.config.background), photo).save(file, "png")
+        data = file.getvalue()
+    return EncodedFrame(
+        name=photo.name,
+        data=data,
+        c2w=photo.c2w,
+        intrinsics=photo.at_size(size),
+        size=size,
+        lens=photo.lens,
+        mask=photo.mask and np.array(turned(whole_mask(photo), photo)),
+    )
+
+
 def _stored(
     scene: PhotoScene | ChunkScene, index: int, encoding: Encoding
 ) -> tuple[EncodedFrame, bool]:
     photos = isinstance(scene, PhotoScene)
-    frame = encoded_photo(scene, index) if photos else scene.encoded(index)
+    frame = _encoded_photo(scene, index) if photos else scene.encoded(index)
     try:
         pixels = np.array(decode_rgb(io.BytesIO(frame.data), scene.config.background))
     except OSError as error:
@@ -120,10 +146,14 @@ def chunk_entry(
     of each of the V frames, (V,); None for a scene that does not move.
     """
     names = [frame.name for frame in frames]
+    # 19 digits may be more than an int64 holds
+    stamps = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
     entry = {
         "key": key,
         "url": "",
-        "timestamps": _timestamps(names),
+        "timestamps": torch.tensor(
+            [int(name) for name in (names if stamps else range(len(names)))]
+        ),
         "cameras": torch.from_numpy(np.stack([_camera(frame) for frame in frames])),
         "images": [_bytes(frame.data) for frame in frames],
         "names": names,
@@ -154,10 +184,3 @@ def _camera(frame: EncodedFrame) -> np.ndarray:
     w2c = np.linalg.inv(frame.c2w)[:3].flatten()
     values = [fx / width, fy / height, cx / width, cy / height, 0.0, 0.0, *w2c]
     return np.array(values, np.float32)
-
-
-def _timestamps(names: Sequence[str]) -> Tensor:
-    """Return the names as integers if all are whole numbers; otherwise the indices 0, 1, ..."""
-    # 19 digits may be more than an int64 holds
-    stamps = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
-    return torch.tensor([int(name) for name in (names if stamps else range(len(names)))])

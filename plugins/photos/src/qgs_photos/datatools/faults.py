@@ -29,8 +29,6 @@ def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
     """Yield faults of image files, listed image sizes, intrinsics and masks."""
     for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
         listed = photo.listed
-        for reason, fix in result.errors:
-            yield scene.finding([frame], reason, fix)
         if result.unturned:
             yield scene.finding([frame], f"photos {TURNED}", TURN, "warning")
         problems = list(listed.problems)
@@ -43,7 +41,7 @@ def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
             values = f"(fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g})"
             reason = f"the intrinsics {values} are implausible for {size[1]} x {size[0]} pixels"
             problems = [FrameProblem(reason, UNLESS)]
-        for problem in problems:
+        for problem in (*result.errors, *problems):
             yield scene.finding([frame], problem.reason, problem.fix)
     if exchanged := _with_exchanged_masks(scene.decoded):
         reason = "the mask fits another photo better, and the mask of that photo fits this one"
@@ -105,23 +103,18 @@ def sharing_findings(scene: DecodedScene, usable: Sequence[int]) -> Iterator[Fin
             continue
         told.add(frame)
         one, other = poses[[*pair], :3, :3]
-        if np.abs(one - other).max() <= _SAME:
-            yield from _repeated(scene, first, frame)
-        else:
-            reason = f"the camera stands on the same point as that of {scene.label(first)}"
+        label = scene.label(first)
+        digest = scene.decoded[first].digest
+        if np.abs(one - other).max() > _SAME:
+            reason = f"the camera stands on the same point as that of {label}"
             fix = "correct the position, or remove one of the frames: the two show no depth"
             yield scene.finding([frame], reason, fix)
-
-
-def _repeated(scene: DecodedScene, first: int, frame: int) -> Iterator[Finding]:
-    # a camera that stands still may film what moves
-    if scene.photos[first].listed.time != scene.photos[frame].listed.time:
-        return
-    label = scene.label(first)
-    digest = scene.decoded[first].digest
-    if digest and digest == scene.decoded[frame].digest:
-        reason = f"the photo and its pose repeat {label}"
-        yield scene.finding([frame], reason, "remove one of the two", "warning")
-    else:
-        reason = f"the pose repeats that of {label}, which has a different photo"
-        yield scene.finding([frame], reason, "correct the pose, or remove one of the frames")
+        # a camera that stands still may film what moves
+        elif scene.photos[first].listed.time != scene.photos[frame].listed.time:
+            continue
+        elif digest and digest == scene.decoded[frame].digest:
+            reason = f"the photo and its pose repeat {label}"
+            yield scene.finding([frame], reason, "remove one of the two", "warning")
+        else:
+            reason = f"the pose repeats that of {label}, which has a different photo"
+            yield scene.finding([frame], reason, "correct the pose, or remove one of the frames")

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from qgs.data.images import decode_rgb, eight_bits, opened_image, orientation
-from qgs.data.photos.reader import PhotoFrame, Size, size_problems
+from qgs.data.photos.reader import FrameProblem, PhotoFrame, Size, size_problems
 from qgs.data.photos.source import turned, turned_size
 from qgs.wording import numbered, one_line
 from qgs_photos.datatools.findings import Finding, Severity
@@ -22,6 +22,7 @@ _ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombEr
 _SMALLEST = (8, 8)
 # Of 255: a covered lens has noise.
 _BLACK = 4
+_REPLACE = "replace it, or remove its frame"
 # Size at which the edges of photos and masks are compared.
 _SQUARE = (64, 64)
 
@@ -80,7 +81,7 @@ class Decoded:
     """Result of decoding a photo.
 
     size: (H, W); None if it cannot be decoded. digest: hash of the file's bytes, by which equal
-    photos are found. errors: pairs of reason and remedy. unturned: whether the photo has an EXIF
+    photos are found. errors: what is wrong with the files. unturned: whether the photo has an EXIF
     orientation that is ignored. empty_mask: whether the mask leaves out the whole photo; None
     without a mask. edges: strength of edges in the photo and in its mask, two maps of size _SQUARE;
     None without a mask.
@@ -88,7 +89,7 @@ class Decoded:
 
     size: Size | None = None
     digest: bytes = b""
-    errors: Sequence[tuple[str, str]] = ()
+    errors: Sequence[FrameProblem] = ()
     unturned: bool = False
     empty_mask: bool | None = None
     edges: np.ndarray | None = None
@@ -136,7 +137,8 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
     if not photo.listed.name:
         return Decoded()
     if not photo.exists:
-        return Decoded(errors=[("the image does not exist", "add it, or remove its frame")])
+        missing = FrameProblem("the image does not exist", "add it, or remove its frame")
+        return Decoded(errors=[missing])
     try:
         data = photo.read()
         digest = hashlib.blake2b(data, digest_size=16).digest()
@@ -153,8 +155,8 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
     except Exception as error:
         # whatever a reader raises; the other photos go on
         reason = f"the image cannot be decoded ({error_text(error)})"
-        return Decoded(errors=[(reason, "replace it, or remove its frame")])
-    errors = [("the image is black", "replace it, or remove its frame")] if black else []
+        return Decoded(errors=[FrameProblem(reason, _REPLACE)])
+    errors = [FrameProblem("the image is black", _REPLACE)] if black else []
     empty: bool | None = None
     edges: np.ndarray | None = None
     for kind, read in photo.maps.items():
@@ -170,7 +172,7 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
                 edges = np.stack([_edges(pixels.convert("L")), _edges(kept)])
         except Exception as error:
             reasons = [error_text(error)]
-        errors += [(reason, f"replace the {kind}") for reason in reasons]
+        errors += [FrameProblem(reason, f"replace the {kind}") for reason in reasons]
     return Decoded(size, digest, errors, unturned, empty, edges)
 
 
