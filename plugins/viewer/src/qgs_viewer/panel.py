@@ -144,17 +144,18 @@ class Panel:
         with self.server.atomic():
             draw(scene, choice)
             if scene.queries:
-                self._describe(scene, choice.query, choice.layer)
+                query = choice.query
+                layer = choice.layer
+                pictures = {}
+                if query is not None:
+                    pictures = attention_pictures_of(scene, query, layer, PHOTO_SIDE)
+                for part, handle in self.pictures.items():
+                    handle.visible = part in pictures
+                    if part in pictures:
+                        handle.image = sheet(pictures[part])
+                self._text.content = "" if query is None else description(scene, query, layer)
         self.scene = scene
         self.choice = choice
-
-    def _describe(self, scene: QueryScene, query: int | None, layer: int) -> None:
-        found = {} if query is None else attention_pictures_of(scene, query, layer, PHOTO_SIDE)
-        for part, handle in self.pictures.items():
-            handle.visible = part in found
-            if part in found:
-                handle.image = sheet(found[part])
-        self._text.content = "" if query is None else description(scene, query, layer)
 
     def _reframed(self, event: Any) -> None:
         """Reconstruct from the ticked photos, and show the result.

@@ -111,7 +111,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     ]
     ranked = [view for scene in scenes for view in scene["views"]]
     # the best first, by the first model
-    ranked.sort(key=lambda view: -view["score"])
+    ranked.sort(key=lambda view: -view[0])
     drawn = (sections.queries, sections.anchors, sections.attention, sections.training_curves)
     height, width = first.recipe.tree["data"]["image_size"]
     data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
@@ -119,17 +119,18 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     samples = counted(first.evaluation.samples, "sample")
     views = f"{samples}, {first.recipe.views.inputs} inputs, scored on views {judged} the inputs"
     names = listed((model.name for model in models), most=3)
-    metrics = [part for place, part in first.recipe.parts.items() if place[0] == "metrics"]
-    columns = [*first.evaluation.columns.items()]
-    columns.insert(1, ("coverage", trust.COVERAGE))
+    parts = first.recipe.parts.items()
+    meanings = [summary_of(part.component) for place, part in parts if place[0] == "metrics"]
+    head, *others = first.evaluation.columns.items()
+    columns = dict([head, ("coverage", trust.COVERAGE), *others])
     template = page_environment().get_template("report.html")
     return template.render(
         comparison=comparison,
         title=f"{names}: {comparison.scenes.lower()}",
-        columns=[column for _, column in columns],
-        rows=score_rows(models, dict(columns)),
+        columns=columns,
+        rows=score_rows(models, columns),
         facts={"Data": data, "Views": views, **comparison.facts},
-        meanings=[summary_of(metric.component) for metric in metrics],
+        meanings=meanings,
         scenes=scenes,
         views=ranked,
         turned=sections.scene_to_turn(shown),

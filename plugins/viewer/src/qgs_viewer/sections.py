@@ -207,7 +207,7 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
     Keys are `name`, the name of the scene; `inputs`, tiles of the input photos; `kinds`, tiles of
     the target views by kind (Render, Error, Depth), then by column (Truth, names of models);
     `most`, the absolute error that the error pictures show as the brightest colour; and `views`,
-    with the PSNR by the first model (`score`) and the render of all (`tiles`) of each target view.
+    pairs of the PSNR by the first model and the renders of all, by column, of each target view.
 
     place: index of the scene among the samples. targets: indices of the target views to show.
     """
@@ -252,10 +252,7 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
         "inputs": _photos(sample.inputs.images[0], inputs),
         "kinds": kinds,
         "most": most,
-        "views": [
-            {"score": score, "tiles": dict(zip(colors, tiles, strict=True))}
-            for score, *tiles in shown
-        ],
+        "views": [(score, dict(zip(colors, tiles, strict=True))) for score, *tiles in shown],
     }
 
 
