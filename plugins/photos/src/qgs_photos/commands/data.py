@@ -1,10 +1,6 @@
 """The commands `qgs data check` and `qgs data pack`."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import Annotated, TypeAlias
 
 import typer
 from rich.console import Console
@@ -13,14 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from qgs.terminal import print_lines, print_table
 from qgs.wording import counted
 
-if TYPE_CHECKING:
-    from qgs.contracts import SceneSource
-    from qgs_photos.datatools.findings import SceneReport
-    from qgs_photos.datatools.packing import Packed
-
 app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
-
-_ROWS = 40
 
 Quality: TypeAlias = Annotated[
     int | None,
@@ -121,7 +110,7 @@ def check(
 
         result = check(opened_path(path), options, indices, progress)
     if result.scenes:
-        print_table(console, "", _rows(result.scenes), box=None, pad_edge=False)
+        print_table(console, "", result.table, box=None, pad_edge=False)
     print_lines(console, map(str, result.findings))
     print_lines(console, [f"note: {note}" for note in result.notes])
     errors = len(errors_of(result.findings))
@@ -131,17 +120,6 @@ def check(
     print_lines(console, [f"{path}: {totals}"])
     if errors:
         raise typer.Exit(1)
-
-
-def _rows(scenes: Sequence[SceneReport]) -> list[list[str]]:
-    rows = [["scene", "format", "frames", "decodable", "missing", "bad poses", "epipolar px"]]
-    # of many scenes the worst
-    for scene in sorted(scenes, key=lambda scene: -len(scene.findings))[:_ROWS]:
-        counts = (scene.listed, scene.decodable, scene.missing, scene.pose_problems)
-        rows.append([scene.name, scene.kind, *map(str, counts), scene.epipolar])
-    if len(scenes) > _ROWS:
-        rows.append([f"and {len(scenes) - _ROWS} more"])
-    return rows
 
 
 @app.command("pack")
@@ -171,14 +149,14 @@ def pack(
     from qgs_photos.datasets.dl3dv import read_scene_list
     from qgs_photos.datatools import packing
     from qgs_photos.datatools.entries import Encoding
+    from qgs_photos.datatools.sources import opened_source
 
     console = Console()
     if test_scenes is not None and test_every is not None:
         raise typer.BadParameter("give --test-scenes or --test-every, not both")
-    source, settings = _opened(path, options or [], image_size)
+    source = opened_source(path, options or [], image_size)
     test = None if test_scenes is None else read_scene_list(opened_path(test_scenes))
     splits = packing.chosen_splits(source, test, test_every)
-    settings |= {"test_scenes": test_scenes, "test_every": test_every}
     with Progress(
         MofNCompleteColumn(),
         BarColumn(),
@@ -193,50 +171,10 @@ def pack(
             source,
             splits,
             opened_path(out),
-            settings,
+            {"test_scenes": test_scenes, "test_every": test_every},
             Encoding(resized=image_size is not None, jpeg=jpeg),
             chunk_bytes=chunk_mb * 2**20,
             leave_out_broken=leave_out_broken,
             progress=lambda name: bar.update(task, advance=1, description=name),
         )
-    _print_packed(console, packed, out)
-
-
-def _opened(
-    path: str, options: list[str], image_size: tuple[int, int] | None
-) -> tuple[SceneSource, dict[str, Any]]:
-    """Return the source of the scenes at `path`, and its options, to record them in `packing.json`.
-
-    path: data set or recipe. options: settings of the source, as KEY=VALUE.
-    """
-    from qgs.data.recognition import recognised
-    from qgs.paths import opened_path
-    from qgs.recipe import resolve
-    from qgs_photos.datatools.sources import sources
-
-    recipe: Any = path
-    if Path(path).suffix not in {".yaml", ".yml"}:
-        kind = recognised(opened_path(path), sources())
-        plugin = kind.partition("/")[0]
-        recipe = {"recipe": 1, "data": {"type": kind, "path": path}}
-        # components of qgs itself are there without being named
-        recipe["plugins"] = [*{plugin} - {"qgs"}]
-    source = resolve(recipe, [f"data.{option}" for option in options]).build_data()
-    if image_size is not None:
-        source = type(source)(source.config.model_copy(update={"image_size": image_size}))
-    return source, {"source": type(source).name, **source.config.model_dump(mode="json")}
-
-
-def _print_packed(console: Console, packed: Packed, out: str) -> None:
-    scenes = ", ".join(f"{count} {split}" for split, count in packed.scenes.items())
-    again = f", {packed.resumed} of them by an earlier run" if packed.resumed else ""
-    lines = [
-        f"{out}: packed scenes: {scenes}{again}; images of this run: {packed.frames}, of which "
-        f"{packed.kept} copied unchanged and {packed.frames - packed.kept} encoded again"
-    ]
-    if not packed.scenes["test"]:
-        lines.append("there are no test scenes: evaluations will use held-out photos of scenes")
-    if packed.left_out:
-        lines.append(f"scenes left out since they cannot be read: {len(packed.left_out)}")
-        lines += [f"  {name}: {reason}" for name, reason in packed.left_out.items()]
-    print_lines(console, lines)
+    print_lines(console, packed.told(out))

@@ -12,6 +12,7 @@ from qgs.wording import listed
 Severity: TypeAlias = Literal["error", "warning"]
 
 _FEW = 3
+_ROWS = 40
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,17 @@ class CheckReport:
     scenes: Sequence[SceneReport]
     general: Sequence[Finding]
     notes: Sequence[str]
+
+    @property
+    def table(self) -> list[list[str]]:
+        """Rows of a table: its headers, then one for each scene; of many scenes, for the worst."""
+        rows = [["scene", "format", "frames", "decodable", "missing", "bad poses", "epipolar px"]]
+        for scene in sorted(self.scenes, key=lambda scene: -len(scene.findings))[:_ROWS]:
+            counts = (scene.listed, scene.decodable, scene.missing, scene.pose_problems)
+            rows.append([scene.name, scene.kind, *map(str, counts), scene.epipolar])
+        if len(self.scenes) > _ROWS:
+            rows.append([f"and {len(self.scenes) - _ROWS} more"])
+        return rows
 
     @property
     def findings(self) -> list[Finding]:

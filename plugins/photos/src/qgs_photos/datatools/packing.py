@@ -121,6 +121,21 @@ class Packed:
     kept: int = 0
     left_out: dict[str, str] = field(default_factory=dict)
 
+    def told(self, out: str) -> Iterator[str]:
+        """Yield lines for the user on what was packed into `out`."""
+        scenes = ", ".join(f"{count} {split}" for split, count in self.scenes.items())
+        again = f", {self.resumed} of them by an earlier run" if self.resumed else ""
+        yield (
+            f"{out}: packed scenes: {scenes}{again}; images of this run: {self.frames}, of which "
+            f"{self.kept} copied unchanged and {self.frames - self.kept} encoded again"
+        )
+        if not self.scenes["test"]:
+            yield "there are no test scenes: evaluations will use held-out photos of scenes"
+        if self.left_out:
+            yield f"scenes left out since they cannot be read: {len(self.left_out)}"
+        for name, reason in self.left_out.items():
+            yield f"  {name}: {reason}"
+
 
 def pack(
     source: SceneSource,
@@ -138,14 +153,16 @@ def pack(
     A chunk has at most `chunk_bytes` bytes, or holds one larger scene. index.json is written last.
     An interrupted packing continues after its last complete chunk if its settings are the same.
 
-    settings: options of the source on which its scenes depend. leave_out_broken: leave out scenes
-    that cannot be read and name them in the result; False raises the error. progress: called with
-    the name of each finished scene. Raises FileExistsError for a folder with other content,
-    ValueError for an unfinished packing with other settings, and the errors of reading scenes.
+    settings: options, beside those of the source, on which `splits` depend. leave_out_broken: leave
+    out scenes that cannot be read and name them in the result; False raises the error. progress:
+    called with the name of each finished scene. Raises FileExistsError for a folder with other
+    content, ValueError for an unfinished packing with other settings, and the errors of reading
+    scenes.
     """
     encoding = encoding or Encoding()
     # chunks of two settings in one folder would be a data set that nobody asked for
-    _begin(folder, {**settings, **asdict(encoding), "chunk_bytes": chunk_bytes})
+    options = {"source": type(source).name, **source.config.model_dump(mode="json"), **settings}
+    _begin(folder, {**options, **asdict(encoding), "chunk_bytes": chunk_bytes})
     packed = Packed()
 
     def entries(places: Places, done: Collection[str]) -> Iterator[ChunkEntry]:

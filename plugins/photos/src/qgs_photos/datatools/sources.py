@@ -1,8 +1,8 @@
 """Find the installed data source that can read a path, and list the scenes to check."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from upath import UPath
@@ -10,7 +10,10 @@ from upath import UPath
 from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
+from qgs.data.scenes import resized
 from qgs.drawing.images import png_bytes, rgb_picture
+from qgs.paths import opened_path
+from qgs.recipe import resolve
 from qgs.recipe.registry import Registry, load_plugin
 from qgs.reconstruction.scenes import installed_sources
 from qgs_photos.datasets.encoded import as_intrinsics
@@ -39,6 +42,23 @@ def sources(format: str = "auto") -> dict[str, type[Component]]:
         names = [*OF_FILES, *([plugin] if slash else [])]
         found = Registry({name: load_plugin(name) for name in names}).components("data")
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}
+
+
+def opened_source(
+    path: str, options: Sequence[str], image_size: tuple[int, int] | None
+) -> SceneSource:
+    """Return the source of the scenes at `path`.
+
+    path: data set or recipe. options: settings of the source, as KEY=VALUE.
+    """
+    recipe: Any = path
+    if not path.endswith((".yaml", ".yml")):
+        kind = recognised(opened_path(path), sources())
+        recipe = {"recipe": 1, "data": {"type": kind, "path": path}}
+        # components of qgs itself are there without being named
+        recipe["plugins"] = [*{kind.partition("/")[0]} - {"qgs"}]
+    source = resolve(recipe, [f"data.{option}" for option in options]).build_data()
+    return source if image_size is None else resized(source, source.config, image_size)
 
 
 def kind_of(path: UPath) -> str:

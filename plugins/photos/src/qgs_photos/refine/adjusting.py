@@ -49,13 +49,13 @@ class Adjustments:
         quat = F.normalize(torch.cat([turn.new_ones(1), turn]), dim=0)
         rows = torch.cat([quat_to_matrix(quat), self.size * shift[:, None]], 1)
         move = torch.cat([rows, rows.new_tensor([[0.0, 0, 0, 1]])])
-        return Cameras(cameras.c2w @ move, cameras.intrinsics, cameras.size)
+        return cameras.replace(c2w=cameras.c2w @ move)
 
     def every_camera(self, cameras: Cameras) -> Cameras:
         """Return the corrected cameras (1, V) of all photos, without gradients."""
         with torch.no_grad():
             each = [self.cameras(v, cameras[:, [v]]).c2w for v in range(cameras.shape[1])]
-        return Cameras(torch.cat(each, 1), cameras.intrinsics, cameras.size)
+        return cameras.replace(c2w=torch.cat(each, 1))
 
     def seen(self, photo: int, rgb: Tensor) -> Tensor:
         """Apply the exposure of the photo with index `photo` to rendered `rgb` (1, 1, 3, H, W)."""

@@ -306,7 +306,7 @@ def resized(views: Views, part: int) -> Views:
     images, masks = map_tensors(smaller, (views.images, views.masks))
     factors = [size[1] / width, size[0] / height]
     intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
-    cameras = Cameras(views.cameras.c2w, intrinsics, size)
+    cameras = views.cameras.replace(intrinsics=intrinsics, size=size)
     return replace(views, images=images, cameras=cameras, masks=masks)
 
 
