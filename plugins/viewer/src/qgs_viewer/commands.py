@@ -3,15 +3,10 @@
 torch is imported only when a command runs, so that --help is fast.
 """
 
-from __future__ import annotations
-
-import socket
-import webbrowser
-from contextlib import suppress
 from enum import StrEnum, auto
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -29,11 +24,9 @@ from qgs.cli.options import (
     scale_settings,
     use_threads,
 )
-from qgs.files import refuse_filled
+from qgs.files import refuse_existing, refuse_filled
+from qgs.terminal import print_lines
 from qgs.wording import listed
-
-if TYPE_CHECKING:
-    from qgs_viewer.opening import Source
 
 
 class FigureName(StrEnum):
@@ -186,10 +179,10 @@ def view(
     # a wrong word is refused before torch is loaded, which takes seconds
     pixels = parse_size(size)
 
-    from qgs.files import refuse_existing
-    from qgs.terminal import print_lines
     from qgs.train.distributed import choose_device
     from qgs_viewer.opening import open_source
+    from qgs_viewer.page import write_page
+    from qgs_viewer.panel import serve
 
     if html is not None:
         refuse_existing(html)
@@ -207,49 +200,9 @@ def view(
     console = Console()
     print_lines(console, opened.notes)
     if html is not None:
-        _write_page(opened, query, html, console)
+        write_page(opened.scene_of(opened.frames), query, html, console)
     else:
-        _serve(opened, query, host, port, show, console)
-
-
-def _write_page(source: Source, query: int | None, file: Path, console: Console) -> None:
-    from qgs.files import refuse_existing, write_text
-    from qgs_viewer.drawing import Choice
-    from qgs_viewer.page import scene_html
-
-    scene = source.scene_of(source.frames)
-    scene.refuse_missing(query)
-    page = scene_html(scene, Choice(query=query, layer=scene.depth))
-    # it may have come into being since the command began
-    refuse_existing(file)
-    write_text(file, page)
-    console.print(f"wrote {file}", soft_wrap=True)
-    if scene.queries:
-        console.print("--query picks a query for the page; leave out --html to pick by mouse.")
-
-
-def _serve(
-    source: Source, query: int | None, host: str, port: int, show: bool, console: Console
-) -> None:
-    from qgs.terminal import print_lines
-    from qgs_viewer.page import quiet_server
-    from qgs_viewer.panel import Panel
-
-    with quiet_server(host, port, source.title) as server:
-        panel = Panel(server, source)
-        panel.scene.refuse_missing(query)
-        if query is not None:
-            panel.pick(query)
-        # others reach this machine by its name, not by the address that stands for all
-        names = {"127.0.0.1": "localhost", "0.0.0.0": socket.gethostname()}
-        # the wanted port may be taken, and then the server has chosen another
-        address = f"http://{names.get(host, host)}:{server.get_port()}"
-        print_lines(console, [f"{source.title}: {address} (Ctrl-C ends it)"])
-        if show:
-            webbrowser.open(address)
-        # Ctrl-C is how a user ends it, no error
-        with suppress(KeyboardInterrupt):
-            server.sleep_forever()
+        serve(opened, query, host, port, show, console)
 
 
 @demo_app.command()
@@ -335,7 +288,6 @@ def figures(
 
     The file figures.md explains each figure.
     """
-    from qgs.terminal import print_lines
     from qgs.train.distributed import choose_device
     from qgs_viewer.comparison import open_models
     from qgs_viewer.figures import write_figures

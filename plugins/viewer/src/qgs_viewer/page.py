@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -17,7 +18,9 @@ import torch
 import torch.nn.functional as F
 import viser
 import websockets.asyncio.server as sockets
+from rich.console import Console
 
+from qgs.files import refuse_existing, write_text
 from qgs.geometry.poses import look_at_depth
 from qgs.types import Gaussians, Views
 from qgs_viewer.drawing import FRUSTUM, Choice, Drawing, distance_to
@@ -153,6 +156,22 @@ def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
     head = files("qgs_viewer") / "template" / "head.html"
     # before viser's code, which reads what it changes
     return page.replace("<head>", f"<head>{head.read_text(encoding='utf-8')}", 1)
+
+
+def write_page(scene: QueryScene, query: int | None, file: Path, console: Console) -> None:
+    """Write an HTML page that shows `scene` to the new file `file`, and say so on the console.
+
+    query: index of the picked query; None shows all. Raises ValueError for a query that does not
+    exist, and FileExistsError if `file` exists.
+    """
+    scene.refuse_missing(query)
+    page = scene_html(scene, Choice(query=query, layer=scene.depth))
+    # it may have come into being since the command began
+    refuse_existing(file)
+    write_text(file, page)
+    console.print(f"wrote {file}", soft_wrap=True)
+    if scene.queries:
+        console.print("--query picks a query for the page; leave out --html to pick by mouse.")
 
 
 def gaussians_html(gaussians: Gaussians, views: Views, background: Background = NEUTRAL) -> str:

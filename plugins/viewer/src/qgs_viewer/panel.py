@@ -1,7 +1,10 @@
 """Controls of the viewer: what is shown, which query is picked, which photos are inputs."""
 
 import re
+import socket
+import webbrowser
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from threading import RLock
@@ -9,10 +12,12 @@ from typing import Any, get_args
 
 import numpy as np
 import viser
+from rich.console import Console
 
+from qgs.terminal import print_lines
 from qgs_viewer.drawing import Choice, Drawing, Others, painted
 from qgs_viewer.opening import Source
-from qgs_viewer.page import stand
+from qgs_viewer.page import quiet_server, stand
 from qgs_viewer.placement import Splats, hit
 from qgs_viewer.queries import PARTS, attention_pictures_of, sheet
 from qgs_viewer.query_scene import QueryScene
@@ -192,6 +197,31 @@ class Panel:
                 return anchor
         gaussian = hit(painted(self.scene, self.choice), origin, direction)
         return None if gaussian is None else self.scene.query_of(gaussian)
+
+
+def serve(
+    source: Source, query: int | None, host: str, port: int, show: bool, console: Console
+) -> None:
+    """Show `source` in the browser until Ctrl-C.
+
+    query: index of the picked query; None shows all. show: whether to open the browser of this
+    machine. Raises ValueError for a query that does not exist.
+    """
+    with quiet_server(host, port, source.title) as server:
+        panel = Panel(server, source)
+        panel.scene.refuse_missing(query)
+        if query is not None:
+            panel.pick(query)
+        # others reach this machine by its name, not by the address that stands for all
+        names = {"127.0.0.1": "localhost", "0.0.0.0": socket.gethostname()}
+        # the wanted port may be taken, and then the server has chosen another
+        address = f"http://{names.get(host, host)}:{server.get_port()}"
+        print_lines(console, [f"{source.title}: {address} (Ctrl-C ends it)"])
+        if show:
+            webbrowser.open(address)
+        # Ctrl-C is how a user ends it, no error
+        with suppress(KeyboardInterrupt):
+            server.sleep_forever()
 
 
 def plain(text: str) -> str:
