@@ -1,22 +1,17 @@
 """Tensors of a golden file of DepthSplat, computed by the components of qgs."""
 
-import json
 from typing import Any
 
 import torch
-from qgs_research.published.mvsplat import depthsplat_encoder
 from qgs_zoo.dinov2.vit import PATCH
 from qgs_zoo.mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
 from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
-from qgs_zoo.mvsplat.head import WorldHead
 from qgs_zoo.mvsplat.mvsplat import expected_disparity
-from qgs_zoo.mvsplat.pixels import OnRays
 from qgs_zoo.mvsplat.sweep import (
     Sweep,
     inverse_depth_candidates,
     relative_poses,
 )
-from qgs_zoo.mvsplat.two_depths import Exchange
 from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
@@ -24,19 +19,15 @@ from published.files import GoldenFile
 from published.recording import Recorder
 from published.splats import (
     gaussians,
+    model_of,
     of_views,
-    pixel_state,
+    predicted,
     views_of,
     warps,
     watch_transformer,
     watch_unet,
-    weights_of,
 )
-from qgs.contracts import LayerParts, ModelDims
-from qgs.types import ImageMemory, Views
-
-DIMS = {1: ModelDims(38, 1, 0), 2: ModelDims(39, 1, 2)}
-"""Model sizes by number of scales. A model with two scales outputs the depths of both."""
+from qgs.types import Views
 
 OUTPUTS = """
 features_cnn.0                        depth_predictor.backbone.conv2
@@ -65,22 +56,12 @@ features_mono.1   mono_pyramid.stages.1
 """
 
 
-def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
-    """Return DepthSplat's encoder with the options and the weights of a golden file."""
-    shapes = {f"encoder.{name}": shape for name, shape in golden.config["state_dict"]}
-    options = depthsplat_encoder(shapes)
-    del options["type"]
-    options["neighbours"] = golden.config["options"]["local_mv_match"]
-    # In Python a Config takes tuples alone, of JSON lists too.
-    config = DepthSplatEncoder.Config.model_validate_json(json.dumps(options))
-    encoder = DepthSplatEncoder(config, DIMS[config.scales]).eval()
-    encoder.network.load_state_dict(weights_of(golden))
-    return encoder
-
-
 def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Compute every output that a golden file has, by name."""
-    encoder = encoder_of(golden)
+    neighbours = golden.config["options"]["local_mv_match"]
+    model = model_of(golden, [f"model.encoder.neighbours={neighbours}"])
+    encoder = model.encoder
+    assert isinstance(encoder, DepthSplatEncoder)
     views = views_of(golden)
     near = golden.input("near")
     far = golden.input("far")
@@ -101,12 +82,14 @@ def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     )
     swept(found, predictor, views, sweep)
     numbers = numbers.movedim(2, -1)
-    # Behind the harmonics stands the coarse depth, of models that have one.
-    found |= gaussians(views, numbers[..., :38], *outputs_of(DIMS[1]))
+    prediction = predicted(model, views, numbers)
+    found |= gaussians(views, numbers, prediction)
     found["depth"] = numbers[..., 0].exp()
-    found["scales"] = found["scales"][..., 0, :]
-    if encoder.dims.depth:
-        found |= training_gaussians(views, numbers, encoder.dims)
+    if model.depth:
+        # Of both scales, concatenated as in training.
+        found["training.depths"] = torch.cat([numbers[..., -1], numbers[..., 0]]).exp()
+        layers = prediction.layers.values()
+        found["training.means"] = torch.cat([layer.gaussians.means for layer in layers])
     return found
 
 
@@ -162,22 +145,3 @@ def swept(found: dict[str, Tensor], predictor: DepthPredictor, views: Views, swe
         found[f"match_probability.{scale}"] = logits.softmax(2)
         inverse = expected_disparity(logits.flatten(0, 1), candidates)[0]
         found[f"coarse_inverse_depth.{scale}"] = inverse.unflatten(0, shape)
-
-
-def training_gaussians(views: Views, numbers: Tensor, dims: ModelDims) -> dict[str, Tensor]:
-    """Return depths and means of Gaussians of both scales, concatenated as in training."""
-    memory = ImageMemory(numbers.flatten(1, 3), grid=(views.cameras.shape[1], *views.cameras.size))
-    layer = Exchange(Exchange.Config(), LayerParts(dims, {}, 1.0))
-    head, centers = outputs_of(dims)
-    state = pixel_state(views, numbers)
-    means: list[Tensor] = []
-    for _ in range(2):
-        state = layer(state, memory)[0]
-        means.append(centers(head(state).offsets, state)[:, :, 0])
-    depths = torch.cat([numbers[..., -1], numbers[..., 0]])
-    return {"training.depths": depths.exp(), "training.means": torch.cat(means)}
-
-
-def outputs_of(dims: ModelDims) -> tuple[WorldHead, OnRays]:
-    """Return the head and the centers component that decode the network's output per pixel."""
-    return WorldHead(WorldHead.Config(), dims), OnRays(OnRays.Config(measure="depth"), dims)

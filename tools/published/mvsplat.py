@@ -1,8 +1,6 @@
 """Tensors of a golden file of MVSplat, computed by the components of qgs."""
 
-from qgs_zoo.mvsplat.head import RayHead
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder
-from qgs_zoo.mvsplat.pixels import OnRays
 from qgs_zoo.mvsplat.sweep import (
     Sweep,
     cyclic_neighbours,
@@ -16,14 +14,14 @@ from published.files import GoldenFile
 from published.recording import Recorder
 from published.splats import (
     gaussians,
+    model_of,
     of_views,
+    predicted,
     views_of,
     warps,
     watch_transformer,
     watch_unet,
-    weights_of,
 )
-from qgs.contracts import ModelDims
 
 OUTPUTS = """
 cnn.layer2                          backbone.backbone.layer2
@@ -38,28 +36,11 @@ delta_disparity_and_density_logit   depth_predictor.to_disparity
 """Lines with a name in the golden file and the encoder module whose output has this name."""
 
 
-def encoder_of(golden: GoldenFile) -> MVSplatEncoder:
-    """Return MVSplat's encoder with the options and the weights of a golden file."""
-    options = golden.config["options"]
-    config = MVSplatEncoder.Config(
-        candidates=options["num_depth_candidates"],
-        cost_width=options["costvolume_unet_feat_dim"],
-        cost_levels=len(options["costvolume_unet_channel_mult"]),
-        depth_width=options["depth_unet_feat_dim"],
-        depth_levels=len(options["depth_unet_channel_mult"]),
-        near=1.0,
-        far=100.0,
-        features=options["d_feature"],
-    )
-    dims = ModelDims(11 + 3 * (options["gaussian_adapter"]["sh_degree"] + 1) ** 2, 1, 0)
-    encoder = MVSplatEncoder(config, dims).eval()
-    encoder.load_state_dict(weights_of(golden))
-    return encoder
-
-
 def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Compute every output that a golden file has, by name."""
-    encoder = encoder_of(golden)
+    model = model_of(golden)
+    encoder = model.encoder
+    assert isinstance(encoder, MVSplatEncoder)
     views = views_of(golden)
     near = golden.input("near")
     far = golden.input("far")
@@ -79,10 +60,10 @@ def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     found["warp_grid"] = warps(views, poses, low, disparity)
     found["shift_mask"] = shift_mask(*low, device=near.device)
     numbers = raw.movedim(2, -1)
-    head = RayHead(RayHead.Config(), encoder.dims)
-    found |= gaussians(views, numbers, head, OnRays(OnRays.Config(), encoder.dims))
+    found |= gaussians(views, numbers, predicted(model, views, numbers))
     # The release keeps an axis of Gaussians a pixel here.
-    found["rotations"] = found["rotations"][..., None, :]
+    for name in ("scales", "rotations"):
+        found[name] = found[name][..., None, :]
     found["depth"] = numbers[..., :1].exp()
     found["density"] = numbers[..., 1:2].sigmoid()
     found["raw_gaussians"] = numbers[..., 2:]

@@ -4,27 +4,29 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
-from qgs_zoo.mvsplat.head import RayHead, WorldHead, mapped_opacity
-from qgs_zoo.mvsplat.pixels import (
-    PIXEL,
-    OnRays,
-    PixelQueries,
-    in_world,
-    pixel_fields,
-    ray_directions,
+from qgs_research.published.layouts import fitting_recipe, names_of
+from qgs_zoo.mvsplat.adapter import (
+    band_mask,
+    camera_quaternions,
+    coefficients,
+    turn_of_harmonics,
 )
+from qgs_zoo.mvsplat.head import mapped_opacity
+from qgs_zoo.mvsplat.pixels import PIXEL, degree_of, ray_directions
 from qgs_zoo.mvsplat.sweep import feature_lenses, warp_grid, warped
 from qgs_zoo.mvsplat.windows import out_of_windows
 from torch import Tensor
 
+import qgs
 from published.files import GoldenFile
 from published.recording import Recorder
 from published.seeded_weights import seeded_weight
-from qgs.contracts import ModelDims
+from qgs.checkpoint.tensors import shapes_of
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.types import Cameras, GaussianAttributes, ImageMemory, QueryState, Views
+from qgs.model import QueryGaussianModel
+from qgs.recipe import resolve
+from qgs.types import Cameras, ImageMemory, Prediction, Views
 
 
 def views_of(golden: GoldenFile) -> Views:
@@ -58,6 +60,19 @@ def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
         )
         for name, shape in golden.config["state_dict"]
     }
+
+
+def model_of(golden: GoldenFile, overrides: Sequence[str] = ()) -> QueryGaussianModel:
+    """Return the model that fits the weights of a golden file, with these weights.
+
+    overrides: options that weights do not determine.
+    """
+    weights = {f"encoder.{name}": x for name, x in weights_of(golden).items()}
+    tree = fitting_recipe(shapes_of(weights), golden.config["kind"])[1]
+    recipe = resolve(tree, overrides)
+    model = recipe.build_model(pretrained=False).eval()
+    model.load_state_dict(names_of(recipe).from_published(weights))
+    return model
 
 
 def of_views(views: int) -> Recorder:
@@ -104,49 +119,38 @@ def warps(views: Views, poses_BVJ44: Tensor, low: Sequence[int], inverse_BVD: Te
     return grid.unflatten(0, pairs)
 
 
-def gaussians(views: Views, numbers: Tensor, head: Any, centers: Any) -> dict[str, Tensor]:
-    """Decode the networks' output into Gaussians, with the queries, head and centers of qgs.
+def predicted(model: QueryGaussianModel, views: Views, numbers: Tensor) -> Prediction:
+    """Decode the output of the networks into the Gaussians of every layer of a model.
+
+    numbers: features of the pixels, (B, V, H, W, C).
+    """
+    memory = ImageMemory(numbers.flatten(1, 3), grid=(views.cameras.shape[1], *views.cameras.size))
+    return model.predict(views, memory, model.queries(memory, views), range(1, model.depth + 1))
+
+
+def gaussians(views: Views, numbers: Tensor, prediction: Prediction) -> dict[str, Tensor]:
+    """Return the Gaussians of a prediction by the names of golden files.
 
     numbers: output of the networks for each pixel, (B, V, H, W, C).
     """
     cameras = views.cameras
-    state = pixel_state(views, numbers)
-    out = head(state)
-    sh = numbers[..., 11:].unflatten(-1, (3, -1))
-    turn = turn_of(cameras.c2w, sh)
+    made = prediction.gaussians
+    degree = degree_of(numbers.shape[-1])
+    sh = numbers[..., 11 : 11 + 3 * coefficients(degree)].unflatten(-1, (3, -1))
+    # The basis of the harmonics is that of e3nn.
+    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], degree) * band_mask(degree, sh)
     row, column = torch.meshgrid(*(torch.arange(side) for side in cameras.size), indexing="ij")
     place = torch.stack([column, row], -1) + numbers[..., 2:4].sigmoid()
+    factors = quat_to_matrix(made.quats) * made.scales[..., None, :]
     return {
         "ray_xy": place / torch.tensor([cameras.size[1], cameras.size[0]]),
-        "means": centers(out.offsets, state)[:, :, 0],
-        "covariances": covariances(out)[:, :, 0],
-        "opacities": out.opacities[..., 0],
-        "scales": out.scales.unflatten(1, (cameras.shape[1], *cameras.size)),
+        "means": made.means,
+        "covariances": factors @ factors.mT,
+        "opacities": made.opacities,
+        "scales": made.scales.unflatten(1, (cameras.shape[1], *cameras.size)),
         "rotations": camera_quaternions(numbers[..., 7:11]),
         "harmonics": torch.einsum("bvkl,bvhwxl->bvhwxk", turn, sh).flatten(1, 3),
     }
-
-
-def pixel_state(views: Views, numbers: Tensor) -> QueryState:
-    """Return a state with one query for each pixel. numbers: features (B, V, H, W, C)."""
-    memory = ImageMemory(numbers.flatten(1, 3), grid=(views.cameras.shape[1], *views.cameras.size))
-    dims = ModelDims(numbers.shape[-1], 1, 0)
-    return PixelQueries(PixelQueries.Config(), dims)(memory, views)
-
-
-def covariances(given: GaussianAttributes) -> Tensor:
-    """Return the covariance matrices (..., 3, 3) of Gaussians."""
-    factors = quat_to_matrix(given.quats) * given.scales[..., None, :]
-    return factors @ factors.mT
-
-
-def turn_of(c2w: Tensor, sh: Tensor) -> Tensor:
-    """Return matrices (..., K, K) that rotate harmonic coefficients from camera to world frame.
-
-    The basis of the harmonics is that of e3nn. sh: raw coefficients (..., K).
-    """
-    degree = round(sh.shape[-1] ** 0.5) - 1
-    return turn_of_harmonics(c2w[..., :3, :3], degree) * band_mask(degree, c2w)
 
 
 def cases_tensors(golden: GoldenFile) -> dict[str, Tensor]:
@@ -166,41 +170,26 @@ def cases_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 def single_gaussians(golden: GoldenFile) -> dict[str, Tensor]:
     """Decode Gaussians that have one camera each; some have extreme rotations and values."""
-    of_rays = golden.config["kind"] == "mvsplat_cases"
-    names = ("depths", "opacities", "raw", "extrinsics")
-    depth, opacity, raw, c2w = (golden.input(f"adapter.{name}") for name in names)
-    fields = rays(golden)
+    names = ("depths", "opacities", "raw", "extrinsics", "coordinates")
+    depth, opacity, raw, c2w, place = (golden.input(f"adapter.{name}") for name in names)
+    height, width = golden.config["image_shape"]
+    lens = lens_of(golden.input("adapter.intrinsics"), (height, width))
+    # Each image is the one pixel around its Gaussian, which may be outside the whole image.
+    lens[:, 2:] += 0.5 - place * torch.tensor([width, height])
+    views = Views(raw.new_zeros(len(raw), 1, 3, 1, 1), Cameras(c2w, lens, (1, 1))[:, None])
     sh = raw[:, 7:].unflatten(1, (3, -1)).clone()
-    if not of_rays:
+    if "adapter.rgb" in golden.tensors:
         sh[..., 0] += (golden.input("adapter.rgb") - 0.5) / SH_C0
     numbers = [depth.log()[:, None], opacity.logit()[:, None], raw.new_zeros(len(raw), 2)]
-    numbers = torch.cat([*numbers, raw[:, :7], sh.flatten(1)], 1)[:, None]
-    dims = ModelDims(numbers.shape[-1], 1, 0)
-    state = QueryState(in_world(numbers, c2w[:, None, :3, :3]), fields)
-    head = RayHead(RayHead.Config(), dims) if of_rays else WorldHead(WorldHead.Config(), dims)
-    out = head(state)
-    centers = OnRays(OnRays.Config(measure="distance" if of_rays else "depth"), dims)
-    directions = ray_directions(numbers[:, :, None, 2:4], fields[PIXEL], unit=of_rays)
-    return {
-        "origins": fields[PIXEL][:, 0, 0],
-        "directions": directions[:, 0, 0],
-        "means": centers(out.offsets, state)[:, 0, 0],
-        "covariances": covariances(out)[:, 0, 0],
-        "scales": out.scales[:, 0, 0],
-        "rotations": camera_quaternions(raw[:, 3:7]),
-        "harmonics": torch.einsum("nkl,nxl->nxk", turn_of(c2w, sh), sh),
-    }
-
-
-def rays(golden: GoldenFile) -> dict[str, Tensor]:
-    """Return ray fields of pixels at whose centres Gaussians are, also outside the image."""
-    height, width = golden.config["image_shape"]
-    c2w = golden.input("adapter.extrinsics")[:, None]
-    lens = lens_of(golden.input("adapter.intrinsics"), (height, width))[:, None]
-    # Of the image as one pixel.
-    fields = pixel_fields(Cameras(c2w, lens, (height, width)), 1, 1)
-    origin, corner, across, down = fields[PIXEL].unbind(2)
-    x, y = golden.input("adapter.coordinates")[:, None, :, None].unbind(2)
-    own = across / width, down / height
-    place = corner + x * across + y * down - (own[0] + own[1]) / 2
-    return {**fields, PIXEL: torch.stack([origin, place, *own], 2)}
+    numbers = torch.cat([*numbers, raw[:, :7], sh.flatten(1)], 1)[:, None, None, None]
+    limits = golden.config["options"]["gaussian_adapter"]
+    overrides = [f"model.head.{n}={limits[f'gaussian_{n}']}" for n in ("scale_min", "scale_max")]
+    recipe = f"tiny/{golden.config['kind'].removesuffix('_cases')}.yaml"
+    model = qgs.compose(recipe, [*overrides, f"model.width={numbers.shape[-1]}"])
+    prediction = predicted(model, views, numbers)
+    pixel = prediction.state[PIXEL]
+    place = prediction.state.features[:, :, None, 2:4]
+    directions = ray_directions(place, pixel, unit=golden.config["kind"] == "mvsplat_cases")
+    found = gaussians(views, numbers, prediction)
+    found |= {"origins": pixel[:, :, 0], "directions": directions}
+    return {name: x.squeeze() for name, x in found.items()}
