@@ -8,7 +8,6 @@ from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
 import torch
-from pydantic_core import to_jsonable_python
 from torch import nn
 from torch.nn import Module
 
@@ -110,13 +109,9 @@ class Case:
     @cached_property
     def label(self) -> str:
         """Slot and name of the component, and the options that are not default, as YAML."""
-        given = dict(self.config)
-        changed = {
-            name: given[name]
-            for name, option in type(self.config).model_fields.items()
-            if given[name] != option.get_default()
-        }
-        written = dump(to_jsonable_python(changed, fallback=repr), flow=True).strip()
+        changed = {*self.config.model_dump(exclude_defaults=True)}
+        shown = self.config.model_dump(mode="json", include=changed, fallback=repr)
+        written = dump(shown, flow=True).strip()
         options = f"({written[1:-1]})" if changed else ""
         return f"{self.slot}/{self.component.name}{options}"
 

@@ -253,12 +253,11 @@ def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
     than D, h and D/h counts as 4.
     """
     named = {"D": dims.width, "h": dims.heads, "D/h": dims.width // dims.heads}
-    sizes = []
-    for size in spec.shape:
-        factor, _, name = str(size).rpartition("*")
-        count = int(factor) if factor.isdigit() else 1
-        sizes.append(size if isinstance(size, int) else count * named.get(name, 4))
-    return sizes
+    factors = [str(size).split("*") for size in spec.shape]
+    return [
+        math.prod(int(part) if part.isdigit() else named.get(part, 4) for part in parts)
+        for parts in factors
+    ]
 
 
 def is_place(spec: FieldSpec) -> bool:

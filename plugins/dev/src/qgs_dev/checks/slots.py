@@ -81,13 +81,11 @@ def check_queries_resize(case: Case) -> None:
     `count` is the number of queries.
     """
     module = case.build()
-    options = case.config.model_dump(mode="json")
-    if "count" not in options or module.count is None:
+    if not hasattr(case.config, "count") or module.count is None:
         raise CannotCheck("the component has no option `count` for the number of queries")
     # Fewer queries must be filled up, more queries must be cut.
     for count in (max(module.count // 2, 1), module.count + 3):
-        options["count"] = count
-        config = type(case.config).model_validate_json(json.dumps(options))
+        config = case.config.model_copy(update={"count": count})
         # another seed than that of `module`, whose own values must not pass for kept ones
         learned = dict(case.with_config(config).build(seed=1).state_dict())
         resized = module.resized(learned, torch.Generator().manual_seed(0))
