@@ -12,3 +12,5 @@ def test_diff_shows_what_differs(tmp_path, monkeypatch):
     for words in ("model.queries.count", f"{3 * 16:+,}", "[red]"):
         assert words in shown
     assert "model.width" not in shown
+    # A model without layers has no component in them.
+    assert "decoder.feed_forward" in done("diff", "tiny/tokengs.yaml", "tiny/mvsplat.yaml").output

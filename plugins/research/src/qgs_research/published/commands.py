@@ -32,8 +32,8 @@ def import_(
     from qgs_research.published.importing import import_weights
 
     resolved = None if recipe == "auto" else resolve(recipe, overrides or ())
-    done = import_weights(weights, resolved, out, overrides=overrides or ())
-    typer.echo("\n".join(done.report))
+    report = import_weights(weights, resolved, out, overrides=overrides or ())
+    typer.echo("\n".join(report))
 
 
 @export_app.command()

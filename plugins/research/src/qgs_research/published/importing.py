@@ -7,7 +7,6 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,25 +28,17 @@ from qgs_research.published.layouts import (
 from qgs_research.published.weight_files import WeightFile, read_weight_file
 
 
-class Transfer(NamedTuple):
-    """Result of `import_weights`: the recipe of the model, and a report as lines of text.
-
-    The report says how the file was read and converted, which tensors are unused, and which options
-    of the recipe differ from the published model although the weights fit, such as activations.
-    """
-
-    recipe: Recipe
-    report: list[str]
-
-
 def import_weights(
     weights: str | Path,
     recipe: Recipe | None,
     out: str | Path,
     *,
     overrides: Sequence[str] = (),
-) -> Transfer:
-    """Write a checkpoint of `recipe` with published weights.
+) -> list[str]:
+    """Write a checkpoint of `recipe` with published weights, and return a report as lines of text.
+
+    The report says how the file was read and converted, which tensors are unused, and which options
+    of the recipe differ from the published model although the weights fit, such as activations.
 
     recipe: None derives the recipe from the weights, changes it by `overrides`, for example
         "data.image_size=[64, 64]", and writes it to a .yaml file beside `out`.
@@ -99,7 +90,7 @@ def import_weights(
     report.append(f"wrote {out}")
     if recipe_file:
         report.append(f"wrote {recipe_file}; its head lists options that weights do not determine")
-    return Transfer(recipe, report)
+    return report
 
 
 def _without_prefix(file: WeightFile) -> WeightFile:

@@ -30,14 +30,12 @@ class Names:
     """Parameter names of a recipe's model, in qgs and in the published weights.
 
     shapes: shapes of the parameters by name in qgs. published: published names by name in qgs.
-    unnamed: names in qgs without a published name. unused: names of tensors that a published file
-    may hold, but that the published code ignores.
+    unused: names of tensors that a published file may hold, but that the published code ignores.
     """
 
     layout: WeightLayout
     shapes: Shapes
     published: Mapping[str, str]
-    unnamed: tuple[str, ...]
     unused: tuple[str, ...]
 
     def from_published(
@@ -49,7 +47,7 @@ class Names:
         all differences in names and shapes.
         """
         wanted = {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
-        found = [f"{name} has no published name" for name in self.unnamed]
+        found = [f"{name} has no published name" for name in self.shapes.keys() - self.published]
         given = {name: w for name, w in weights.items() if name not in self.unused}
         if found := found + differing_tensors(shapes_of(given), wanted):
             raise PublishedError(
@@ -103,12 +101,10 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
     model = recipe.build_model("meta")
     shapes = shapes_of(unique_tensors(model))
     named = {name: layout.published_name(name) for name in shapes}
-    published = {ours: theirs for ours, theirs in named.items() if theirs is not None}
-    unnamed = tuple(name for name in shapes if name not in published)
+    published = {ours: theirs for ours, theirs in named.items() if theirs}
     # These are stored beside the used ones, but the published code never reads them.
     beside = (renamed(name, *rule) for name in published.values() for rule in layout.unused)
-    unused = tuple(name for name in beside if name is not None)
-    return Names(layout, shapes, published, unnamed, unused)
+    return Names(layout, shapes, published, tuple(filter(None, beside)))
 
 
 def recognise(shapes: Shapes) -> WeightLayout | None:

@@ -61,7 +61,7 @@ class WeightLayout:
     def published_name(self, ours: str) -> str | None:
         """Return the published name of the parameter that qgs calls `ours`, or None."""
         names = (renamed(ours, *rule) for rule in self.renames.items())
-        return next((name for name in names if name is not None), None)
+        return next(filter(None, names), None)
 
 
 def layout(

@@ -1,5 +1,6 @@
 """The commands `qgs study`, `qgs compare` and `qgs diff`."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -125,14 +126,12 @@ def diff(
         rows = slots if path.endswith(".type") else options
         rows.append([path.removesuffix(".type"), *(value or "-" for value in values)])
     # sizes need no memory for weights
-    before = parameter_counts(ours.build_model("meta"))
-    after = parameter_counts(theirs.build_model("meta"))
-    before["total"] = sum(before.values())
-    after["total"] = sum(after.values())
+    before, after = (Counter(parameter_counts(x.build_model("meta"))) for x in (ours, theirs))
     parameters = [["component", *names, "difference"]]
-    for name, count in before.items():
-        change = f"{after[name] - count:+,}" if after[name] != count else ""
-        parameters.append([name, f"{count:,}", f"{after[name]:,}", change])
+    sizes = [(name, before[name], after[name]) for name in {**before, **after}]
+    for name, old, new in [*sizes, ("total", before.total(), after.total())]:
+        change = f"{new - old:+,}" if new != old else ""
+        parameters.append([name, f"{old:,}", f"{new:,}", change])
     console = Console()
     print_table(console, "slots that differ", slots)
     print_table(console, "options that differ", options)

@@ -13,7 +13,7 @@ from qgs.contracts import Column
 from qgs.metrics.baselines import BASELINES
 from qgs_research.studies.estimates import CONFIDENCE, Estimate, Runs, interval
 from qgs_research.studies.hypotheses import MAIN
-from qgs_research.studies.stored import StoredResults, scenes_with
+from qgs_research.studies.stored import StoredResults, common_scenes
 
 Terms: TypeAlias = Mapping[tuple[str, str], int]
 """Weighted sum of mean scores: the weight of each mean, by (model, evaluation)."""
@@ -94,15 +94,19 @@ class Scores:
 
         Returns None if the terms share no seed or no scene.
         """
-        parts = [(self.stored.get(term, {}), weight) for term, weight in terms.items()]
-        seeds = [seed for seed in parts[0][0] if all(seed in runs for runs, _ in parts)]
-        scenes = scenes_with(metric, [runs[seed] for runs, _ in parts for seed in seeds])
+        parts = [self.stored.get(term, {}) for term in terms]
+        seeds = [seed for seed in parts[0] if all(seed in runs for runs in parts)]
+        results = [runs[seed] for runs in parts for seed in seeds]
+        # scenes.csv has the baselines' values too.
+        value = f"model_{metric}"
+        both = common_scenes(results)
+        scenes = [scene for scene in both if all(value in one.scenes[scene] for one in results)]
         if not scenes:
             return None
-        values = np.zeros((len(seeds), len(scenes)))
-        for runs, weight in parts:
-            # Pairing precedes the means, so that common effects of a seed or scene cancel.
-            values += weight * np.array([runs[seed].scores(metric, scenes) for seed in seeds])
+        scores = np.array([[one.scenes[scene][value] for scene in scenes] for one in results])
+        weights = np.array([*terms.values()])[:, None, None]
+        # Pairing precedes the means, so that common effects of a seed or scene cancel.
+        values = (weights * scores.reshape(len(parts), len(seeds), -1)).sum(0)
         return Estimate(seeds=seeds, values=values, interval=interval(values, confidence))
 
     def baselines(self, evaluation: str) -> dict[str, dict[str, float]]:

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,18 +36,6 @@ class StoredResults:
     recipe: str = ""
     seed: int | None = None
     trained: Mapping[str, str] = field(default_factory=dict)
-
-    def scores(self, metric: str, scenes: Iterable[str]) -> list[float]:
-        """Return the model's value of `metric` in each scene. Raises KeyError if one is missing."""
-        return [self.scenes[scene][f"model_{metric}"] for scene in scenes]
-
-
-def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes that have a value of `metric` in each of `results`."""
-    # scenes.csv has the baselines' values too.
-    value = f"model_{metric}"
-    scenes = common_scenes(results)
-    return [scene for scene in scenes if all(value in one.scenes[scene] for one in results)]
 
 
 def common_scenes(results: Sequence[StoredResults]) -> list[str]:
