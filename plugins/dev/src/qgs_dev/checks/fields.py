@@ -21,7 +21,6 @@ from qgs.recipe.recipe import Recipe, resolve
 from qgs.recipe.slots import SECTIONS
 from qgs.recipe.yaml_text import inline
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
-from qgs.train.training_pass import TrainingPass
 from qgs.types import QueryState
 from qgs_dev.case import Case, ContractError
 from qgs_dev.inputs import FACTS, Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
@@ -38,6 +37,7 @@ from qgs_dev.vocabulary import (
     gradients,
     leaves,
     mapped,
+    scalar,
 )
 
 PLUGIN = "under_test"
@@ -295,14 +295,23 @@ def _queries_with(case: Case, given: Fields) -> Any:
 def run_training_step(recipe: Recipe, case: Case) -> None:
     """Run one training step without an optimiser: forward pass, rendering, losses, gradients.
 
-    Raises ContractError if predictions, losses, signs of renderings or gradients are not finite.
+    Raises ContractError if predictions, images, losses or gradients are not finite.
     """
-    passes = TrainingPass(recipe, recipe.build_model())
+    model = recipe.build_model().train()
+    losses = recipe.build_losses().values()
     views = Maker(case).target()
-    prediction = passes.predict(views)
-    expect_finite(prediction, "in a prediction of a model with this component")
-    outcome = passes.judge(prediction, views.select([0]), views)
-    expect_finite(vars(outcome), "as a loss or sign of a model with this component")
-    found = gradients(outcome.total, dict(passes.named_parameters()))
+    target = views.select([0])
+    total = torch.zeros(()).double()
+    for prediction in model(views).layers.values():
+        expect_finite(prediction, "in a prediction of a model with this component")
+        rendering = model.render(prediction.gaussians, target.cameras)
+        expect_finite(rendering, "in a rendering of a model with this component")
+        for loss in losses:
+            unseen = loss.renderings == "none"
+            seen = map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering
+            terms = loss(prediction, seen, target, views)
+            expect_finite(terms, "as a loss of a model with this component")
+            total = total + scalar(terms)
+    found = gradients(total, dict(model.named_parameters()))
     expect(found, "no parameter of a model with this component gets a gradient")
     expect_finite(found, "in its gradient in a model with this component")
