@@ -9,8 +9,7 @@ from fuzzing.kill import RECIPES
 from published.files import read_golden
 from qgs_research.published.importing import import_weights
 from qgs_research.published.layouts import PublishedError, fitting_recipe, names_of
-from qgs_research.published.tokengs import TOKENGS
-from qgs_research.published.tokengs2026 import TOKENGS_2026_6
+from qgs_research.published.tokengs import TOKENGS, TOKENGS_2026_6
 from safetensors.torch import load_file, save_file
 from tables import assert_equal, must_refuse
 

@@ -2,7 +2,7 @@
 
 import pytest
 import yaml
-from qgs_research.published.locus import LOCUSGS
+from qgs_research.published.tokengs import LOCUSGS
 from qgs_research.published.weight_layout import LayoutError
 
 import qgs

@@ -10,10 +10,8 @@ from qgs.checkpoint.model_file import unique_tensors
 from qgs.checkpoint.tensors import Shapes, differing_tensors, shapes_of
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.wording import listed
-from qgs_research.published.locus import LOCUSGS
 from qgs_research.published.mvsplat import DEPTHSPLAT, MVSPLAT
-from qgs_research.published.tokengs import TOKENGS
-from qgs_research.published.tokengs2026 import TOKENGS_2026_6
+from qgs_research.published.tokengs import LOCUSGS, TOKENGS, TOKENGS_2026_6
 from qgs_research.published.weight_layout import LayoutError, WeightLayout, renamed
 
 # TokenGS comes first, because it is the most general.
