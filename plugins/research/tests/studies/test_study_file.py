@@ -9,10 +9,9 @@ from contextlib import nullcontext
 import pytest
 from commands import done
 from fuzzing.kill import RECIPES
-from qgs_research.studies.hypotheses import parsed
 from qgs_research.studies.plan import composed, planned
 from qgs_research.studies.runs import recipe_file, run_of, write_plan
-from qgs_research.studies.study import read_study
+from qgs_research.studies.study import parsed, read_study
 from tables import must_refuse, read_json, write_json
 
 from qgs.contracts import OptionError

@@ -8,10 +8,9 @@ from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from qgs.wording import listed
-from qgs_research.studies.estimates import Runs
-from qgs_research.studies.hypotheses import MAIN
-from qgs_research.studies.scores import Scores
+from qgs_research.studies.scores import Runs, Scores
 from qgs_research.studies.stored import StoredResults, common_scenes, moved_scenes
+from qgs_research.studies.study import MAIN
 from qgs_research.studies.tables import (
     Summary,
     interval_notes,

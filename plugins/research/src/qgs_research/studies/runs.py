@@ -12,8 +12,7 @@ from qgs.recipe.files import merge
 from qgs.recipe.recipe import annotated, differing_options
 from qgs.recipe.yaml_text import MapNode, from_plain
 from qgs.wording import counted
-from qgs_research.studies.hypotheses import MAIN
-from qgs_research.studies.study import Study
+from qgs_research.studies.study import MAIN, Study
 
 BESIDE = ("seed", "plugins")
 """Keys of a recipe that are ignored when the recipes of variants are compared."""

@@ -9,10 +9,9 @@ from rich.console import Console
 
 from qgs.terminal import print_lines, print_table
 from qgs.wording import listed
-from qgs_research.studies.estimates import Estimate, interval_shown, shown
-from qgs_research.studies.hypotheses import MAIN
-from qgs_research.studies.scores import Scores
+from qgs_research.studies.scores import Estimate, Scores, interval_shown, shown
 from qgs_research.studies.stored import StoredResults
+from qgs_research.studies.study import MAIN
 
 Rows: TypeAlias = Sequence[Sequence[str]]
 """Rows of a table, as lists of cells. The first row has the headers."""
