@@ -12,7 +12,7 @@ from commands import done, run_qgs
 from contract_mutants import modules
 from contract_mutants.modules import CachesByShape, RaisesWhenBuilt
 from qgs_dev import CHECKS, Case, CaseRun, checks_for, run_check, runs_of
-from qgs_dev.modules import attributes
+from qgs_dev.vocabulary import attributes
 from tables import must_refuse
 from torch import nn
 

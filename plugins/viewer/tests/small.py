@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 import yaml
 from commands import MODEL
-from qgs_dev.modules import seeded
+from qgs_dev.case import seeded
 from qgs_viewer.opening import ModelSource
 from qgs_viewer.scenes import scenes_of
 from walk import Walk

@@ -1,7 +1,8 @@
 """Cases of the contract suite (a component with options and sizes), and errors of checks."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import UnionType
@@ -26,7 +27,6 @@ from qgs.contracts import (
 from qgs.recipe.build import load_pretrained
 from qgs.recipe.yaml_text import dump
 from qgs.tokengs import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
-from qgs_dev.modules import seeded
 
 # The smallest model with two heads and two layers, so that the checks of a plugin take seconds.
 SMALL = ModelDims(width=32, heads=2, depth=2)
@@ -46,6 +46,14 @@ LAYER_SCALE = 0.3
 
 # Added to parameters, because initial zeros would hide what a component does.
 NOISE = 0.1
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Set torch's random seed inside a `with` block, and restore the random state afterwards."""
+    with torch.random.fork_rng(devices=()):
+        torch.default_generator.manual_seed(seed)
+        yield
 
 
 class ContractError(AssertionError):

@@ -23,9 +23,8 @@ from qgs.recipe.decode import decode_config
 from qgs.recipe.errors import Problems
 from qgs.recipe.yaml_text import dump, load_mapping
 from qgs.types import GaussianAttributes, ImageMemory, QueryState, Rendering
-from qgs_dev.case import Case
+from qgs_dev.case import Case, seeded
 from qgs_dev.inputs import FACTS, WITH_MEMORY, Inputs, Maker, Sizes, inputs_of, sizes_of
-from qgs_dev.modules import seeded, tensors_of
 from qgs_dev.vocabulary import (
     Trial,
     expect,
@@ -35,6 +34,7 @@ from qgs_dev.vocabulary import (
     gradients,
     leaves,
     scalar,
+    tensors_of,
     tracked,
 )
 

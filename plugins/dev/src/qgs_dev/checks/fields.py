@@ -22,9 +22,8 @@ from qgs.recipe.slots import SECTIONS
 from qgs.recipe.yaml_text import inline
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
 from qgs.types import QueryState
-from qgs_dev.case import Case, ContractError
+from qgs_dev.case import Case, ContractError, seeded
 from qgs_dev.inputs import FACTS, Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
-from qgs_dev.modules import seeded
 from qgs_dev.tables import recipe_path
 from qgs_dev.vocabulary import (
     Trial,

@@ -14,7 +14,7 @@ from torch.overrides import TorchFunctionMode
 from qgs.containers import map_tensors, named_tensors
 from qgs.contracts import GAUSSIAN_FIELDS
 from qgs.precision import at_least_float32
-from qgs_dev.case import CannotCheck, Case
+from qgs_dev.case import CannotCheck, Case, seeded
 from qgs_dev.checks.attention import explanation
 from qgs_dev.inputs import (
     FACTS,
@@ -26,12 +26,12 @@ from qgs_dev.inputs import (
     required_fields,
     required_places,
 )
-from qgs_dev.modules import each_mode, seeded
 from qgs_dev.vocabulary import (
     Trial,
     cast,
     described,
     difference,
+    each_mode,
     expect,
     expect_finite,
     expect_none,

@@ -10,10 +10,9 @@ from qgs.containers import map_tensors
 from qgs.contracts import Metric, MetricInput, Outcome
 from qgs.train.training_pass import RECORDED, TrainingPass
 from qgs.types import LayerPrediction
-from qgs_dev.case import CannotCheck, Case
+from qgs_dev.case import CannotCheck, Case, seeded
 from qgs_dev.checks.fields import resolved
 from qgs_dev.inputs import Maker, Sizes, inputs_of, required_fields
-from qgs_dev.modules import seeded
 from qgs_dev.vocabulary import (
     Trial,
     cloned,

@@ -6,21 +6,23 @@ import torch
 from pydantic import ValidationError
 
 from qgs.contracts import ComponentConfig
-from qgs_dev.case import Case
+from qgs_dev.case import Case, seeded
 from qgs_dev.checks.basics import other_generators
 from qgs_dev.checks.judging import rehearsed
 from qgs_dev.inputs import Inputs, inputs_of
-from qgs_dev.modules import attributes, each_mode, seeded, tensors_of
 from qgs_dev.vocabulary import (
     Trial,
+    attributes,
     cast,
     cloned,
+    each_mode,
     expect,
     expect_finite,
     expect_none,
     expect_same,
     leaves,
     scalar,
+    tensors_of,
 )
 
 # Share of the largest gradient below which a gradient is a rounding error of float32.

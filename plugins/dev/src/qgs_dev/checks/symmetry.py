@@ -10,12 +10,12 @@ from qgs.containers import map_tensors
 from qgs.contracts import CrossAttention, Encoder
 from qgs.geometry import transforms
 from qgs.types import ImageMemory
-from qgs_dev.case import Case
+from qgs_dev.case import Case, seeded
 from qgs_dev.inputs import QUERY_INPUTS, WITH_MEMORY, Inputs, inputs_of, many, required_places
-from qgs_dev.modules import each_mode, seeded
 from qgs_dev.vocabulary import (
     Trial,
     difference,
+    each_mode,
     expect,
     expect_same,
     floating,
