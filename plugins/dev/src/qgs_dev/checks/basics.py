@@ -5,9 +5,9 @@ override them.
 """
 
 import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, get_args
+from typing import Any, get_args, get_origin, get_type_hints
 from unittest.mock import ANY, patch
 
 import numpy
@@ -21,8 +21,8 @@ from qgs.contracts import ComponentConfig
 from qgs.recipe.build import OnMeta
 from qgs.recipe.decode import decode_config
 from qgs.recipe.errors import Problems
+from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import dump, load_mapping
-from qgs.types import GaussianAttributes, ImageMemory, QueryState, Rendering
 from qgs_dev.case import Case, seeded
 from qgs_dev.inputs import FACTS, WITH_MEMORY, Inputs, Maker, Sizes, inputs_of, sizes_of
 from qgs_dev.vocabulary import (
@@ -37,18 +37,6 @@ from qgs_dev.vocabulary import (
     tensors_of,
     tracked,
 )
-
-# Types that a forward pass returns; in all other slots it returns a tensor.
-OUTPUTS: Mapping[str, type] = {
-    "encoder": ImageMemory,
-    "queries": QueryState,
-    "layer": tuple,
-    "feedback": tuple,
-    "refinement": QueryState,
-    "head": GaussianAttributes,
-    "renderer": Rendering,
-    "losses": Mapping,
-}
 
 VARIED = (
     Sizes(),
@@ -75,14 +63,16 @@ def check_builds(case: Case) -> None:
 def check_runs(case: Case) -> None:
     """Require that a forward pass on random inputs returns the type that the slot prescribes."""
     output = Trial(case)()
-    kind = OUTPUTS.get(case.slot, Tensor)
+    contract: Any = SLOTS[case.slot].contract
+    wanted = get_type_hints(contract.forward)["return"]
+    kind = get_origin(wanted) or wanted
     seen = f"the component returns {type(output).__name__}, not {kind.__name__}"
     expect(isinstance(output, kind), seen)
     if case.slot in WITH_MEMORY:
         kinds = [type(part).__name__ for part in output]
         seen = f"the component returns {kinds}, not state and memory"
         expect(kinds == ["QueryState", "ImageMemory"], seen)
-    if isinstance(output, Mapping):
+    if isinstance(output, dict):
         odd = [name for name, term in output.items() if not isinstance(term, Tensor)]
         expect_none(odd, "not a tensor")
 

@@ -236,11 +236,15 @@ def _expect_all_finite(
         return x if stays else change(name, x)
 
     trial = Trial(case)
-    given = trial.tracked(mapped(trial.inputs, changed))
-    named = {**given, **dict(trial.module.named_parameters())}
-    for mode, outputs in trial.in_each_mode(given):
+    inputs = mapped(trial.inputs, changed)
+    for mode in each_mode(trial.module):
         where = f"in {mode}, with {what}"
+        # New ones, since a memory keeps values with their graphs.
+        given = trial.tracked(inputs)
+        with seeded(0):
+            outputs = trial(given)
         expect_finite(outputs, where)
+        named = {**given, **dict(trial.module.named_parameters())}
         expect_finite(gradients(scalar(outputs), named), f"in its gradient {where}")
 
 
