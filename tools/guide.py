@@ -22,8 +22,7 @@ from typing import Any
 
 from jinja2 import Template
 from qgs_dev import CHECKS
-from qgs_dev.schema import settings_schema
-from qgs_dev.tables import option_rows
+from qgs_dev.schema import option_rows, settings_schema
 
 from qgs.contracts import Component, ComponentConfig
 from qgs.recipe import slots

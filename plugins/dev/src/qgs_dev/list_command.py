@@ -25,7 +25,7 @@ def list_components(
     All installed plugins are imported; for a NAME such as rooms/locus-64, only the plugin `rooms`.
     """
     from qgs.recipe.registry import Registry, load_plugin, load_usable_plugins
-    from qgs_dev.tables import details, overview
+    from qgs_dev.schema import details, overview
 
     plugin, slash, _ = (name or "").partition("/")
     # A name such as rooms/locus-64 needs one plugin only; importing all takes seconds.

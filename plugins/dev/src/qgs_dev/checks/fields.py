@@ -24,7 +24,7 @@ from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
 from qgs.types import QueryState
 from qgs_dev.case import Case, ContractError, seeded
 from qgs_dev.inputs import FACTS, Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
-from qgs_dev.tables import recipe_path
+from qgs_dev.schema import recipe_path
 from qgs_dev.vocabulary import (
     Trial,
     described,
