@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from qgs_research.bench.work import peak_memory, workload_of
+from qgs_research.bench.run import peak_memory, workload_of
 from tables import must_refuse
 from torch import nn
 from torch.testing import assert_close

@@ -5,7 +5,6 @@ import re
 import yaml
 from commands import done, typed
 from qgs_research.bench import run
-from qgs_research.bench.work import Peak
 from tables import must_refuse, read_json
 
 TOKENGS = "tiny/tokengs.yaml"
@@ -21,7 +20,7 @@ def bench(words):
 
 def test_recipes_are_compared_with_the_first(tmp_path, monkeypatch):
     peaks = iter([30, 15, 60, 60, 15, 90])
-    monkeypatch.setattr(run, "peak_memory", lambda *_: Peak(2**20 * next(peaks), 2**20))
+    monkeypatch.setattr(run, "peak_memory", lambda *_: run.Peak(2**20 * next(peaks), 2**20))
     everything = f"--step --memory --renderer --views 3 --json {tmp_path}/reports/bench.json"
     told = bench(f"{TOKENGS} {LOCUS} {GSLRM} {everything}").output
     report = read_json(tmp_path / "reports/bench.json")

@@ -7,9 +7,10 @@ from unittest.mock import Mock, call
 
 import torch
 import torch.nn.functional as F
-from qgs_research.bench.run import forward_flops, in_turn
-from qgs_research.bench.work import (
+from qgs_research.bench.run import (
     Workload,
+    forward_flops,
+    in_turn,
     make_task,
     peak_memory,
     posed_photos,
@@ -80,7 +81,7 @@ def test_what_failed_in_the_process_is_told(monkeypatch):
         Workload(2, 2, (15, 24)),
         threads=1,
     )
-    monkeypatch.setattr("qgs_research.bench.work.measure", die)
+    monkeypatch.setattr("qgs_research.bench.run.measure", die)
     must_refuse(
         "was killed", peak_memory, recipe, "forward", MODEST, threads=1, kind=ChildProcessError
     )

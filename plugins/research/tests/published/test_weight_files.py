@@ -3,7 +3,7 @@
 from io import BytesIO
 
 import torch
-from qgs_research.published.weight_files import read_weight_file
+from qgs_research.published.importing import read_weight_file
 from safetensors.torch import save
 from tables import assert_equal, must_not_find, must_refuse
 

@@ -1,29 +1,206 @@
-"""Measurement of recipes: memory in separate processes, then latency in alternating rounds."""
+"""Measurement of recipes: memory in separate processes, then latency in alternating rounds.
+
+A workload sets the size of the inputs of a measured call; a task executes an operation once.
+"""
 
 import platform
+import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
 from operator import truediv
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
+from torch import nn
 from torch.utils.benchmark import timer
 from torch.utils.flop_counter import FlopCounterMode
 
 import qgs
+from qgs.geometry.poses import look_at
 from qgs.model import QueryGaussianModel
+from qgs.precision import Precision, autocast
 from qgs.recipe import Recipe, resolve
-from qgs_research.bench.work import (
-    Operation,
-    Task,
-    Workload,
-    make_task,
-    peak_memory,
-    posed_photos,
-    workload_of,
-)
+from qgs.train.state import make_optimizer
+from qgs.train.training_pass import TrainingPass
+from qgs.types import Cameras, Gaussians, Views
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Inputs of a measured call, and where and how it runs.
+
+    views: number of input photos per scene. targets: number of rendered photos per scene. size: (H,
+    W) of all photos in pixels. batch: scenes per call. precision: float32, or bf16 for autocast.
+    """
+
+    views: int
+    targets: int
+    size: tuple[int, int]
+    batch: int = 1
+    device: str = "cpu"
+    precision: Precision = "float32"
+
+
+def workload_of(
+    recipe: Recipe, views: int | None = None, size: tuple[int, int] | None = None, **more: Any
+) -> Workload:
+    """Return the workload for `recipe`.
+
+    views: number of input photos; None takes that of the recipe. size: (H, W) in pixels; None takes
+    `data.image_size`. more: the remaining fields of `Workload`, by name. Raises ValueError if the
+    image size is unknown.
+    """
+    if size is None and recipe.data_config:
+        size = recipe.data_config.image_size
+    if size is None:
+        raise ValueError(
+            "the recipe has no data.image_size, so the size of the photos is unknown; "
+            "give it with --size HxW, for example --size 256x256"
+        )
+    return Workload(views or recipe.views.inputs, recipe.views.targets, size, **more)
+
+
+def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
+    """Return `count` random photos (noise) for each of `batch` scenes, with cameras and times.
+
+    Cameras are on an arc and look at its centre (0, 0, 1). The pose of the first camera is the
+    identity. The field of view is about 53 degrees along the longer side of a photo.
+    """
+    # All recipes and processes get equal photos.
+    generator = torch.Generator().manual_seed(seed)
+    images = torch.rand(batch, count, 3, *size, generator=generator)
+    # Cameras are ten degrees apart, like neighbouring photos of a walk.
+    angle = torch.deg2rad(10.0 * torch.arange(count))
+    forward = torch.stack([angle.sin(), torch.zeros(count), angle.cos()], -1)
+    down = torch.tensor([0.0, 1.0, 0.0]).expand_as(forward)
+    centre = torch.tensor([0.0, 0.0, 1.0])
+    c2w = look_at(centre - forward, forward, down).repeat(batch, 1, 1, 1)
+    height, width = size
+    focal = float(max(size))
+    intrinsics = torch.tensor([focal, focal, width / 2, height / 2]).expand(batch, count, 4)
+    times = torch.linspace(0, 1, count).expand(batch, count)
+    return Views(images, Cameras(c2w, intrinsics, size), None, times, times[:, :1])
+
+
+Task: TypeAlias = Callable[[], object]
+Operation: TypeAlias = Literal["forward", "render", "step"]
+
+
+def make_task(
+    operation: Operation, recipe: Recipe, model: QueryGaussianModel, workload: Workload
+) -> Task:
+    """Return a function without arguments that executes `operation` once.
+
+    forward: from photos to the Gaussians of the last layer, without gradients. render: rendering of
+    these Gaussians at the target cameras, without gradients. step: a whole training step, which
+    changes the weights.
+    """
+    inputs, targets = (
+        posed_photos(workload.batch, count, workload.size, seed).to(workload.device)
+        for seed, count in enumerate((workload.views, workload.targets))
+    )
+    if operation == "step":
+        # A whole step as in `qgs train`, so that its time includes losses and renderer.
+        objective = TrainingPass(recipe, model.train()).to(workload.device)
+        factors = recipe.rate_factors(objective)
+        optimizer = make_optimizer(objective, recipe.build_optimizer(), factors)
+
+        def step() -> None:
+            optimizer.zero_grad(set_to_none=True)
+            with autocast(workload.precision, workload.device):
+                outcome = objective(inputs, targets)
+            outcome.total.backward()
+            nn.utils.clip_grad_norm_(objective.parameters(), recipe.training.clip)
+            optimizer.step()
+
+        return step
+    model.eval()
+
+    @torch.inference_mode()
+    def forward() -> Gaussians:
+        with autocast(workload.precision, workload.device):
+            return model(inputs).gaussians
+
+    if operation == "forward":
+        return forward
+    # Made once, outside the measured time.
+    gaussians = forward()
+    return torch.inference_mode()(lambda: model.render(gaussians, targets.cameras))
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Peak memory of an operation, in bytes.
+
+    peak_bytes: on a CPU, the largest resident set size of the process; on a GPU, the largest memory
+    that torch allocated. idle_bytes: memory in use before the model was built.
+    """
+
+    peak_bytes: int
+    idle_bytes: int
+
+
+def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, threads: int) -> Peak:
+    """Run `operation` once in a fresh process and return its peak memory.
+
+    Raises ChildProcessError if the process was killed, and the errors of the model.
+    """
+    # Spawned, because a forked process would start with the memory of this one.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(measure, dict(recipe.tree), operation, workload, threads).result()
+        except BrokenProcessPool:
+            raise ChildProcessError(
+                f"the process that measured the memory of the {operation} was killed, probably "
+                "because memory ran out; choose fewer or smaller views, or a smaller batch or model"
+            ) from None
+
+
+def measure(tree: dict[str, Any], operation: Operation, workload: Workload, threads: int) -> Peak:
+    """Run `operation` in this process and return its peak memory.
+
+    tree: recipe as a mapping. threads: number of CPU threads.
+    """
+    torch.set_num_threads(threads)
+    recipe = resolve(tree)
+    on_gpu = workload.device == "cuda"
+    idle = 0 if on_gpu else resident_bytes("VmRSS")
+    task = make_task(operation, recipe, recipe.build_model(workload.device), workload)
+    if operation == "step":
+        # The first step creates the optimiser's moments and compiles kernels: measure the second.
+        task()
+        restart = Path("/proc/self/clear_refs")
+        if on_gpu:
+            torch.cuda.reset_peak_memory_stats()
+        elif restart.exists():  # on Linux
+            # Linux then forgets the peak, VmHWM, but keeps the memory.
+            restart.write_text("5")
+    task()
+    peak = torch.cuda.max_memory_allocated() if on_gpu else resident_bytes("VmHWM")
+    return Peak(peak_bytes=peak, idle_bytes=idle)
+
+
+def resident_bytes(field: str) -> int:
+    """Return the resident memory of this process in bytes.
+
+    field: VmRSS for the present memory, VmHWM for the peak. Systems without /proc always give the
+    peak.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        lines = status.read_text().splitlines()
+        (kibibytes,) = (line.split()[1] for line in lines if line.startswith(f"{field}:"))
+        return int(kibibytes) * 1024
+    # Imported here: Windows has none, and on Linux it would count the parent of the process.
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
 
 
 def measure_recipes(

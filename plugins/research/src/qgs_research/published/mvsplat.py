@@ -19,8 +19,6 @@ _HEAD_WIDTH = 64
 """Channels per attention head in every DINOv2 model."""
 _BLOCKS = {12: [2, 5, 8, 11], 24: [4, 11, 17, 23]}
 """Indices of the ViT blocks whose outputs are used, by number of blocks."""
-_CNN_WIDTHS = [64, 96, 128]
-"""Channels of the three stages of MVSplat's CNN."""
 _HARMONICS = (4, 9, 16, 25)
 """Number of spherical harmonics per colour channel, for degrees 1 to 4."""
 _EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement"))
@@ -63,6 +61,7 @@ def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
         "type": "mvsplat/mvsplat",
         "near": 1.0,
         "far": 100.0,
+        "cnn_widths": _stages(shapes, backbone),
         "features": size_at(shapes, backbone + "conv2.weight"),
         "candidates": size_at(shapes, _PREDICTOR + "regressor_residual.weight"),
         "cost_width": size_at(shapes, _PREDICTOR + "corr_refine_net.0.weight"),
@@ -70,9 +69,6 @@ def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
         "depth_width": size_at(shapes, _PREDICTOR + "refine_unet.0.weight"),
         "depth_levels": _unet_levels(shapes, _PREDICTOR + "refine_unet.3."),
     }
-    stages = _stages(shapes, backbone)
-    if stages != _CNN_WIDTHS:
-        encoder["cnn_widths"] = stages
     return _recipe(
         {
             # The memory has depth and opacity before the channels of a raw Gaussian.
