@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import torch
 from contract_mutants.mutant import mutant
-from contract_mutants.slots import ChangedEncoder, ChangedSquares
+from contract_mutants.slots import ChangedSquares
+from contract_mutants.sound import ChangedEncoder
 from contract_mutants.spatial import AtPlaces, BiasedAttention, Extended, PlacesByALayer
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 from torch import Tensor, nn

@@ -1,11 +1,12 @@
 """Renderers with a wrong background, alpha, depth or gradient."""
 
 from dataclasses import replace
+from typing import Any
 
 from contract_mutants.mutant import mutant
 
 from qgs.renderers import TorchRenderer
-from qgs.types import Cameras, Gaussians, Rendering
+from qgs.types import Cameras, Gaussians
 
 CAMERAS = "camera_gradients_match_differences"
 FEATURES = "features_are_blended_as_colours"
@@ -13,17 +14,24 @@ HARMONICS = "colours_depend_on_the_direction"
 GAUSSIANS = "render_gradients_match_differences"
 
 
-class ChangedRenderer(TorchRenderer):
+class ChangedResult:
+    """A sound component, whose output mutants change."""
+
+    def result(self, out: Any) -> Any:
+        return out
+
+    def forward(self, *given):
+        return self.result(super().forward(*given))
+
+
+class ChangedRenderer(ChangedResult, TorchRenderer):
     """A sound renderer, whose inputs or output mutants change."""
 
     def given(self, gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
         return gaussians, cameras
 
-    def result(self, out: Rendering) -> Rendering:
-        return out
-
     def forward(self, gaussians, cameras, background=None):
-        return self.result(super().forward(*self.given(gaussians, cameras), background))
+        return super().forward(*self.given(gaussians, cameras), background)
 
 
 @mutant("no_gaussians_give_the_background", "not the background")

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import torch
 from contract_mutants.mutant import mutant
-from contract_mutants.sound import StridedConvolutions
+from contract_mutants.renderers import ChangedResult
+from contract_mutants.sound import ChangedEncoder, StridedConvolutions
 from contract_mutants.spatial import Extended
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck
 from torch import Tensor, nn
@@ -15,7 +16,6 @@ from qgs.contracts import (
     Column,
     CrossAttention,
     Loss,
-    Outcome,
     Scene,
     SceneSource,
     memory_fields,
@@ -33,23 +33,6 @@ from qgs.tokengs import (
     OnePass,
 )
 from qgs.tokengs.blocks import CrossAttentionCore, split_heads
-from qgs.types import ImageMemory, Views
-
-
-class ChangedEncoder(MultiViewViT):
-    """A sound encoder, whose input or output mutants change."""
-
-    class Config(MultiViewViT.Config):
-        depth: int = 1
-
-    def given(self, views: Views) -> Views:
-        return views
-
-    def result(self, memory: ImageMemory) -> ImageMemory:
-        return memory
-
-    def forward(self, views):
-        return self.result(super().forward(self.given(views)))
 
 
 @mutant("head_gives_gaussians", "quaternions are 2")
@@ -235,24 +218,28 @@ class SharesItsProjection(Extended, CrossAttention):
         return self.core(state.features, keys, values)
 
 
+class ChangedExplanation:
+    """Attention whose explanation mutants change."""
+
+    def explain(self, *given):
+        return self.told(super().explain(*given).content)
+
+
 @mutant("explanation_is_a_softmax", "off the softmax")
-class ExplainsBySigmoid(ContentSelfAttention):
-    def explain(self, state, queries):
-        content = super().explain(state, queries).content
+class ExplainsBySigmoid(ChangedExplanation, ContentSelfAttention):
+    def told(self, content):
         return AttentionWeights(content, None, torch.sigmoid(content))
 
 
 @mutant("updates_are_explained", "of them is unexplained")
-class ExplainsTooSharply(ContentCrossAttention):
-    def explain(self, state, memory, queries):
-        content = 2 * super().explain(state, memory, queries).content
-        return AttentionWeights(content, None, content.softmax(-1))
+class ExplainsTooSharply(ChangedExplanation, ContentCrossAttention):
+    def told(self, content):
+        return AttentionWeights(content, None, (2 * content).softmax(-1))
 
 
 @mutant("explanation_is_a_softmax", "content is not finite; put masks into geometry")
-class MasksItsContent(ContentSelfAttention):
-    def explain(self, state, queries):
-        content = super().explain(state, queries).content
+class MasksItsContent(ChangedExplanation, ContentSelfAttention):
+    def told(self, content):
         content = content.masked_fill(content < content.mean(), -torch.inf)
         return AttentionWeights(content, None, content.softmax(-1))
 
@@ -282,14 +269,7 @@ class ReadsCamerasUntold(MultiViewViT):
     reads_cameras = False
 
 
-class Changed(OnePass):
-    """A sound objective, whose outcome mutants change."""
-
-    def result(self, outcome: Outcome) -> Outcome:
-        return outcome
-
-    def forward(self, inputs, targets, passes):
-        return self.result(super().forward(inputs, targets, passes))
+class Changed(ChangedResult, OnePass): ...
 
 
 @mutant("objective_gives_an_outcome", "has no gradient in the model's parameters")

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from contract_mutants.mutant import named
-from contract_mutants.renderers import RefusesWhatItDeclares
+from contract_mutants.renderers import ChangedResult, RefusesWhatItDeclares
 from contract_mutants.spatial import BiasedAttention, Extended, PlacesByALayer
 from einops import rearrange
 from torch import nn
@@ -17,7 +17,7 @@ from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.tokengs import ContentCrossAttention, MlpFeedForward, MultiViewViT
 from qgs.tokengs.blocks import merge_heads
 from qgs.tokengs.encoder import keys_and_values
-from qgs.types import ImageMemory
+from qgs.types import ImageMemory, Views
 
 
 @named
@@ -55,12 +55,22 @@ class FusesInHalf(ContentCrossAttention):
         return self.core.out_proj(merge_heads(read))
 
 
-@named
-class SeesFar(Extended, MultiViewViT):
-    """Convolutions over 19 pixels, before patches of 8 are cut."""
+class ChangedEncoder(ChangedResult, MultiViewViT):
+    """A sound encoder, whose input or output mutants change."""
 
     class Config(MultiViewViT.Config):
         depth: int = 1
+
+    def given(self, views: Views) -> Views:
+        return views
+
+    def forward(self, views):
+        return super().forward(self.given(views))
+
+
+@named
+class SeesFar(Extended, ChangedEncoder):
+    """Convolutions over 19 pixels, before patches of 8 are cut."""
 
     def add(self, dims):
         layers = [(3, 16), (16, 16), (16, 3)]
@@ -68,9 +78,9 @@ class SeesFar(Extended, MultiViewViT):
             *(nn.Sequential(nn.Conv2d(i, o, 7, padding=3), nn.Tanh()) for i, o in layers)
         )
 
-    def embed(self, views, plucker):
+    def given(self, views):
         seen = self.stem(views.images.flatten(0, 1)).unflatten(0, views.images.shape[:2])
-        return super().embed(replace(views, images=seen), plucker)
+        return replace(views, images=seen)
 
 
 class StridedConvolutions(Extended, PatchEncoder):
@@ -101,8 +111,7 @@ class StridedConvolutions(Extended, PatchEncoder):
 
 
 @named
-class ConvolvesByThree(StridedConvolutions):
-    class Config(StridedConvolutions.Config): ...
+class ConvolvesByThree(StridedConvolutions): ...
 
 
 @named
