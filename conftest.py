@@ -46,10 +46,12 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def short_orbit(monkeypatch):
-    monkeypatch.setattr("qgs.reconstruction.saving.ORBIT_FRAMES", 2)
-    monkeypatch.setattr("qgs.reconstruction.saving.ORBIT_SIDE", 16)
+@pytest.fixture(scope="session")
+def short_orbit():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qgs.reconstruction.saving.ORBIT_FRAMES", 2)
+        patch.setattr("qgs.reconstruction.saving.ORBIT_SIDE", 16)
+        yield
 
 
 @pytest.fixture

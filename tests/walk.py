@@ -1,10 +1,10 @@
-"""Cameras on arcs, and a scene that a camera walks past."""
+"""Cameras on arcs, what they may look at, and a scene that a camera walks past."""
 
 import torch
 
 from qgs.contracts import Scene
 from qgs.geometry.poses import look_at
-from qgs.types import Cameras
+from qgs.types import Cameras, Gaussians
 
 FRAMES = 6
 SIDE = 64
@@ -28,6 +28,17 @@ def along_x(places):
 def pinhole(c2w, lens=(64.0, 64.0, 32.0, 32.0), size=(SIDE, SIDE)):
     """Cameras (V,)."""
     return Cameras(c2w, torch.tensor(lens).to(c2w).expand(len(c2w), 4), size)
+
+
+def cloud(number, seed=0):
+    """Gaussians (1, G) around the origin."""
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.randn(1, number, 7, generator=generator)
+    even = torch.rand(1, number, 7, generator=generator)
+    quats = torch.nn.functional.normalize(normal[..., 3:], dim=-1)
+    scales = 0.05 + 0.1 * even[..., :3]
+    opacities = 0.3 + 0.6 * even[..., 3]
+    return Gaussians(0.3 * normal[..., :3], scales, quats, opacities, even[..., 4:])
 
 
 class Walk(Scene):

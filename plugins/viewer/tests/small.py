@@ -4,7 +4,6 @@ from copy import deepcopy
 from functools import cache
 
 import torch
-import torch.nn.functional as F
 import yaml
 from commands import MODEL
 from qgs_dev.case import seeded
@@ -17,7 +16,6 @@ from qgs.contracts import ViewsConfig
 from qgs.data.samples import make_sample
 from qgs.domain import KEY, Domain
 from qgs.recipe import resolve
-from qgs.types import Gaussians
 
 QUERIES = 12
 VIEWS = ViewsConfig(inputs=2, gap=(1, 5), scale="auto")
@@ -41,16 +39,6 @@ def stand_in(file, queries=8):
     model = resolve(RECIPE, [f"model.queries.count={queries}"]).build_model()
     qgs.save(model, file, extra={KEY: Domain(ranges, 48).text, "step": "7000"})
     return str(file)
-
-
-def cloud(count):
-    """Gaussians (1, G) in a cube of side 2 around the origin."""
-    with seeded(3):
-        means = torch.rand(1, count, 3) * 2 - 1
-        quats = F.normalize(torch.randn(1, count, 4), dim=-1)
-        scales = 0.04 + 0.08 * torch.rand(1, count, 3)
-        opacities = torch.rand(1, count) * 0.7 + 0.2
-        return Gaussians(means, scales, quats, opacities, torch.rand(1, count, 3))
 
 
 @cache

@@ -61,10 +61,9 @@ def opened(names, photos):
 
 
 def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
-    models, tmp_path, monkeypatch, caplog
+    models, here, caplog, small_pictures
 ):
-    monkeypatch.chdir(tmp_path)
-    photos = noisy_photos(tmp_path / "my photos", 12)
+    photos = noisy_photos(here / "my photos", 12)
     shutil.copy(photos / "transforms.json", photos / "transforms_train.json")
     shown = done("report", *models, "--photos", photos, "--scale", "0.5").output
     page = html.unescape(Path("report/report.html").read_text())
@@ -146,13 +145,12 @@ def test_a_model_tuned_on_the_photos_is_compared_on_those_it_never_saw(models, t
     assert len(ends) == 2
 
 
-def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_an_earlier_demo_is_never_touched(here):
     assert new_folder(None, "demo").name == "demo"
-    (tmp_path / "demo").mkdir()
+    (here / "demo").mkdir()
     assert new_folder(None, "demo").name == "demo-2"
-    (tmp_path / "demo/report.html").touch()
-    must_refuse("not empty", new_folder, tmp_path / "demo", "demo", kind=FileExistsError)
+    (here / "demo/report.html").touch()
+    must_refuse("not empty", new_folder, here / "demo", "demo", kind=FileExistsError)
 
 
 RUN = "<script>alert(1)"
@@ -222,7 +220,7 @@ def room(tmp_path_factory):
     return write_nerfstudio(folder / "photos", photos)
 
 
-def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path):
+def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path, small_pictures):
     """With the same score too, of the one window that is judged."""
     (result,) = opened([MODEL], room)
     (score,) = result.evaluation.scores

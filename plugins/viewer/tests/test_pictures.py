@@ -11,8 +11,7 @@ from qgs_viewer.look import CATEGORICAL
 from qgs_viewer.placement import IDENTITY, Placement, hit, on_photo, splats
 from renderers.scenes import make_scene
 from scipy.spatial.transform import Rotation
-from small import cloud
-from walk import arc, pinhole
+from walk import arc, cloud, pinhole
 
 from qgs.drawing.images import NOTHING, finer
 from qgs.geometry.transforms import to_camera, to_pixels
@@ -111,7 +110,7 @@ def test_covariances_are_those_of_points_that_were_placed_one_by_one():
 
 def test_a_click_hits_what_the_renderer_shows_there():
     """Where one Gaussian stands out: two approximations of a splat may order similar ones."""
-    view = pinhole(arc([0], 4), (60.0, 55.0, 30.0, 35.0))
+    view = pinhole(arc([0], 4), (120.0, 110.0, 30.0, 35.0))
     scene = cloud(60).to(torch.float64)
     scene.colors.requires_grad_()
     picture = TorchRenderer(TorchRenderer.Config())(scene, view[None], torch.zeros(3).double())

@@ -9,10 +9,10 @@ from qgs_viewer.page import first_eye, up_of
 from qgs_viewer.placement import Placement
 from qgs_viewer.queries import attention_pictures_of
 from qgs_viewer.query_scene import QueryScene
-from small import BY_DISTANCE, KINDS, cloud, model_scenes_of, source_of
+from small import BY_DISTANCE, KINDS, model_scenes_of, source_of
 from tables import assert_equal
 from torch.testing import assert_close
-from walk import SIDE, arc, pinhole
+from walk import SIDE, arc, cloud, pinhole
 
 import qgs
 from qgs.geometry.transforms import to_camera, to_pixels

@@ -9,9 +9,9 @@ import torch
 from photo_formats import noisy_photos
 from qgs_viewer.opening import ModelSource, open_source
 from qgs_viewer.query_scene import NEUTRAL
-from small import VIEWS, cloud, model_of
+from small import VIEWS, model_of
 from tables import must_refuse
-from walk import Walk
+from walk import Walk, cloud
 
 import qgs
 from qgs.data.samples import make_sample
@@ -20,7 +20,7 @@ from qgs.reconstruction.scene_formats import load_ply, save_splat
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, short_orbit):
     """What `qgs reconstruct` leaves, by a model whose checkpoint lies beside it."""
     folder = tmp_path_factory.mktemp("finished")
     qgs.save(model_of("locus"), folder / "model.safetensors")

@@ -20,9 +20,10 @@ from qgs_viewer.notebook import prediction_png, show_pictures
 from qgs_viewer.page import quiet_server, scene_html
 from qgs_viewer.panel import Panel, plain
 from qgs_viewer.query_scene import QueryScene
-from small import QUERIES, cloud, model_of, model_scenes_of, sample_of, source_of
+from small import QUERIES, model_of, model_scenes_of, sample_of, source_of
 from tables import must_refuse
 from viser.transforms import SO3
+from walk import cloud
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

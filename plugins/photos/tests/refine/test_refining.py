@@ -18,13 +18,13 @@ from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
 from tables import assert_equal, must_refuse
 from textured_room import INTRINSICS, photos_of, walk
-from walk import arc, pinhole
+from walk import arc, cloud, pinhole
 
 from qgs.containers import map_tensors
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
-from qgs.types import Gaussians, Views
+from qgs.types import Views
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
 
@@ -43,16 +43,6 @@ def clock(monkeypatch):
 
     monkeypatch.setattr("qgs_photos.refine.refining.perf_counter", read)
     return hooks.append
-
-
-def cloud(number, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    normal = torch.randn(1, number, 7, generator=generator)
-    even = torch.rand(1, number, 7, generator=generator)
-    quats = torch.nn.functional.normalize(normal[..., 3:], dim=-1)
-    scales = 0.05 + 0.1 * even[..., :3]
-    opacities = 0.3 + 0.6 * even[..., 3]
-    return Gaussians(0.3 * normal[..., :3], scales, quats, opacities, even[..., 4:])
 
 
 def ring(views, side=24):
