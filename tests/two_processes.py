@@ -10,22 +10,10 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 import torch
 from accelerate.state import AcceleratorState
-from training_runs import change_samples, resume
+from training_runs import resume, spoil
 
 from qgs.data.stream import SampleError
 from qgs.recipe import resolve
-
-
-def spoil(bad, nan):
-    """Sample `bad`, where it replaces none, has a bad pixel or cannot be made."""
-
-    def change(sample, number, attempt):
-        if number == bad and not attempt:
-            if not nan:
-                raise SampleError(f"scene 'x', frame {bad} (a.png): cannot be read")
-            sample.targets.images[0, 0, 0, 0, 0] = torch.nan
-
-    change_samples(pytest.MonkeyPatch(), change)
 
 
 def train_as(rank, port, tree, folder, *spoiled):
@@ -37,7 +25,7 @@ def train_as(rank, port, tree, folder, *spoiled):
         os.environ[name] = str(value)
     AcceleratorState._reset_state(reset_partial_state=True)
     if spoiled:
-        spoil(*spoiled)
+        spoil(pytest.MonkeyPatch(), *spoiled)
     try:
         result = resume(resolve(tree), folder)
     except SampleError as error:

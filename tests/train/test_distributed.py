@@ -62,7 +62,7 @@ def test_two_processes_have_the_loss_curve_of_one(tmp_path, name, options):
 def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
     options = ("on_nonfinite=skip", "render_views=1", "ema=0.9", "evaluate_every=2")
     recipe = tiny("locus", *(f"training.{option}" for option in options))
-    train_in_two_processes(recipe, tmp_path, 3, True)
+    train_in_two_processes(recipe, tmp_path, {3}, True)
     records = read_jsonl(tmp_path / "history.jsonl")
     assert ["loss" in record for record in records] == [True, False, True]
     assert column(read_jsonl(tmp_path / "evaluations.jsonl"), "step") == [2, 2, 3, 3]
@@ -75,13 +75,13 @@ def test_two_processes_stop_together_at_a_sample_that_one_cannot_make_or_leave_i
 ):
     """Samples with odd numbers are those of the second process."""
     folder = tmp_path / "run"
-    errors = told_by_two(tiny("locus"), folder, bad, False)
+    errors = told_by_two(tiny("locus"), folder, {bad})
     reason = f"scene 'x', frame {bad} (a.png): cannot be read"
     for error, cause in zip(errors, (ELSEWHERE, reason), strict=True):
         assert error.startswith(f"{cause}; ")
         assert (f"saved at step {steps}; continue with --resume" in error) == bool(steps)
     assert folder.exists() == bool(steps)
-    told_by_two(tiny("locus", "training.on_bad_sample=skip"), folder, bad, False)
+    told_by_two(tiny("locus", "training.on_bad_sample=skip"), folder, {bad})
     assert len(losses(folder)) == 3
 
 
