@@ -6,7 +6,7 @@ import pytest
 import torch
 from line_scenes import Line, Lines, plan_of, samples_of
 from photo_formats import opened, synthetic, write_nerfstudio
-from tables import must_not_find, must_refuse, rows, write_json
+from tables import must_refuse, rows, write_json
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.evaluate.plan import read_index
@@ -48,11 +48,6 @@ def test_other_files_are_refused_with_the_reason(tmp_path):
     for text, reason in rows(REFUSED):
         file.write_text(text)
         must_refuse(reason, read_index, str(file))
-
-
-def test_a_missing_index_is_told_with_its_path():
-    reason = r"no evaluation index at nowhere/index\.json"
-    must_not_find(reason, read_index, "nowhere/index.json")
 
 
 def test_samples_are_those_of_the_index_in_its_order(tmp_path):

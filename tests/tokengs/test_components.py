@@ -4,21 +4,12 @@ import math
 
 import pytest
 import torch
-from losses.judging import CAMERAS, TRUTH
-from small_parts import DIMS, made
-from tables import must_refuse
+from small_parts import made
 from torch.testing import assert_close
 
-from qgs import QueryState, Views
-from qgs.contracts import ModelDims, RecipeContext
-from qgs.tokengs import (
-    CrossAttentionCore,
-    GaussianHead,
-    LayerSupervision,
-    MultiViewViT,
-    OffsetCenters,
-    posact,
-)
+from qgs import QueryState
+from qgs.contracts import ModelDims
+from qgs.tokengs import CrossAttentionCore, GaussianHead, OffsetCenters, posact
 
 
 def test_posact_its_slope_at_zero_and_its_limits():
@@ -30,13 +21,6 @@ def test_posact_its_slope_at_zero_and_its_limits():
     y = posact(saturated, 100.0, 1000.0)
     assert y.tolist() == [-1000.0, -1000.0, 1000.0, 1000.0]
     assert torch.autograd.grad(y.sum(), saturated)[0].isfinite().all()
-
-
-def test_an_image_that_patches_do_not_divide():
-    encoder = made(MultiViewViT, patch_size=5)
-    must_refuse("16 x 24 cannot be cut into patches of 5", encoder, Views(TRUTH, CAMERAS))
-    problems = encoder.problems(encoder.config, RecipeContext(DIMS, (16, 24)))
-    assert [problem.option for problem in problems] == ["patch_size"]
 
 
 def test_head_starts_with_the_spread_and_at_the_depth_it_is_told():
@@ -53,11 +37,6 @@ def test_offset_centers_are_the_offsets_further_along_z_in_float32():
     offsets = torch.randn(2, 5, 1, 3).bfloat16()
     means = made(OffsetCenters, z_offset=-2.0)(offsets, QueryState(torch.zeros(2, 5, 16)))
     assert_close(means, offsets.float() + torch.tensor([0, 0, -2.0]))
-
-
-def test_supervision_weights():
-    weights = LayerSupervision(LayerSupervision.Config(layers=(1, 2, 4))).weights()
-    assert weights == pytest.approx({1: 1 / 6, 2: 2 / 6, 4: 3 / 6})
 
 
 def test_a_bias_is_for_all_heads_or_for_each():

@@ -74,7 +74,7 @@ def die(*_):
 def test_what_failed_in_the_process_is_told(monkeypatch):
     recipe = resolve(TOKENGS, SMALL)
     must_refuse(
-        "images of 15 x 24 cannot be cut into patches",
+        "images of 15 x 24 cannot be cut into patches of 8",
         peak_memory,
         recipe,
         "forward",
