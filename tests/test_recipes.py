@@ -39,6 +39,8 @@ TOKENGS_2026_6 = 362_695_680
 DYNAMIC = 360_076_288
 LOCUSGS = 241_514_780 - 52_236
 """Without parameters that the published LocusGS carries and never uses."""
+LANDMARK = TOKENGS - N * 1024 + 12_379_410
+"""Without learned queries, with places, neighbours and the refinement."""
 GSLRM = 303_548_416
 """The paper: 300 million in 24 blocks of width 1024."""
 ABLATIONS = yaml.safe_load("""
@@ -56,6 +58,7 @@ PARAMETERS = {
     "tokengs/(re10k|dl3dv)": TOKENGS,
     "tokengs/latent_": TOKENGS_2026_6,
     "tokengs/dynamic": DYNAMIC,
+    "landmark/(re10k|dl3dv)": LANDMARK,
     "gslrm/(re10k|dl3dv)": GSLRM,
     "locus/(re10k|dl3dv)|ablations/": LOCUSGS,
 }
@@ -87,8 +90,9 @@ def model(file):
     return recipe(file).build_model("meta")
 
 
-def parameters(file):
-    return sum(parameter.numel() for parameter in model(file).parameters())
+def parameters(file, *overrides):
+    changed = resolve(recipe(file).tree, overrides)
+    return sum(parameter.numel() for parameter in changed.build_model("meta").parameters())
 
 
 def broken(promises):
@@ -120,10 +124,8 @@ def alone(file):
 def as_published(file, wanted):
     """The number of parameters, and the structure of ablations without sizes and initial values."""
     wanted = SHOWN.get(file, f"{wanted:,}")
-    count = parameters(file)
-    queries = model(file).queries
-    if queries.count == 1024:
-        count += (N - 1024) * sum(x[0].numel() for x in queries.parameters())
+    few = model(file).queries.count == 1024
+    count = parameters(file, *[f"model.queries.count={N}"] * few)
     kept = {f"has {wanted} parameters, not {count:,}": f"{count:,}" == wanted}
     if golden := file.startswith("ablations/") and ABLATIONS.get(Path(file).stem):
         released = read_golden(ROOT / f"tests/golden/locus_{golden}_a.safetensors")
