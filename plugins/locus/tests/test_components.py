@@ -6,7 +6,6 @@ import yaml
 from qgs_locus.anchors import AnchoredQueries, FrustumCenters, NormalCenters
 from qgs_locus.decoding import RadiusScaledCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, raw_radius_of, support_radius
-from refusals import wrong_refusals
 from small_parts import made
 from torch.testing import assert_close
 
@@ -53,32 +52,6 @@ recipe: 1
 plugins: [locus]
 model: {queries: {type: locus/anchored}}
 """)
-REFUSED = """
-model.decoder.refinement={type: locus/refine, center: false, radius: false}
-    model.decoder.refinement: nothing is
-model.decoder.refinement={type: locus/refine, center_step: linear, input_limit: 7}
-    model.decoder.refinement.input_limit: no effect
-model.decoder.refinement={type: locus/refine, center: false, center_step: linear}
-    model.decoder.refinement.center_step: no effect
-model.decoder.refinement={type: locus/refine, radius: false, radius_min: 0.5}
-    model.decoder.refinement.radius_min: no effect
-model.centers={type: locus/anchor_offset, offset: linear, output_limit: null}
-    model.centers.output_limit: no effect
-model.decoder.cross_attention={type: locus/ray_biased, bandwidth: fixed, sigma_sq_min: 0.5}
-    model.decoder.cross_attention.sigma_sq_min: no effect
-model.queries={type: locus/anchored, radius: false, init_radius: 2}
-    model.queries.init_radius: no effect
-model.queries.center_init={kind: frustum, depth: [0, 1]}
-    model.queries.center_init.depth: 0 < min
-model.queries.center_init={kind: frustum, depth: [2, 1]}
-    model.queries.center_init.depth: 0 < min
-model.queries.center_init={kind: frustum, depth: [-1, 1]}
-    model.queries.center_init.depth: 0 < min
-"""
-
-
-def test_options_without_effect_or_sense_are_refused():
-    assert not wrong_refusals(RECIPE, REFUSED)
 
 
 def test_idle_options_at_their_defaults_compose_again():

@@ -8,7 +8,6 @@ from qgs_viewer.curves import curves_of
 from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.rooms.source import RoomScene, RoomsSource
 from qgs_worlds.worlds.source import WorldsSource
-from refusals import wrong_refusals
 from tables import assert_equal
 
 from qgs.checkpoint.models import checkpoint_path
@@ -77,31 +76,6 @@ def test_slices_and_range(source):
     assert [scene.name for scene in scenes[3:]] == ["train/000003", "train/000004"]
     with pytest.raises(IndexError):
         scenes[5]
-
-
-RECIPE = {"recipe": 1, "plugins": ["rooms", "worlds"]}
-REFUSED = """
-data={type: rooms/procedural, image_size: [16, 24], fov: [80, 60]}
-    data.fov: must be
-data={type: rooms/procedural, image_size: [16, 24], scenes: 0}
-    data.scenes: 1
-data={type: rooms/procedural, image_size: [16, 24], rooms: 3}
-    data.rooms: no option
-data={type: worlds/procedural, image_size: [16, 24], scenes: 0}
-    data.scenes: 1
-data={type: worlds/procedural, image_size: [16, 24], complexity: 2}
-    data.complexity: 4
-data={type: worlds/procedural, image_size: [16, 24], light: dark}
-    data.light: 'varied'
-data={type: worlds/procedural, image_size: [16, 24], depth: [2, 1]}
-    data.depth: must be
-data={type: worlds/procedural, image_size: [16, 24], rooms: 2}
-    data.rooms: 1
-"""
-
-
-def test_wrong_options_are_refused():
-    assert not wrong_refusals(RECIPE, REFUSED)
 
 
 @pytest.mark.parametrize("mirror", [False, True])

@@ -14,7 +14,6 @@ from qgs_anchors.ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_a
 from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS
-from refusals import wrong_refusals
 from small_parts import made, shaken
 from tables import assert_equal
 from torch.testing import assert_close
@@ -112,20 +111,6 @@ def test_gaussians_turn_and_grow_with_their_anchor():
     assert_close(placed.scales, local.scales * radii_along(radii, local.quats))
     for name in ("offsets", "opacities", "colors"):
         assert_equal(getattr(placed, name), getattr(local, name))
-
-
-REFUSED = """
-model.decoder.refinement={type: ellipsoid/refine, center: false, rotation: false, radius: false}
-    model.decoder.refinement: nothing is
-model.decoder.cross_attention={type: ellipsoid/ray_biased, bandwidth: fixed, radius_min: 0.5}
-    model.decoder.cross_attention.radius_min: no effect
-model.centers={type: ellipsoid/axis_scaled, radius_bound: offset}
-    model.centers: softplus
-"""
-
-
-def test_options_without_effect_or_sense_are_refused():
-    assert not wrong_refusals(yaml.safe_load(ELLIPSOID), REFUSED)
 
 
 ELLIPSOID = """

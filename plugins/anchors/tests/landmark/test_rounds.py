@@ -4,7 +4,6 @@ import torch
 import yaml
 from commands import done
 from odd_views import odd_views
-from refusals import wrong_refusals
 from tables import assert_equal, must_refuse
 from torch.testing import assert_close
 
@@ -134,24 +133,6 @@ def test_rounds_are_traced_as_layers_are():
     assert_close(after, {n: layer.state.features[:, [1, 3]] for n, layer in found.layers.items()})
 
 
-REFUSED = """
-model.feedback.layers=4
-    model.feedback.layers:
-model.feedback.least=3
-    model.feedback.least:
-model.head.gaussians_per_query=2
-    model.head:
-model.centers.radius_min=0.1
-    model.centers:
-model.queries.far=0.1
-    model.queries.far:
-"""
-
-
-def test_what_cannot_work_is_refused():
-    assert not wrong_refusals(RECIPE, REFUSED)
-
-
 @torch.no_grad()
 def test_a_number_of_anchors_is_that_for_any_number_of_photos():
     model = built("model.queries.count=20")
@@ -191,11 +172,3 @@ def test_rounds_start_from_rounds_of_their_kind(tmp_path):
     assert_equal(more, learned.state_dict())
     for other in (NO_ROUNDS, "model.feedback.cells=1"):
         must_refuse(r"feedback\.embedding\.weight", started, other, kind=CheckpointError)
-
-
-def test_parameters():
-    """TokenGS's 222,016,768, less its 4,096 learned queries, and 12,379,410 of places, neighbours,
-    the refinement and the queries."""
-    for recipe in ("re10k", "re10k_4096", "dl3dv", "dl3dv_4096_4views"):
-        model = qgs.compose(f"landmark/{recipe}.yaml", device="meta")
-        assert sum(parameter.numel() for parameter in model.parameters()) == 230_201_874

@@ -12,7 +12,6 @@ from odd_views import odd_views
 from qgs_dev import Case
 from qgs_dev.inputs import Sizes, inputs_of
 from qgs_zoo.globalsplat.losses import Frustum, Regularisers, beyond_frusta, subset
-from refusals import wrong_refusals
 from torch.testing import assert_close
 from training_runs import run
 
@@ -50,38 +49,6 @@ def test_published_training():
     optimizer = recipe.tree["optimizer"]
     assert optimizer["initial_divisor"] * optimizer["final_divisor"] == 50
     assert optimizer["warmup"] == 0.03 * recipe.training.steps
-
-
-REFUSED = """
-model.decoder.layer.memory_width=null
-    model.decoder.layer: writes it as 96 float32
-model.encoder.rgb_width=32
-    model.encoder.rgb_width: writes it as 64 float32
-model.queries={type: qgs/latent, count: 8}
-    model.queries: needs globalsplat.texture
-model.decoder.layer={type: qgs/cross_self_mlp}
-    model.decoder.layer: `qgs/content` needs memory.keys
-model.decoder.cross_attention={type: qgs/content}
-    model.decoder.cross_attention: has no slot `cross_attention`
-model.head.level=5
-    model.head.level: 16 candidates cannot form 2^5 Gaussians
-model.head.candidates=12
-    model.head.candidates: must be a power of two
-model.head.scale_min=0.1
-    model.head.scale_min: must be below `scale_max`, which is 0.05
-model.head.level={schedule: linear, values: [0, 4.5], at: [1, 9]}
-    model.head.level: 16 candidates cannot form 2^4.5 Gaussians
-model.queries.extra=256
-    model.queries.extra: all 256 tokens are extra ones
-data.image_size=[60, 64]
-    data.image_size: model.encoder.patch_size: patches of 8 pixels do not divide
-objective={type: globalsplat/two_passes}
-    objective: at least 3 input views, got 2
-"""
-
-
-def test_what_cannot_work_is_refused():
-    assert not wrong_refusals(TINY, REFUSED)
 
 
 def test_two_passes_train_a_head_that_grows(tmp_path):

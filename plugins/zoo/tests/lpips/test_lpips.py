@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from qgs_zoo.lpips import Lpips, LpipsLoss
-from refusals import refused
 from safetensors.torch import load_file, save_file
 from tables import assert_equal, must_refuse
 from torch import nn
@@ -132,8 +131,3 @@ def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg):
     (gradient,) = torch.autograd.grad(found, rgb)
     assert value(rgb - 0.01 * gradient / gradient.abs().max()) < found
     assert not any(parameter.requires_grad for parameter in loss.parameters())
-
-
-def test_images_that_are_too_small_are_refused_with_the_recipe():
-    data = "data={type: qgs/photos, path: x, image_size: [8, 16]}"
-    assert "LPIPS" in refused(RECIPE, [data, "losses={mine: {type: lpips/vgg16}}"]).reason

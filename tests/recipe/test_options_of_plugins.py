@@ -1,0 +1,24 @@
+"""Options of plugins that cannot work, or have no effect, are refused: refused.txt of their tests.
+
+The first line is a recipe. Of each override below it the next line says `option: reason`.
+"""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from refusals import refused
+
+FILES = Path(__file__).parents[2].glob("plugins/*/tests/**/refused.txt")
+
+
+@pytest.mark.parametrize("file", sorted(FILES), ids=str)
+def test_overrides_are_refused(file):
+    recipe, *lines = file.read_text().splitlines()
+    wrong = []
+    for override, expected in zip(lines[::2], lines[1::2], strict=True):
+        option, _, reason = expected.strip().partition(":")
+        problem = refused(yaml.safe_load(recipe), [override])
+        if problem.option != option or reason.strip() not in problem.reason:
+            wrong.append((override, problem))
+    assert not wrong
