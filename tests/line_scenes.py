@@ -62,3 +62,9 @@ def samples_of(*given, **options):
     """All samples of a plan; a scene that fails raises."""
     plan = plan_of(*given, **options)
     return [sample for scene in plan.wanted for sample in plan.samples(scene)]
+
+
+def judged_samples(recipe, **options):
+    """Those that an evaluation of a recipe scores."""
+    sampler = recipe.build_view_sampler()
+    return samples_of(recipe.build_data(), recipe.views, recipe.evaluation, sampler, **options)

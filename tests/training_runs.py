@@ -83,9 +83,15 @@ def assert_equal_runs(first, second):
     assert one == other
 
 
+def stream_of(recipe, seed=0, **options):
+    """The samples of a training."""
+    sampler = recipe.build_view_sampler()
+    return SampleStream(recipe.build_data(), recipe.views, seed, sampler=sampler, **options)
+
+
 def batches(recipe, count, size, skips=False, **options):
     """The first training batches."""
-    samples = SampleStream(recipe.build_data(), recipe.views, 0, skips)
+    samples = stream_of(recipe, skips=skips)
     with closing(training_batches(samples, size, **options)) as stream:
         return list(islice(stream, count))
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from line_scenes import DOWN, samples_of
-from training_runs import resume, run, tiny
+from line_scenes import DOWN, judged_samples
+from training_runs import resume, run, stream_of, tiny
 from walk import along_x, pinhole
 
 from qgs.checkpoint.model_file import CheckpointFile, save
 from qgs.checkpoint.tensors import CheckpointError
 from qgs.data import stream
-from qgs.data.stream import SampleStream, trained_domain
+from qgs.data.stream import trained_domain
 from qgs.domain import KEY, Domain, verdict
 from qgs.geometry.poses import look_at
 from qgs.recipe import resolve
@@ -106,27 +106,22 @@ GROWING = "view_sampler.max_gap={schedule: linear, values: [4, 20], at: [0, 10]}
 def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
     monkeypatch.setattr(stream, "MEASURED", 128)
     recipe = resolve(f"recipes/tiny/{name}.yaml", options)
-    source = recipe.build_data()
-    sampler = recipe.build_view_sampler()
-    trained = trained_domain(
-        SampleStream(source, recipe.views, recipe.seed, sampler=sampler), recipe.training.steps
-    )
+    trained = trained_domain(stream_of(recipe), recipe.training.steps)
     test = Domain()
-    for sample in samples_of(source, recipe.views, recipe.evaluation, sampler):
+    for sample in judged_samples(recipe):
         test.see(sample.inputs.cameras, sample.targets.cameras)
     assert not trained.differences(test)
 
 
 def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch):
-    source = recipe().build_data()
-    monkeypatch.setattr(type(source.scenes("train")[0]), "cameras", None)
-    assert trained_domain(SampleStream(source, recipe().views, 0), 0).samples == 0
+    samples = stream_of(recipe())
+    monkeypatch.setattr(type(samples.source.scenes("train")[0]), "cameras", None)
+    assert trained_domain(samples, 0).samples == 0
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(tmp_path):
     two = recipe("training.steps=2")
-    samples = SampleStream(two.build_data(), two.views, two.seed, sampler=two.build_view_sampler())
-    expected = trained_domain(samples, 2).ranges
+    expected = trained_domain(stream_of(two), 2).ranges
     file = run(recipe("training.steps=1"), tmp_path).folder.checkpoint
     assert CheckpointFile(file).domain.ranges == expected
     file.write_bytes(file.read_bytes()[:1000])

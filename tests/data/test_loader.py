@@ -10,7 +10,7 @@ import torch
 from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
 from tables import assert_equal, must_refuse
-from training_runs import batches, tiny
+from training_runs import batches, stream_of, tiny
 
 from qgs.containers import named_tensors
 from qgs.contracts import ViewsConfig
@@ -50,8 +50,7 @@ def test_worker_processes_change_nothing_and_end_with_an_error_that_names_the_fi
     recipe = photos(tmp_path / "shelf")
 
     def until_broken(start, workers):
-        samples = SampleStream(recipe.build_data(), recipe.views, 3)
-        stream = training_batches(samples, 1, start, workers=workers)
+        stream = training_batches(stream_of(recipe, 3), 1, start, workers=workers)
         found = []
 
         def follow():
@@ -108,10 +107,7 @@ def test_samples_of_a_step_have_one_image_size_and_one_number_of_inputs():
     recipe = tiny(
         "tokengs", f"training.image_sizes={[*map(list, sizes)]}", "view_sampler.extra_inputs=2"
     )
-    sampler = recipe.build_view_sampler()
-    samples = SampleStream(
-        recipe.build_data(), recipe.views, 0, sampler=sampler, per_step=2, sizes=sizes
-    )
+    samples = stream_of(recipe, per_step=2, sizes=sizes)
 
     def found(start, workers=0):
         with closing(training_batches(samples, 1, start, workers=workers)) as stream:

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from line_scenes import DOWN, Line, Lines, drawn, samples_of, values
+from line_scenes import DOWN, Line, Lines, drawn, judged_samples, samples_of, values
 from odd_views import odd_views
 from tables import assert_equal, must_refuse
 from torch.testing import assert_close
@@ -202,8 +202,7 @@ def test_pose_noise_moves_inputs_but_the_first_and_nothing_else():
 
 def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol():
     def first_inputs(recipe):
-        source = recipe.build_data()
-        return samples_of(source, recipe.views, recipe.evaluation)[0].inputs.cameras.c2w
+        return judged_samples(recipe)[0].inputs.cameras.c2w
 
     exact = resolve("recipes/tiny/tokengs.yaml", ["evaluation.scenes=1"])
     noisy = resolve(exact.tree, ["views.pose_noise=3"])

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from line_scenes import samples_of
+from line_scenes import judged_samples
 from tables import assert_equal, must_refuse
 from training_runs import tiny
 
@@ -23,8 +23,7 @@ MSE = ("losses.photometric.ssim_weight=0.0", "evaluation.tuning_steps=8")
 def opened(*words):
     """The recipe, its model and the input views of a scene."""
     recipe = tiny(*words)
-    samples = samples_of(recipe.build_data(), recipe.views, recipe.evaluation)
-    return recipe, recipe.build_model().eval(), samples[0].inputs
+    return recipe, recipe.build_model().eval(), judged_samples(recipe)[0].inputs
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,15 @@ from itertools import islice
 
 import numpy as np
 import torch
-from line_scenes import Line, Lines, samples_of
+from line_scenes import Line, Lines, judged_samples, samples_of
 from qgs_photos.datasets.view_samplers import Bounded, Farthest, Overlapping
-from refusals import wrong_refusals
 from tables import must_refuse
+from training_runs import stream_of
 from walk import arc
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.stream import SampleStream, trained_domain, training_batches
+from qgs.data.stream import trained_domain, training_batches
 from qgs.recipe import resolve
 
 TWO = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
@@ -61,35 +61,32 @@ def test_short_scenes_and_several_inputs():
     assert list(inputs) == sorted({*inputs})
 
 
-def opened(*options):
-    """A recipe, its data and its sampler."""
-    recipe = resolve("tiny/tokengs_bounded.yaml", [*options, "data.image_size=[16, 16]"])
-    return recipe, recipe.build_data(), recipe.build_view_sampler()
+def small(*options):
+    return resolve("tiny/tokengs_bounded.yaml", [*options, "data.image_size=[16, 16]"])
 
 
-def batches(recipe, source, sampler, start, count):
+def batches(recipe, start, count):
     """Two samples a batch, two batches a step."""
-    samples = SampleStream(source, recipe.views, 0, sampler=sampler, per_step=4)
-    return [*islice(training_batches(samples, 2, start), count)]
+    return [*islice(training_batches(stream_of(recipe, per_step=4), 2, start), count)]
 
 
 def test_a_training_widens_the_gap_and_resumes_where_it_was():
     """The warm-up of 5 steps ends with sample 20."""
-    parts = opened("view_sampler.warm_up_steps=5", "view_sampler.initial_max_gap=2")
-    recipe, source, sampler = parts
+    recipe = small("view_sampler.warm_up_steps=5", "view_sampler.initial_max_gap=2")
 
     def gaps(start, count):
-        drawn = [frames for batch in batches(*parts, start, count) for frames in batch.input_frames]
+        drawn = [x for batch in batches(recipe, start, count) for x in batch.input_frames]
         return [frames[-1] - frames[0] for frames in drawn]
 
     whole = gaps(0, 14)
     assert gaps(9, 5) == whole[18:]
     assert {*whole[:4]} == {2}
     assert max(whole[4:]) > 3
+    sampler = recipe.build_view_sampler()
     for number, gap in enumerate(whole):
         low, high = sampler.gaps(number // 4)
         assert low <= gap <= high
-    samples = samples_of(source, recipe.views, recipe.evaluation, sampler)
+    samples = judged_samples(recipe)
     found = [sample.input_frames[-1] - sample.input_frames[0] for sample in samples]
     assert min(found) in {3, 7}
     assert max(found) > 3
@@ -133,13 +130,10 @@ def test_inputs_stand_where_cameras_move():
 
 def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
     gaps = "min_gap: 3, max_gap: 7, initial_min_gap: 3, initial_max_gap: 7"
-    sampler = f"view_sampler={{type: datasets/farthest, {gaps}}}"
-    parts = opened(sampler, "views.inputs=4")
-    recipe, source, drawn = parts
-    counts = [batch.inputs.images.shape[1] for batch in batches(*parts, 0, 8)]
+    recipe = small(f"view_sampler={{type: datasets/farthest, {gaps}}}", "views.inputs=4")
+    counts = [batch.inputs.images.shape[1] for batch in batches(recipe, 0, 8)]
     assert counts == [2, 2, 3, 3, 4, 4, 2, 2]
-    samples = SampleStream(source, recipe.views, 0, sampler=drawn)
-    assert trained_domain(samples, steps=600).ranges["views"] == (2, 4)
+    assert trained_domain(stream_of(recipe), steps=600).ranges["views"] == (2, 4)
 
 
 DEPTH = 10.0
@@ -242,17 +236,3 @@ def test_too_few_photos_are_refused():
         Line(2, held_out=(1,)),
         TWO,
     )
-
-
-REFUSED = """
-view_sampler={type: datasets/farthest, fewest: 3}
-    view_sampler.fewest: larger than `views.inputs`, 2
-view_sampler={type: datasets/overlapping, apart: [2, 1]}
-    view_sampler.apart: 0 < min
-view_sampler={type: datasets/overlapping, apart: [0, 1]}
-    view_sampler.apart: 0 < min
-"""
-
-
-def test_more_inputs_than_views_and_bounds_without_order_are_refused():
-    assert not wrong_refusals("tiny/tokengs_bounded.yaml", REFUSED)
