@@ -1,10 +1,12 @@
-"""What tests demand in one line: a refusal, the same bits, files as they were; tables, JSON."""
+"""What tests demand in one line: a refusal, the same bits, files as before; tables, JSON, text."""
 
+import io
 import json
 from functools import partial
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from torch.testing import assert_close
 
 assert_equal = partial(assert_close, rtol=0, atol=0)
@@ -23,6 +25,11 @@ must_not_find = partial(must_refuse, kind=FileNotFoundError)
 def rows(table, mark=" | "):
     """The cells of each line."""
     return [line.split(mark) for line in table.strip().splitlines()]
+
+
+def quiet_console():
+    """A console of wide lines, whose text is that of its file."""
+    return Console(file=io.StringIO(), width=300)
 
 
 def contents(folder):

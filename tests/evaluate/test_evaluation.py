@@ -2,7 +2,6 @@
 
 import csv
 import hashlib
-import io
 import json
 import math
 from collections import Counter
@@ -11,9 +10,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from line_scenes import samples_of
-from rich.console import Console
-from tables import assert_equal
+from line_scenes import judged_samples
+from tables import assert_equal, quiet_console
 from training_runs import tiny
 
 from qgs.contracts import CONTRACT_VERSION, Column, ComponentConfig, Metric, Plugin
@@ -79,9 +77,9 @@ PARTLY = """{
 
 
 def shown(evaluation):
-    console = Console(record=True, width=120, file=io.StringIO())
+    console = quiet_console()
     evaluation.show(console)
-    return console.export_text()
+    return console.file.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +105,7 @@ def judged():
 def test_scores_are_the_metrics_of_model_and_baselines(judged):
     recipe, evaluation, _ = judged
     model = recipe.build_model().eval()
-    sample = samples_of(recipe.build_data(), recipe.views, recipe.evaluation, depths=True)[0]
+    sample = judged_samples(recipe, depths=True)[0]
     inputs = sample.inputs
     targets = sample.targets
     with torch.no_grad():

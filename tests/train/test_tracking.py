@@ -1,6 +1,5 @@
 """What trackers are told, and what a person reads while a model trains."""
 
-import io
 import json
 import sys
 import time
@@ -9,8 +8,7 @@ from unittest.mock import MagicMock
 
 import pytest
 from accelerate import PartialState
-from rich.console import Console
-from tables import must_refuse
+from tables import must_refuse, quiet_console
 from training_runs import TRAINED, resume, run, tiny
 
 from qgs.contracts import MissingExtraError
@@ -112,7 +110,7 @@ def test_a_resumed_run_goes_on_in_its_run_of_wandb(tmp_path, monkeypatch):
 
 
 def test_a_line_tells_how_much_of_the_budget_is_used():
-    console = Console(width=200, file=io.StringIO())
+    console = quiet_console()
     with TrainingProgress(console) as bar:
         bar.show(501, 0.1, 20.0, 0.501)
         bar.show(502, 0.1, 20.0, 0.502)  # a moment later

@@ -1,6 +1,5 @@
 """Studies that run: queues on one folder, kills, what is added later. Trainings of seconds."""
 
-import io
 import multiprocessing
 import os
 import re
@@ -16,8 +15,7 @@ from qgs_research.studies.plan import planned
 from qgs_research.studies.results import Results
 from qgs_research.studies.runs import run_of
 from qgs_research.studies.study import read_study
-from rich.console import Console
-from tables import must_refuse
+from tables import must_refuse, quiet_console
 
 
 @pytest.fixture
@@ -62,7 +60,7 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
 
 
 def trained(plan, workers):
-    console = Console(file=io.StringIO())
+    console = quiet_console()
     ended = running.train_missing(
         plan, plan.runs, workers=workers, threads=1, device="cpu", console=console
     )
