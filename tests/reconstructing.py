@@ -4,6 +4,14 @@ import pytest
 from commands import saved
 from photo_formats import noisy_photos
 
+HOLDOUTS = {
+    "": {3},
+    "--holdout none": set(),
+    "--holdout 1.png,3": {1, 3},
+    "--frames 2,3": set(),  # 3 is the held-out one
+}
+"""Options, and the photos of the row that are then compared with."""
+
 
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory):

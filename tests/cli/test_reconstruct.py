@@ -8,7 +8,7 @@ from commands import done, record_of, saved
 from photo_formats import scene
 from PIL import Image
 from plyfile import PlyData
-from reconstructing import kinds
+from reconstructing import HOLDOUTS, kinds
 from tables import must_refuse, rows
 
 import qgs
@@ -59,14 +59,7 @@ def test_everything_is_written_and_what_a_user_made_is_kept(
 
 
 def test_photos_held_out_are_compared_with(checkpoint, photos, tmp_path, small_pictures):
-    cases = {
-        "": {3},
-        "--holdout none": set(),
-        "--holdout 1.png,3": {1, 3},
-        "--frames 2,4": {3},
-        "--frames 2,3": set(),  # 3 is the held-out one
-    }
-    for options, compared in cases.items():
+    for options, compared in (HOLDOUTS | {"--frames 2,4": {3}}).items():
         record = written(checkpoint, photos, *options.split(), "--overwrite", out=tmp_path)
         assert {f for f, kind in kinds(record).items() if kind == "novel"} == compared, options
 

@@ -5,7 +5,7 @@ import shutil
 import pytest
 from commands import done, record_of, saved
 from plyfile import PlyData
-from reconstructing import kinds
+from reconstructing import HOLDOUTS, kinds
 from tables import must_refuse, read_json, write_json
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
@@ -24,13 +24,7 @@ def refined_in(file):
 
 
 def test_photos_held_out_are_compared_with_and_not_refined_on(checkpoint, photos, tmp_path):
-    cases = {
-        "": {3},
-        "--holdout none": set(),
-        "--holdout 1.png,3": {1, 3},
-        "--frames 2,3": set(),  # 3 is the held-out one
-    }
-    for options, compared in cases.items():
+    for options, compared in HOLDOUTS.items():
         out = tmp_path / f"out{options}"
         words = (*options.split(), "--scale", 0.5, "--out", out)
         done("reconstruct", checkpoint, photos, *words)
