@@ -4,6 +4,7 @@ import json
 from functools import partial
 
 import pytest
+from tables import write_json
 from training_runs import tiny
 
 from qgs.evaluate.plan import read_index
@@ -31,7 +32,7 @@ def drawn(*overrides, scenes=("x",)):
 @pytest.fixture
 def file(tmp_path):
     file = tmp_path / "published.json"
-    file.write_text(json.dumps(INDEX))
+    write_json(file, INDEX)
     return file
 
 

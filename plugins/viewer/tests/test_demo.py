@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from commands import done
+from commands import done, record_of
 from photo_formats import PhotoSet, noisy_photos, write_nerfstudio
 from qgs_viewer import report
 from qgs_viewer.commands import new_folder
@@ -86,7 +86,7 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
         assert all(word in known for word in options if word.startswith("--"))
     assert refine[2:] == ["report/scene", str(photos)]
     done(*reconstruct[1:])
-    record = json.loads(Path("report/scene/cameras.json").read_text())["to_photos"]
+    record = record_of(Path("report/scene"))["to_photos"]
     assert (record["scale"], record["search"]) == (0.5, None)
 
 
@@ -226,7 +226,7 @@ def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path
     (score,) = result.evaluation.scores
     (_, inputs, compared), found = next(iter(result.scales.items()))
     done("reconstruct", MODEL, room, "--out", tmp_path / "out")
-    record = json.loads((tmp_path / "out/cameras.json").read_text())
+    record = record_of(tmp_path / "out")
     assert record["to_photos"]["scale"] == pytest.approx(found.factor)
     assert record["to_photos"]["search"] == json.loads(json.dumps(asdict(found)))
     source = open_source(MODEL, photos=str(room))

@@ -1,16 +1,16 @@
 """What `qgs view` makes of a PLY, and of a finished reconstruction with or without its model."""
 
-import json
 import shlex
 import shutil
 
 import pytest
 import torch
+from commands import record_of
 from photo_formats import noisy_photos
 from qgs_viewer.opening import ModelSource, open_source
 from qgs_viewer.query_scene import NEUTRAL
 from small import VIEWS, model_of
-from tables import must_refuse
+from tables import must_refuse, write_json
 from walk import Walk, cloud
 
 import qgs
@@ -51,7 +51,7 @@ def test_a_scene_is_shown_with_photos_that_are_still_there(tmp_path):
     command = shlex.join(["qgs", "scene", str(photos), "--size", "16x16"])
     names = [f"images/{frame}.png" for frame in (0, 2)]
     record = {"command": command, "refined_on": names}
-    (scene / "metrics.json").write_text(json.dumps(record))
+    write_json(scene / "metrics.json", record)
     source = open_source(str(scene))
     shown = source.scene_of(())
     assert (shown.gaussians.count, shown.background) == (5, (0.0, 0.0, 0.0))
@@ -68,12 +68,12 @@ def test_a_scene_is_shown_with_photos_that_are_still_there(tmp_path):
 @pytest.fixture
 def opened(finished, tmp_path):
     """Opens a copy of it with changes in its record, which a list of names reduces to those."""
-    told = json.loads((finished / "cameras.json").read_text())
+    told = record_of(finished)
     folder = shutil.copytree(finished, tmp_path / "scene")
 
     def opened(*names, **changes):
         record = {name: told[name] for name in names} if names else {**told, **changes}
-        (folder / "cameras.json").write_text(json.dumps(record))
+        write_json(folder / "cameras.json", record)
         return open_source(str(folder))
 
     return opened
