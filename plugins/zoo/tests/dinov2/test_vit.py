@@ -16,7 +16,8 @@ def test_positions_of_the_trained_size_stay():
 
 
 def test_weights_of_a_file_are_loaded(tmp_path):
-    """Under the hub's names or behind a prefix, whatever else the file holds."""
+    """Under the hub's names or behind a prefix, whatever else the file holds. The same function
+    reads the files of VGGT and LPIPS."""
     small = dict(DinoV2(8, 2, 2).named_parameters())
     dims = ModelDims(width=8, heads=2, depth=1)
     for prefix, suffix in (("", ".pth"), ("pretrained.", ".pt"), ("pretrained.", ".safetensors")):
