@@ -10,7 +10,6 @@ from small_parts import made
 from tables import must_refuse
 from torch.testing import assert_close
 
-from qgs.contracts.schedule import follow
 from qgs.recipe import resolve
 from qgs.train.training_pass import TrainingPass
 from qgs.types import ImageMemory, LayerPrediction, Photos
@@ -118,9 +117,6 @@ def test_larger_patches_embed_times_as_smaller_ones():
 
 
 def test_the_published_weight_of_dynamic_gaussians():
-    objective = resolve(PUBLISHED).build_objective()
-    weights = []
-    for step in (0, 5000, 10_000, 15_000, 20_000):
-        follow([objective], step)
-        weights.append(objective.config.weight)
-    assert weights == pytest.approx([0.3, 0.3, 0.15, 0, 0])
+    schedule = resolve(PUBLISHED).build_objective().schedules["weight"]
+    weights = map(schedule.number, (0, 5000, 10_000, 15_000, 20_000))
+    assert [*weights] == pytest.approx([0.3, 0.3, 0.15, 0, 0])
