@@ -139,15 +139,20 @@ def test_a_number_of_anchors_is_that_for_any_number_of_photos():
     assert [model(views(count)).gaussians.count for count in (2, 5)] == [80, 80]
 
 
+def started(learned, file, *overrides):
+    """A model that starts from another, which is saved in `file`, and what is said."""
+    save(learned, file)
+    recipe = resolve(RECIPE, (f"init_from={file}", *overrides))
+    model = recipe.build_model().eval()
+    return model, initialise(model, recipe)
+
+
 @torch.no_grad()
 def test_a_model_without_rounds_starts_one_with_rounds(tmp_path):
     """They repeat its layers: what they add to keys, values and features is 0 at first."""
     plain = built(NO_ROUNDS)
-    save(plain, tmp_path / "plain.safetensors")
-    grown = resolve(RECIPE, (f"init_from={tmp_path}/plain.safetensors",))
-    model = grown.build_model().eval()
+    model, said = started(plain, tmp_path / "plain.safetensors")
     given = views()
-    said = initialise(model, grown)
     assert "feedback.marker: none -> (32,)" in said
     assert "trained with model.feedback.type: qgs/none (here landmark/rendered)" in said
     weights = model.state_dict()
@@ -159,16 +164,8 @@ def test_a_model_without_rounds_starts_one_with_rounds(tmp_path):
 
 
 def test_rounds_start_from_rounds_of_their_kind(tmp_path):
-    learned = built()
-    save(learned, tmp_path / "rounds.safetensors")
-
-    def started(override):
-        recipe = resolve(RECIPE, (f"init_from={tmp_path}/rounds.safetensors", override))
-        model = recipe.build_model()
-        initialise(model, recipe)
-        return model
-
-    more = started("model.feedback.rounds=3").state_dict()
-    assert_equal(more, learned.state_dict())
+    given = built(), tmp_path / "rounds.safetensors"
+    more, _ = started(*given, "model.feedback.rounds=3")
+    assert_equal(more.state_dict(), given[0].state_dict())
     for other in (NO_ROUNDS, "model.feedback.cells=1"):
-        must_refuse(r"feedback\.embedding\.weight", started, other, kind=CheckpointError)
+        must_refuse(r"feedback\.embedding\.weight", started, *given, other, kind=CheckpointError)
