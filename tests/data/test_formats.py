@@ -95,7 +95,7 @@ def test_a_folder_of_scenes(tmp_path, caplog):
         write_nerfstudio(tmp_path / name, synthetic(tmp_path / "photos" / name, seed=i))
     (tmp_path / "notes").mkdir()
     source = opened(tmp_path)
-    assert [s.name for s in source.scenes("train")] == ["a", "b"]
+    assert source.names("train") == ["a", "b"]
     assert "no photos with cameras: notes, photos" in caplog.text
     assert source.scenes("test")[0].held_out == (3,)
     assert not torch.equal(*(s.images([0]) for s in source.scenes("train")))

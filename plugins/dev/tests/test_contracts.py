@@ -10,6 +10,7 @@ from qgs_dev import CaseRun, runs_of
 from qgs_dev.running import without_case
 from tables import read_json
 
+from qgs.checkpoint.tensors import shapes_of
 from qgs.recipe.registry import load_plugin
 
 PINNED = read_json(Path(__file__).parent / "state_dicts.json")
@@ -40,16 +41,13 @@ def test_extended_contract(run: CaseRun) -> None:
     run.check(["construction", "extended"])
 
 
-def shapes_of(run: CaseRun) -> dict[str, list[int]]:
-    return {name: [*weight.shape] for name, weight in run.case.build().state_dict().items()}
-
-
 def test_every_component_is_checked_and_its_weights_are_pinned() -> None:
     unchecked = set()
     for plugin, pinned in PINNED.items():
         runs = {run.case.label: run for run in runs_of(plugin) if run.case.has_parameters}
         firsts = {label for label, run in runs.items() if not run.variant}
-        missing = {label: shapes_of(runs[label]) for label in firsts - pinned.keys()}
+        modules = {label: runs[label].case.build() for label in firsts - pinned.keys()}
+        missing = {label: shapes_of(module.state_dict()) for label, module in modules.items()}
         assert not missing, f"add to {plugin} in state_dicts.json: {json.dumps(missing)}"
         assert pinned.keys() <= runs.keys(), plugin
         unchecked |= {component.name for component in without_case(load_plugin(plugin))}

@@ -12,6 +12,7 @@ from qgs_viewer.figures import DPI, FIGURES, WIDTH, grid, write_figure
 from qgs_viewer.queries import attention_pictures_of
 from qgs_viewer.sections import LAYERS, Detail, anchors, attention, novel_views
 from small import PAIR, QUERIES, model_of, model_scenes_of
+from tables import names_in
 from walk import SIDE
 
 import qgs
@@ -84,7 +85,7 @@ def test_figures_are_written_and_explained(tmp_path):
     words = ["figures", model, "--device", "cpu", "--scene", "test/000001"]
     out = tmp_path / "figures"
     done(*words, "--out", out, "--only", "queries", "--only", "curves")
-    assert {file.name for file in out.iterdir()} == {"queries.pdf", "queries.png", "figures.md"}
+    assert names_in(out) == {"queries.pdf", "queries.png", "figures.md"}
     text = (out / "figures.md").read_text()
     assert "![queries](queries.png)" in text
     assert "curves is left out" in text
