@@ -114,9 +114,9 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
 
 
 def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch):
-    samples = stream_of(recipe())
-    monkeypatch.setattr(type(samples.source.scenes("train")[0]), "cameras", None)
-    assert trained_domain(samples, 0).samples == 0
+    scene = recipe().build_data().scenes("train")[0]
+    monkeypatch.setattr(type(scene), "cameras", None)
+    assert trained_domain(stream_of(recipe()), 0).samples == 0
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(tmp_path):

@@ -1,6 +1,5 @@
 import math
 import os
-import pickle  # noqa: TID251  as multiprocessing does
 import zipfile
 from functools import partial
 
@@ -63,15 +62,11 @@ opened = partial(photo_formats.opened, size=(16, 16), source=ChunksSource)
 first = partial(photo_formats.scene, size=(16, 16), source=ChunksSource)
 
 
-def names(source, split="train"):
-    return [scene.name for scene in source.scenes(split)]
-
-
 def test_frames_and_cameras(tmp_path):
     data_set(tmp_path)
     source = opened(tmp_path)
-    assert names(source) == ["s0", "s1", "s2"]
-    assert names(source, "test") == ["t0"]
+    assert source.names("train") == ["s0", "s1", "s2"]
+    assert source.names("test") == ["t0"]
     scene = source.scenes("train")[1]
     assert len(scene) == 7
     c2w = scene.cameras.c2w[5]
@@ -98,16 +93,16 @@ def test_listing_opens_no_chunk(tmp_path):
 
 def test_held_out_frames_serve_where_there_are_no_test_chunks(tmp_path):
     write(tmp_path / "train", a=[record("s0")])
-    assert names(opened(tmp_path), "test") == []
+    assert opened(tmp_path).names("test") == []
     assert opened(tmp_path, holdout=3).scenes("test")[0].held_out == (1,)
     write(tmp_path / "test", a=[record("t0")])
-    assert names(opened(tmp_path, holdout=3), "test") == ["t0"]
+    assert opened(tmp_path, holdout=3).names("test") == ["t0"]
 
 
 def test_without_an_index_and_split_folders_the_chunks_are_read(tmp_path, caplog):
     write(tmp_path, a=[record("s0")], b=[record("s1")], index=False)
-    assert names(opened(tmp_path)) == ["s0", "s1"]
-    assert names(opened(tmp_path, max_scenes=1)) == ["s0"]
+    assert opened(tmp_path).names("train") == ["s0", "s1"]
+    assert opened(tmp_path, max_scenes=1).names("train") == ["s0"]
     assert "has no index.json" in caplog.text
     write(tmp_path, c=[record("s1")], index=False)
     must_refuse(r"'s1' is in b\.torch and in c\.torch", opened, tmp_path)
@@ -119,7 +114,7 @@ def test_missing_chunks_and_short_scenes_are_counted_and_named(tmp_path, caplog)
     source = opened(tmp_path, min_frames=5)
     assert "1 of 3 scenes" in caplog.text
     assert "s2 (b.torch)" in caplog.text
-    assert names(source) == ["s1"]
+    assert source.names("train") == ["s1"]
     assert "fewer than 5 frames (min_frames) and are left out: s0 (4)" in caplog.text
     (tmp_path / "train/a.torch").unlink()
     must_not_find("none of their chunks exists", opened, tmp_path)
@@ -134,14 +129,7 @@ def test_legacy_files_are_read_whole(tmp_path):
 
 def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
     data_set(tmp_path)
-    source = opened(tmp_path)
-    scene = first(tmp_path)
-    before = scene.images([1])
-    data = pickle.dumps((source, scene))
-    assert len(data) < 3000
-    source, scene = pickle.loads(data)  # noqa: S301
-    for copy in (scene, source.scenes("train")[0]):
-        assert_equal(copy.images([1]), before)
+    photo_formats.assert_travels(opened(tmp_path))
 
 
 def test_masks_names_sizes_and_backgrounds(tmp_path):
