@@ -5,13 +5,14 @@ The writers share no code with the readers: they follow the descriptions of the 
 
 import io
 import math
+import pickle  # noqa: TID251  as multiprocessing does
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from tables import write_json
+from tables import assert_equal, write_json
 from walk import along_x
 
 from qgs.data import PhotosSource
@@ -53,6 +54,13 @@ def encoded(image, kind="PNG", **options):
     return file.getvalue()
 
 
+def turned(orientation):
+    """EXIF data that turn or mirror a photo."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    return exif
+
+
 def row_of_frames(count, step=1.0, **top):
     """The content of transforms.json for `images/0.png`, ...: cameras `step` apart along x."""
     frames = [
@@ -62,9 +70,31 @@ def row_of_frames(count, step=1.0, **top):
     return {**top, "frames": frames}
 
 
+def write_row(folder, images, step=1.0, cameras=(), **top):
+    """Images and their `row_of_frames`. cameras: what the first frames have of their own."""
+    content = row_of_frames(len(images), step, **top)
+    for frame, own in zip(content["frames"], cameras, strict=False):
+        frame.update(own)
+    for number, image in enumerate(images):
+        put(folder / f"images/{number}.png", encoded(image))
+    write_json(folder / "transforms.json", content)
+    return folder
+
+
 def scene(path, size=(30, 40), **options):
     """The first training scene of what is `opened`."""
     return opened(path, size, **options).scenes("train")[0]
+
+
+def assert_travels(source):
+    """Other processes read a source and its scenes as this one does, and get no open files."""
+    scene = source.scenes("train")[0]
+    before = scene.images([1])
+    data = pickle.dumps((source, scene))
+    assert len(data) < 3000
+    source, scene = pickle.loads(data)  # noqa: S301
+    for copy in (scene, source.scenes("train")[0]):
+        assert_equal(copy.images([1]), before)
 
 
 def centred(photos):
@@ -181,27 +211,15 @@ def world_to_camera(c2w):
     return w, x, y, z, *w2c[:3, 3]
 
 
-def numbered_photos(path, count=10, size=(64, 48), cameras=({},), **top):
-    """Photos whose red channel is 10 times their number; `cameras` are what the first ones have
-    of their own."""
-    (path / "images").mkdir(exist_ok=True)
+def numbered_photos(path, count=10, size=(64, 48), cameras=(), **top):
+    """A row of photos whose red channel is 10 times their number."""
     given = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
-    content = row_of_frames(count, **given | top)
-    for frame, own in zip(content["frames"], cameras, strict=False):
-        frame.update(own)
-    for i in range(count):
-        Image.new("RGB", size, (10 * i, 50, 200)).save(path / f"images/{i}.png")
-    write_json(path / "transforms.json", content)
-    return path
+    images = [Image.new("RGB", size, (10 * i, 50, 200)) for i in range(count)]
+    return write_row(path, images, cameras=cameras, **given | top)
 
 
 def noisy_photos(folder, count=7, step=0.1):
     """Nerfstudio photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
-    (folder / "images").mkdir(parents=True)
-    random = np.random.default_rng(0)
-    for index in range(count):
-        pixels = random.integers(0, 256, (20, 24, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"images/{index}.png")
+    images = np.random.default_rng(0).integers(0, 256, (count, 20, 24, 3), dtype=np.uint8)
     camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
-    write_json(folder / "transforms.json", row_of_frames(count, step=step, **camera))
-    return folder
+    return write_row(folder, images, step, **camera)

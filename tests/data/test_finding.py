@@ -1,7 +1,7 @@
 """Photos that lie elsewhere, or are called otherwise, than their listing says."""
 
 import pytest
-from photo_formats import row_of_frames
+from photo_formats import encoded, put, row_of_frames
 from photo_formats import scene as read
 from PIL import Image
 from tables import must_not_find, must_refuse, rows, write_json
@@ -48,9 +48,7 @@ def spoon(tmp_path):
         folder = tmp_path / name
         for number in "012":
             for file in files:
-                path = folder / file.replace("N", number)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                Image.new("RGB", (40, 30)).save(path)
+                put(folder / file.replace("N", number), encoded(Image.new("RGB", (40, 30))))
         content = row_of_frames(3, fl_x=40, w=40, h=30)
         for number, frame in enumerate(content["frames"]):
             frame["file_path"] = listed.replace("N", str(number))

@@ -41,22 +41,25 @@ def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
     assert_equal(photos.images([0, 2, 1]), expected)
 
 
+def zeros_in(path, count):
+    """A member of a new archive."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("inside", bytes(count))
+    return UPath(f"zip:///::{path}") / "inside"
+
+
 def test_files_that_are_read_whole_have_a_limit(tmp_path):
     with (tmp_path / "huge.json").open("wb") as file:
         file.truncate(2 * 10**9)
     huge = UPath(tmp_path / "huge.json")
     must_refuse(r"huge\.json is larger than 50\.0 MB", read_json, huge, "", kind=OSError)
-    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("large", bytes(10**6))
-    member = UPath(f"zip:///::{tmp_path / 'a.zip'}") / "large"
+    member = zeros_in(tmp_path / "a.zip", 10**6)
     assert len(open_file(member).read()) == 10**6
-    must_refuse(r"large.*a\.zip is larger than 1\.0 kB", read_file, member, 1000, kind=OSError)
+    must_refuse(r"inside.*a\.zip is larger than 1\.0 kB", read_file, member, 1000, kind=OSError)
 
 
 def test_an_archive_that_another_thread_replaces_stays_open_while_it_is_read(tmp_path, monkeypatch):
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        archive.writestr("inside", bytes(10**5))
-    member = UPath(f"zip:///::{tmp_path / 'a.zip'}") / "inside"
+    member = zeros_in(tmp_path / "a.zip", 10**5)
     system = type(member.fs)
     whole = system._open
 

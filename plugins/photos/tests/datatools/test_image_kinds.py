@@ -6,10 +6,10 @@ import re
 import av
 import numpy as np
 import pytest
-from photo_formats import encoded, row_of_frames, scene
+from photo_formats import encoded, scene, turned, write_row
 from PIL import Image
 from qgs_photos.datatools.check import Options, check
-from tables import must_refuse, write_json
+from tables import must_refuse
 from upath import UPath
 
 SIZE = (4, 6)
@@ -23,13 +23,9 @@ MILLIMETRES = 1000 * METRES
 
 def photos(folder, files, key="file_path"):
     """Photos as they are read, and what is found of them. files: bytes by name, of each frame."""
-    listing = row_of_frames(len(files), fl_x=5.0, w=6, h=4)
-    (folder / "images").mkdir()
-    for frame, (name, data) in zip(listing["frames"], files.items(), strict=True):
-        (folder / frame["file_path"]).write_bytes(encoded(RGB))
+    write_row(folder, [RGB] * len(files), cameras=[{key: x} for x in files], fl_x=5.0, w=6, h=4)
+    for name, data in files.items():
         (folder / name).write_bytes(data)
-        frame[key] = name
-    write_json(folder / "transforms.json", listing)
     return scene(folder, SIZE), check(UPath(folder), Options(geometry=0)).findings
 
 
@@ -151,9 +147,7 @@ def test_what_is_refused_is_told_alike(method, tmp_path):
 
 
 def test_a_photo_mirrored_by_exif_keeps_its_stored_pixels_and_a_warning_names_it(tmp_path, caplog):
-    exif = Image.Exif()
-    exif[0x0112] = 2
-    data = encoded(RGB, exif=exif)
+    data = encoded(RGB, exif=turned(2))
     read, (finding,) = photos(tmp_path, {"a.png": data, "b.png": data})
     np.testing.assert_allclose(read.images([0])[0].movedim(0, -1) * 255, RGB, 1e-6)
     assert "EXIF orientation, which is ignored" in caplog.text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from photo_formats import encoded, scene
+from photo_formats import encoded, scene, turned
 from PIL import Image
 from planted import Room
 from qgs_photos.datatools.check import Options, check
@@ -43,12 +43,10 @@ def written(shots, tmp_path):
             stored_axes = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
             room.poses[:, :, :2] @= stored_axes
         room.camera |= lens
-        exif = Image.Exif()
-        exif[0x0112] = orientation
         masks = []
         for name, shot in zip(list(room.files), shots, strict=False):
             image = Image.fromarray(shot.image).transpose(transpose)
-            room.files[name] = encoded(image, exif=exif)
+            room.files[name] = encoded(image, exif=turned(orientation))
             masks.append(255 * (np.array(image)[..., 0] > 128).astype(np.uint8))
         room.mask(masks)
         room.write(tmp_path / f"{orientation} {listed}")
@@ -94,10 +92,8 @@ def test_packed_photos_are_upright(written, shots, tmp_path):
 
 
 def test_of_squares_a_warning_says_whose_cameras_they_have(tmp_path, caplog):
-    exif = Image.Exif()
-    exif[0x0112] = 6
     path = UPath(tmp_path / "square.png")
-    path.write_bytes(encoded(np.zeros((4, 4, 3), np.uint8), exif=exif))
+    path.write_bytes(encoded(np.zeros((4, 4, 3), np.uint8), exif=turned(6)))
     frame = upright(PhotoFrame("square.png", path, np.eye(4), INTRINSICS))
     assert frame.turns == 1
     assert "poses must belong to the stored pixels" in caplog.text

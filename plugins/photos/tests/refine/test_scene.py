@@ -27,7 +27,7 @@ from qgs_photos.refine.scene_photos import (
     judged_frames,
     sized,
 )
-from tables import must_refuse, names_in, quiet_console, read_json, rows
+from tables import must_refuse, names_in, read_json, rows, text_console
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
 from torch.testing import assert_close
@@ -128,7 +128,7 @@ def test_an_interrupt_before_the_optimisation_says_what_is_kept(photos, tmp_path
 
 def test_without_the_viewer_there_is_no_page(monkeypatch):
     monkeypatch.setitem(sys.modules, "qgs_viewer.page", None)
-    console = quiet_console()
+    console = text_console()
     assert page_writer(console) is None
     assert "pip install" in console.file.getvalue()
 
