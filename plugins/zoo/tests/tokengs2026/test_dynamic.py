@@ -25,8 +25,10 @@ SIZES = (
     "decoder.layer_scale=0.5 head.gaussians_per_query=2 head.init_std=0.5 supervision.layers=[2]"
 )
 SMALL = (
-    *("plugins=[tokengs2026, rooms]", "evaluation.tuning=queries"),
-    *(f"model.encoder={{{VIT}, layer_scale: 0.5}}", *(f"model.{x}" for x in SIZES.split())),
+    "plugins=[tokengs2026, rooms]",
+    "evaluation.tuning=queries",
+    f"model.encoder={{{VIT}, layer_scale: 0.5}}",
+    *(f"model.{size}" for size in SIZES.split()),
 )
 
 
