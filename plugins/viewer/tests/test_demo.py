@@ -247,7 +247,6 @@ def test_a_scale_can_be_set(room, tmp_path):
     assert source.views.scale == "auto"
     out = ("--out", tmp_path / "out")
     for words in (
-        ("reconstruct", MODEL, room, *out),
         ("demo", room, "--model", MODEL, *out),
         ("report", MODEL, "--photos", room, *out),
         ("view", MODEL, room),
