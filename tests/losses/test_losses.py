@@ -8,6 +8,7 @@ from losses.judging import CAMERAS, GOLDEN, PREDICTED, TRUTH, judged
 from tables import must_refuse
 from torch.testing import assert_close
 from training_runs import run, tiny
+from walk import pinhole
 
 from qgs.contracts import ModelDims, RecipeContext, ViewsConfig
 from qgs.data.samples import make_sample, stack_views
@@ -84,10 +85,9 @@ def test_options_of_visibility_that_cannot_work_are_refused():
 
 ROOMS = tiny("tokengs", "losses.depth={type: qgs/depth_surface, weight: 1.0}")
 POSE = torch.tensor([[0, 0, 1.0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-LENS = torch.tensor([2.0, 2.0, 3.0, 2.0])
 DEPTHS = torch.zeros(1, 1, 1, 4, 6)
 DEPTHS[..., 1, 2] = 2
-FROM = Cameras(POSE[None, None], LENS[None, None], (4, 6))
+FROM = pinhole(POSE[None], (2.0, 2.0, 3.0, 2.0), (4, 6))[None]
 WALL = Views(torch.zeros(1, 1, 3, 4, 6), FROM, depths=DEPTHS)
 """A turned camera of 4 x 6 pixels, one of which sees something."""
 SEEN_FROM_IT = torch.tensor([

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from itertools import count
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,28 +17,16 @@ NAN = float("nan")
 INF = float("inf")
 
 
-class Step:
-    """One step of a small model, of two batches, that can be broken in many places."""
-
-    def __init__(self, recipe):
-        self.model = recipe.build_model().train()
-        self.objective = TrainingPass(recipe, self.model)
-        self.batches = batches(recipe, 2, 2)
-        self.gradients = partial(
-            compute_gradients,
-            make_accelerator("cpu", unread=False),
-            self.objective,
-            recipe.training,
-            self.batches,
-        )
-
-    def first(self):
-        return first_bad_tensor(self.objective, self.batches, self.gradients)
-
-
 @pytest.fixture
 def step():
-    return Step(tiny("tokengs", "training.render_views=1"))
+    """One step of a small model, of two batches, that can be broken in many places."""
+    recipe = tiny("tokengs", "training.render_views=1")
+    drawn = batches(recipe, 2, 2)
+    objective = TrainingPass(recipe, recipe.build_model().train())
+    accelerator = make_accelerator("cpu", unread=False)
+    gradients = partial(compute_gradients, accelerator, objective, recipe.training, drawn)
+    first = partial(first_bad_tensor, objective, drawn, gradients)
+    return SimpleNamespace(objective=objective, batches=drawn, gradients=gradients, first=first)
 
 
 def told(step, tensor, batch):
@@ -67,7 +56,7 @@ def test_a_weight_comes_before_everything_and_data_is_named_with_its_batch(step)
     ):
         tensor.view(-1)[0] = NAN
         assert told(step, f"{name} (1 of {tensor.numel()} values, the first nan)", 1)
-    name, parameter = list(step.model.named_parameters())[5]
+    name, parameter = list(step.objective.model.named_parameters())[5]
     parameter.data.view(-1)[:2] = torch.tensor([NAN, INF])
     values = f"2 of {parameter.numel()} values, the first nan"
     assert told(step, f"weight model.{name} ({values})", 0)
@@ -93,7 +82,7 @@ def poisoned(x):
 
 def test_a_module_is_named_by_its_output_and_the_gradient_of_it(step, monkeypatch):
     """The head runs twice in a batch, after each of two layers."""
-    model = step.model
+    model = step.objective.model
     layer = model.decoder[1]
     across = "output of model.decoder.1.cross_attention"
     blank = lambda r: replace(r, depth=r.depth * NAN)  # noqa: E731
