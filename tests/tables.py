@@ -27,7 +27,7 @@ def rows(table, mark=" | "):
     return [line.split(mark) for line in table.strip().splitlines()]
 
 
-def quiet_console():
+def text_console():
     """A console of wide lines, whose text is that of its file."""
     return Console(file=io.StringIO(), width=300)
 

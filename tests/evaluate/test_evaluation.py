@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from line_scenes import judged_samples
-from tables import assert_equal, quiet_console
+from tables import assert_equal, text_console
 from training_runs import tiny
 
 from qgs.contracts import CONTRACT_VERSION, Column, ComponentConfig, Metric, Plugin
@@ -77,7 +77,7 @@ PARTLY = """{
 
 
 def shown(evaluation):
-    console = quiet_console()
+    console = text_console()
     evaluation.show(console)
     return console.file.getvalue()
 

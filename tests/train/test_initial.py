@@ -3,7 +3,7 @@
 import pytest
 import torch
 from safetensors.torch import load_file
-from tables import assert_equal, quiet_console
+from tables import assert_equal, text_console
 from torch.testing import assert_close
 from training_runs import tiny
 
@@ -89,7 +89,7 @@ def test_larger_patches_give_the_tokens_of_coarser_images(learned):
 def test_training_starts_from_a_run(trained_run, tmp_path):
     start = f"init_from={trained_run.folder.path}"
     still = ("optimizer.learning_rate=1e-9", "optimizer.weight_decay=0.0")
-    console = quiet_console()
+    console = text_console()
     grown = tiny("locus", "model.queries.count=32", start, *still)
     result = train(grown, tmp_path, device="cpu", console=console)
     before, after = (r.model.queries.center for r in (trained_run, result))

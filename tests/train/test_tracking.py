@@ -8,7 +8,7 @@ from unittest.mock import MagicMock
 
 import pytest
 from accelerate import PartialState
-from tables import must_refuse, quiet_console
+from tables import must_refuse, text_console
 from training_runs import TRAINED, resume, run, tiny
 
 from qgs.contracts import MissingExtraError
@@ -110,7 +110,7 @@ def test_a_resumed_run_goes_on_in_its_run_of_wandb(tmp_path, monkeypatch):
 
 
 def test_a_line_tells_how_much_of_the_budget_is_used():
-    console = quiet_console()
+    console = text_console()
     with TrainingProgress(console) as bar:
         bar.show(501, 0.1, 20.0, 0.501)
         bar.show(502, 0.1, 20.0, 0.502)  # a moment later

@@ -15,7 +15,7 @@ from qgs_research.studies.plan import planned
 from qgs_research.studies.results import Results
 from qgs_research.studies.runs import run_of
 from qgs_research.studies.study import read_study
-from tables import must_refuse, quiet_console
+from tables import must_refuse, text_console
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
 
 
 def trained(plan, workers):
-    console = quiet_console()
+    console = text_console()
     ended = running.train_missing(
         plan, plan.runs, workers=workers, threads=1, device="cpu", console=console
     )
