@@ -1,4 +1,4 @@
-"""`qgs` as a user types it, a model of one layer, and overrides that make recipes small."""
+"""`qgs` as a user types it, a recipe of one layer, and overrides that make recipes small."""
 
 import yaml
 from tables import read_json
@@ -7,14 +7,16 @@ from typer.testing import CliRunner
 import qgs
 from qgs.cli import app
 
-MODEL = yaml.safe_load("""
-width: 16
-heads: 2
-encoder: {type: qgs/multiview_vit, patch_size: 8, depth: 1}
-queries: {type: qgs/latent, count: 8, std: 1.0}
-decoder: {depth: 1}
-head: {type: qgs/gaussian_head, gaussians_per_query: 4}
-supervision: {type: qgs/layers, layers: [1]}
+ONE_LAYER = yaml.safe_load("""
+recipe: 1
+model:
+  width: 16
+  heads: 2
+  encoder: {type: qgs/multiview_vit, patch_size: 8, depth: 1}
+  queries: {type: qgs/latent, count: 8, std: 1.0}
+  decoder: {depth: 1}
+  head: {type: qgs/gaussian_head, gaussians_per_query: 4}
+  supervision: {type: qgs/layers, layers: [1]}
 """)
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
 
@@ -43,7 +45,7 @@ def saved(file, kind, **data):
         f"data={{type: {kind}, image_size: [16, 16]}}",
         *(f"data.{name}={value}" for name, value in data.items()),
     ]
-    qgs.save(qgs.compose({"recipe": 1, "model": MODEL}, overrides), file)
+    qgs.save(qgs.compose(ONE_LAYER, overrides), file)
     return file
 
 

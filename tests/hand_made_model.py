@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from commands import MODEL
+from commands import ONE_LAYER
 from walk import along_x, pinhole
 
 import qgs
@@ -20,7 +20,7 @@ OPTIONS = [
 @pytest.fixture
 def model():
     overrides = [f"model.{option}" for option in OPTIONS]
-    return qgs.compose({"recipe": 1, "model": MODEL}, overrides).eval()
+    return qgs.compose(ONE_LAYER, overrides).eval()
 
 
 @pytest.fixture

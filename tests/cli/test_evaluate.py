@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from commands import MODEL, done, run_qgs
+from commands import ONE_LAYER, done, run_qgs
 from photo_formats import noisy_photos
 from PIL import Image
 from tables import contents, must_refuse, read_json, write_json
@@ -106,7 +106,7 @@ def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path
         Image.fromarray(90 + rng.integers(0, 9, (20, 24, 3), np.uint8)).save(file)
     data = f"data={{type: qgs/photos, path: {tmp_path}, image_size: [16, 16], holdout: 3}}"
     views = "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}"
-    model = qgs.compose({"recipe": 1, "model": MODEL}, [data, views])
+    model = qgs.compose(ONE_LAYER, [data, views])
     model.head.linear.bias.data.unflatten(0, (-1, 14))[:, 6:9] = 5.0
     domain = '{"samples": 4, "ranges": {"baseline": [0, 9]}}'
     qgs.save(model, tmp_path / "checkpoint.safetensors", extra={"trained_on": domain})

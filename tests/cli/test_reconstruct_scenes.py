@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from commands import MODEL
+from commands import ONE_LAYER
 from photo_formats import centred, opened, synthetic, write_llff, write_nerfstudio
 from PIL import Image
 from qgs_photos.datatools import packing
@@ -19,11 +19,11 @@ WHOLE = (16, 24)
 
 def recipe(kind, **options):
     data = {"type": kind, "image_size": [*SIZE], **options}
-    return resolve({"recipe": 1, "model": MODEL, "data": data}, ["plugins=[rooms, datasets]"])
+    return resolve(ONE_LAYER | {"data": data}, ["plugins=[rooms, datasets]"])
 
 
 ROOMS = recipe("rooms/procedural")
-NO_DATA = resolve({"recipe": 1, "model": MODEL})
+NO_DATA = resolve(ONE_LAYER)
 
 
 def chosen(trained, path, size=None, name=None):

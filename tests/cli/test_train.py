@@ -5,7 +5,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
-from commands import MODEL, done, sets
+from commands import ONE_LAYER, done, sets
 from tables import contents, must_not_find, names_in
 
 from qgs.cli.train import with_absolute_path
@@ -68,7 +68,7 @@ def test_what_is_missing_is_told_before_training(here):
 
 def test_paths_become_absolute_and_urls_stay(here):
     zipfile.ZipFile("photos.zip", "w").close()
-    recipe = {"recipe": 1, "model": MODEL, "plugins": ["rooms"]}
+    recipe = ONE_LAYER | {"plugins": ["rooms"]}
     for path, absolute in (
         ("../photos", f"{here.parent}/photos"),
         ("~/photos", f"{Path.home()}/photos"),

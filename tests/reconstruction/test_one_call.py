@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 import yaml
-from commands import MODEL
+from commands import ONE_LAYER
 from photo_formats import noisy_photos, scene
-from tables import must_refuse
+from tables import must_not_find, must_refuse
 from torch.testing import assert_close
 from varying_head import VaryingHead
 
@@ -18,11 +18,10 @@ from qgs.renderers import AutoRenderer
 from qgs.types import Views
 
 REST = """
-recipe: 1
 data: {type: qgs/photos, path: nowhere, image_size: [16, 24]}
 views: {inputs: 1, scale: distance, scale_factor: 0.5}
 """
-RECIPE = {"model": MODEL, **yaml.safe_load(REST)}
+RECIPE = ONE_LAYER | yaml.safe_load(REST)
 POSE = look_at(
     torch.tensor([7.0, -3, 0.5]), torch.tensor([-1, 0.3, 0.1]), torch.tensor([0.0, 0, -1])
 )
@@ -102,4 +101,4 @@ def test_photos_are_read_in_their_own_world_and_size(photos):
     few = qgs.read_photos(photos, size=(10, 12), frames=["2.png", 0])
     assert few.images.shape == (1, 2, 3, 10, 12)
     assert few.cameras.c2w[0, :, 0, 3].tolist() == [10, 0]
-    must_refuse("nothing", qgs.read_photos, photos / "nothing", kind=FileNotFoundError)
+    must_not_find("nothing", qgs.read_photos, photos / "nothing")

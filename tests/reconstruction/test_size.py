@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from commands import MODEL
+from commands import ONE_LAYER
 from photo_formats import centred, synthetic, write_nerfstudio
 from walk import Walk, arc, pinhole
 
@@ -80,7 +80,7 @@ def test_a_sample_without_targets_is_halved_and_a_moving_scene_is_not(monkeypatc
 def test_photos_are_never_enlarged_nor_larger_than_256(tmp_path, trained, stored, expected):
     write_nerfstudio(tmp_path, centred(synthetic(tmp_path / "photos", 4, stored)))
     data = {"type": "rooms/procedural", "image_size": [trained, trained]}
-    recipe = resolve({"recipe": 1, "plugins": ["rooms"], "model": MODEL, "data": data})
+    recipe = resolve(ONE_LAYER | {"plugins": ["rooms"], "data": data})
     scene, _ = chosen_scene(recipe, str(tmp_path), None, None)
     assert scene.cameras.size == expected
     half = [side // 2 for side in expected]

@@ -5,7 +5,7 @@ from functools import cache
 
 import torch
 import yaml
-from commands import MODEL
+from commands import ONE_LAYER
 from qgs_dev.case import seeded
 from qgs_viewer.opening import ModelSource
 from qgs_viewer.scenes import scenes_of
@@ -23,13 +23,12 @@ BY_DISTANCE = VIEWS.model_copy(update={"scale": "distance", "scale_factor": 0.7}
 KINDS = ("tokengs", "locus", "ellipsoid")
 PAIR = KINDS[:2]
 REST = """
-recipe: 1
 plugins: [rooms]
 data: {type: rooms/procedural, image_size: [16, 16], test_scenes: 3}
 views: {inputs: 2, targets: 2, gap: [2, 4], scale_factor: 0.4}
 evaluation: {scenes: 2}
 """
-RECIPE = {"model": MODEL, **yaml.safe_load(REST)}
+RECIPE = ONE_LAYER | yaml.safe_load(REST)
 """Of a model that takes no time, with rooms of its own."""
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import rich.text
-from commands import MODEL
+from commands import ONE_LAYER
 from safetensors.numpy import save_file
 
 from qgs.cli import GROUP, main
@@ -18,7 +18,7 @@ NAME = "a\x1b[2J\u202eb\x9bc\rd\x07"
 RAW = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 RECIPE = f"""
 recipe: 1
-model: {json.dumps(MODEL)}
+model: {json.dumps(ONE_LAYER["model"])}
 plugins: [rooms]
 data: {{type: rooms/procedural, image_size: [16, 16], test_scenes: 1}}
 views: {{inputs: 2, targets: 2, gap: [2, 4]}}
