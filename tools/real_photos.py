@@ -15,6 +15,7 @@ import argparse
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -24,6 +25,7 @@ import torch.nn.functional as F
 from kornia.geometry.transform import warp_perspective
 from qgs_photos.datasets.view_samplers import apart
 from qgs_photos.refine import refine
+from qgs_research.studies.tables import markdown_table
 from qgs_viewer.comparison import recipes_alike, spread_windows
 from torch import Tensor
 
@@ -46,10 +48,8 @@ def main() -> None:
     options = parsed()
     torch.set_num_threads(options.threads)
     rows: list[Row] = []
-    for name in options.model:
-        for photos in options.photos:
-            for distance in options.distances:
-                rows += scene_rows(name, photos, distance, options)
+    for given in product(options.model, options.photos, options.distances):
+        rows += scene_rows(*given, options)
     print(table(rows))
     if options.out:
         options.out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
@@ -153,12 +153,11 @@ def table(rows: Sequence[Row]) -> str:
         window = (row["scene"], row["inputs"], row["targets"])
         if window not in [(other["scene"], other["inputs"], other["targets"]) for other in whole]:
             whole.append(row)
-    heads = ["model", "scene", "distance", "windows", *scores]
-    lines = [heads, ["---"] * len(heads)]
+    lines = [["model", "scene", "distance", "windows", *scores]]
     for names, part in sorted(groups.items()):
         means = [f"{mean(row[score] for row in part):.3f}" for score in scores]
         lines.append([*names, str(len(part)), *means])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown_table(lines)
 
 
 if __name__ == "__main__":

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
+from qgs_dev.vocabulary import scene
 from qgs_locus.fields import CENTER
 from qgs_locus.visibility import AnchorVisibility
 from torch import Tensor
 
 from published.files import EXPECTED, GoldenFile
-from qgs.containers import map_tensors
 from qgs.contracts import Loss
 from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
@@ -103,14 +103,11 @@ def whole_loss(
     Both are given for each scene and in total. has_mask: (B,), True for scenes whose mask is
     supervised. ssim: weight of the SSIM term.
     """
-    scenes = [
-        [map_tensors(lambda x, one=slice(n, n + 1): x[one], part) for part in given]
-        for n in range(len(has_mask))
-    ]
+    scenes = [scene(given, n) for n in range(len(has_mask))]
     per_scene = {}
     total = torch.zeros(len(has_mask))
     for name, weight, loss in terms_of(release, options, ssim):
-        values = torch.stack([value(loss, (*scene,)) for scene in scenes])
+        values = torch.stack([value(loss, one) for one in scenes])
         per_scene[name] = values * has_mask if name == "loss_mask" else values
         total = total + weight * per_scene[name]
     _, rendering, target = given

@@ -110,8 +110,7 @@ def watch(kept: Recorder, model: QueryGaussianModel) -> None:
     """Record the outputs of modules inside the encoder and the decoder layers."""
     encoder = model.encoder
     assert isinstance(encoder, PatchViT)
-    first = encoder.blocks[0] if len(encoder.blocks) else encoder.get_submodule("norm")
-    kept.input("encoder_in", first)
+    kept.input("encoder_in", encoder.blocks[0])
     if isinstance(encoder, LatentBottleneck):
         kept.input("encoder_features", encoder.feature_kv_proj)
         kept.input("scene_latents.0", encoder.latent_blocks[0])
