@@ -5,14 +5,13 @@ import torch
 from qgs.types import Cameras, Views
 
 
-def odd_views(count=2, height=16, width=16, scenes=2, seed=0, dtype=torch.float32):
-    """Noise; cameras are turned and moved a little, each with a lens of its own, off centre."""
+def odd_views(count=2, height=16, width=16, scenes=2, seed=0):
+    """Noise; cameras are turned and moved a little, with unequal focal lengths, off centre."""
     generator = torch.Generator().manual_seed(seed)
     turns = 0.1 * torch.randn(scenes, count, 3, 3, generator=generator)
-    c2w = torch.eye(4).double().repeat(scenes, count, 1, 1)
-    c2w[..., :3, :3] = torch.linalg.matrix_exp((turns - turns.mT).double())
+    c2w = torch.eye(4).repeat(scenes, count, 1, 1)
+    c2w[..., :3, :3] = torch.linalg.matrix_exp(turns - turns.mT)
     c2w[..., :3, 3] = 0.2 * torch.randn(scenes, count, 3, generator=generator)
     lens = torch.tensor([0.9 * width, width, width / 2 - 0.5, height / 2 + 0.5])
-    lens = lens * (0.95 + 0.1 * torch.rand(scenes, count, 4, generator=generator))
     images = torch.rand(scenes, count, 3, height, width, generator=generator)
-    return Views(images, Cameras(c2w, lens, (height, width))).to(dtype)
+    return Views(images, Cameras(c2w, lens.expand(scenes, count, 4), (height, width)))

@@ -4,7 +4,6 @@ import math
 
 import torch
 import torch.nn.functional as F
-from odd_views import odd_views
 from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters, FramedRefinement
 from qgs_anchors.landmark.neighbours import NeighbourAttention
 from qgs_anchors.landmark.observed import ObservedQueries
@@ -15,11 +14,11 @@ from small_parts import made, shaken
 from torch.testing import assert_close
 
 from qgs.geometry.rays import camera_rays
-from qgs.geometry.transforms import to_camera
+from qgs.geometry.transforms import quat_to_matrix, to_camera
 from qgs.recipe import resolve
 from qgs.tokengs.blocks import split_heads
 from qgs.train.initial import initialise
-from qgs.types import ImageMemory, QueryState, Rendering, Views
+from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 
 GRID = (2, 4, 6)
 SIZE = (16, 24)
@@ -34,12 +33,13 @@ def drawn(seed, *shape):
 
 
 LENS = torch.tensor([20.0, 20.0, 12.5, 7.5]).double()
-ODD = odd_views(2, *SIZE, dtype=torch.float64)
-VIEWS = ODD.replace(cameras=ODD.cameras.replace(intrinsics=LENS.expand(2, 2, 4)))
+C2W = torch.eye(4).double().repeat(2, 2, 1, 1)
+C2W[..., :3, :3] = quat_to_matrix(F.normalize(drawn(6, 2, 2, 4), dim=-1))
+C2W[..., :3, 3] = drawn(7, 2, 2, 3)
+VIEWS = Views(drawn(0, 2, 2, 3, *SIZE).sigmoid(), Cameras(C2W, LENS.expand(2, 2, 4), SIZE))
 """Two scenes of two photos, the cameras turned and moved."""
 HALVED = Views(
-    F.avg_pool3d(VIEWS.images, (1, 2, 2)),
-    VIEWS.cameras.replace(intrinsics=LENS.expand(2, 2, 4) / 2, size=(8, 12)),
+    F.avg_pool3d(VIEWS.images, (1, 2, 2)), Cameras(C2W, VIEWS.cameras.intrinsics / 2, (8, 12))
 )
 MEMORY = ImageMemory(drawn(1, 2, TOKENS, 16), grid=GRID)
 

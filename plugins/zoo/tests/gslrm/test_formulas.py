@@ -15,6 +15,7 @@ from qgs_zoo.gslrm.pixels import (
     patch_rays_at,
 )
 from qgs_zoo.parts import pixel_rays
+from refusals import refused
 from small_parts import attended, made
 from torch.testing import assert_close
 
@@ -47,14 +48,14 @@ def test_rays_of_a_patch_are_spread_evenly():
 
 def test_means_lie_on_the_rays_of_their_pixels():
     """And gradients of what queries know of rays reach the cameras."""
-    given = odd_views(3, 8, 12, dtype=torch.float64)
+    given = odd_views(3, 8, 12)
     memory = ImageMemory(torch.randn(2, 18, 16), grid=GRID)
     queries = made(PixelQueries)
     c2w = given.cameras.c2w.requires_grad_()
     state = queries(memory, given)
     assert state.features is memory.features
     assert queries.count is None
-    offsets = 3 * torch.randn(2, 18, P * P, 3).double()
+    offsets = torch.randn(2, 18, P * P, 3) * 3
     w = torch.sigmoid(offsets.sum(-1, keepdim=True) / 3)
     origins, directions = map(in_patches, camera_rays(given.cameras))
     ahead = c2w[..., :3, 2].repeat_interleave(6, 1)[:, :, None]
@@ -66,6 +67,11 @@ def test_means_lie_on_the_rays_of_their_pixels():
             assert_close(placed, origins + along * directions)
     state[PATCH].sum().backward()
     assert c2w.grad[..., :3, :].any(-1).all()
+
+
+def test_the_end_is_beyond_the_beginning():
+    override = "model.centers={type: gslrm/along_rays, near: 4, far: 4}"
+    assert refused("tiny/gslrm.yaml", [override]).option == "model.centers.far"
 
 
 def test_the_transformer_sees_nine_channels_of_every_pixel():
