@@ -53,7 +53,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Batch:
-    """Batch of B samples: views (B, V_in) and (B, V_out), with the names of their scenes.
+    """Batch of B samples: views (B, V_in) and (B, V_out), with names of scenes and frame numbers.
 
     V_in and V_out are the numbers of input views and target views. Tensors are float32 and
     contiguous.
@@ -62,8 +62,8 @@ class Batch:
     inputs: Views
     targets: Views
     scenes: tuple[str, ...]
-    drawn: tuple[str, ...]
-    """Texts for messages that name the scene, the input frames and the target frames."""
+    input_frames: tuple[Frames, ...]
+    target_frames: tuple[Frames, ...]
     left_out: tuple[str, ...] = ()
     """Messages about samples that failed and were replaced: scene, frame and reason."""
 
@@ -261,15 +261,12 @@ def collate(samples: Sequence[Sample]) -> Batch:
             f"a batch mixes scenes with times and scenes without times ({listed(still)}): write "
             "'time' for the frames of all scenes, or of no scene"
         )
-    drawn = (
-        f"scene {s.scene!r} (inputs {[*s.input_frames]}, targets {[*s.target_frames]})"
-        for s in samples
-    )
     return Batch(
         inputs=stack_views([sample.inputs for sample in samples]),
         targets=stack_views([sample.targets for sample in samples]),
         scenes=tuple(sample.scene for sample in samples),
-        drawn=tuple(drawn),
+        input_frames=tuple(sample.input_frames for sample in samples),
+        target_frames=tuple(sample.target_frames for sample in samples),
     )
 
 

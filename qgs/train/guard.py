@@ -328,8 +328,7 @@ def first_bad_tensor(
             bad = tensor[~tensor.isfinite()]
             if bad.numel() and not found:
                 values = f"{bad.numel()} of {tensor.numel()} values, the first {bad[0].item()}"
-                drawn = ", ".join(batch.drawn)
-                found.append(f"the first bad tensor is {path} ({values}), with {drawn}")
+                found.append(f"the first bad tensor is {path} ({values}), with {_samples(batch)}")
 
     def see_batch(module: nn.Module, arguments: Sequence[Any]) -> None:
         nonlocal batch
@@ -360,3 +359,11 @@ def first_bad_tensor(
         for handle in handles:
             handle.remove()
     return "".join(found)
+
+
+def _samples(batch: Batch) -> str:
+    drawn = zip(batch.scenes, batch.input_frames, batch.target_frames, strict=True)
+    return ", ".join(
+        f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
+        for scene, inputs, targets in drawn
+    )

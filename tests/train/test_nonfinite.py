@@ -31,9 +31,10 @@ def step():
 
 def told(step, tensor, batch):
     """Whether the words about a step begin with the tensor, and name the samples of the batch."""
-    drawn = ", ".join(step.batches[batch].drawn)
+    drawn = step.batches[batch]
     words = step.first()
-    return words.startswith(f"the first bad tensor is {tensor}") and words.endswith(drawn)
+    parts = (f"scene {drawn.scenes[0]!r}", f"targets {list(drawn.target_frames[0])}")
+    return words.startswith(f"the first bad tensor is {tensor}") and all(p in words for p in parts)
 
 
 def test_a_good_step_shows_nothing_and_keeps_no_hook(step):
