@@ -236,7 +236,7 @@ def scene_depth(scene: Scene) -> float:
     return depth or extent or 1.0
 
 
-def seen_depth(scene: Scene, frames: Frames) -> float:
+def seen_depth(scene: Scene, frames: Sequence[int]) -> float:
     """Return the median depth of what `frames` show, in the scene's unit; 0 if it is unknown.
 
     It comes from depth maps, else from a plane sweep, else it is the depth of the point that the

@@ -101,7 +101,7 @@ def test_poses_that_came_with_the_photos_are_looked_at(taken, photos_of_scene, t
     photos = ScenePhotos(str(stray), Options())
     assert len(photos.small) == 8
     (fault,) = faults_of_given_poses(photos)
-    assert fault.names == ("images/2.png",)
+    assert [name for _, name, _ in fault.photos] == ["images/2.png"]
     # COLMAP makes the poses of a video in a folder beside it
     photos.path = str(tmp_path / "walk.mp4")
     (tmp_path / "walk.mp4").touch()

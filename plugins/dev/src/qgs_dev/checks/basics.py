@@ -117,7 +117,7 @@ def _expected_shapes(trial: Trial, sizes: Sizes) -> dict[str, list[int]]:
     maker.axes["M"] = ANY
     # Queries have their own number, whatever the sizes of the inputs.
     if case.slot == "queries":
-        maker.axes["N"] = trial.module.count
+        maker.axes["N"] = trial.module.count or ANY
     if case.slot == "head":
         maker.axes["K"] = trial.module.gaussians_per_query
     fixed = FACTS[case.slot].get("shapes", {"output": "BND"})

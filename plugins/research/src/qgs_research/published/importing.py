@@ -28,6 +28,7 @@ from qgs_research.published.layouts import (
     names_of,
     recognise,
 )
+from qgs_research.published.weight_layout import WeightLayout
 
 TORCH = (".pt", ".pth", ".bin", ".ckpt")
 NESTING = ("model", "state_dict", "module")
@@ -148,13 +149,8 @@ def import_weights(
     if recipe is None:
         layout, tree = fitting_recipe(shapes, str(weights))
         recipe = resolve(tree, overrides)
-        lines = [
-            f"# Derived from {file.path.name}, weights of {layout.name} ({layout.source}).",
-            "# Shapes do not determine these options; the published values are used:",
-            *(f"#   {choice}" for choice in layout.undecided),
-            *(f"# Overridden: {override}" for override in overrides),
-        ]
-        text = "\n".join([*lines, dump(dict(recipe.tree if overrides else tree))])
+        head = _head(file, layout, overrides)
+        text = "\n".join([*head, dump(dict(recipe.tree if overrides else tree))])
     names = names_of(recipe)
     tensors, converted = _as_float32(file, names)
     # Weights do not show activations, so report where the recipe differs from the published one.
@@ -182,6 +178,16 @@ def import_weights(
     if recipe_file:
         report.append(f"wrote {recipe_file}; its head lists options that weights do not determine")
     return report
+
+
+def _head(file: WeightFile, layout: WeightLayout, overrides: Sequence[str]) -> Sequence[str]:
+    """Return lines of YAML that say what a derived recipe rests on."""
+    return [
+        f"# Derived from {file.path.name}, weights of {layout.name} ({layout.source}).",
+        "# Shapes do not determine these options; the published values are used:",
+        *(f"#   {choice}" for choice in layout.undecided),
+        *(f"# Overridden: {override}" for override in overrides),
+    ]
 
 
 def _without_prefix(file: WeightFile) -> WeightFile:
