@@ -29,6 +29,7 @@ WORDS = {
     "turn": "their axes differ by {} degrees",
     "depth": "the point they look at is {} away",
     "fov": "their field of view is {} degrees wide",
+    "side": "the shorter side of their images has {} pixels",
 }
 """Phrases for messages, by name of a measurement of a sample's cameras; lengths in model units."""
 REMEDY = "try another scale of the world, other input views, or train on views like these"
@@ -51,7 +52,7 @@ class Domain:
         """Measure the cameras of a sample, (1, V) in the model's frame, and add the values."""
         # In float32 a cosine near 1 is off by angles of 0.02 degrees.
         c2w = inputs.c2w[0].double()
-        measured = {"views": [float(len(c2w))]}
+        measured = {"views": [float(len(c2w))], "side": [float(min(inputs.size))]}
         # Distances and axes only for several inputs.
         if len(c2w) > 1:
             places = c2w[:, :3, 3]
@@ -133,8 +134,8 @@ def verdict(trained: Domain, found: Domain) -> str:
             f"Expect a worse result; {REMEDY}"
         )
     return (
-        "the cameras lie within the range of the training, in distance, direction, depth and field "
-        "of view; the content of the photos may still be new to the model"
+        "the cameras lie within the range of the training, in distance, direction, depth, field of "
+        "view and image size; the content of the photos may still be new to the model"
     )
 
 

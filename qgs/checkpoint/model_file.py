@@ -142,6 +142,11 @@ class CheckpointFile(TensorFile):
         load_weights(model, self.tensors, self.path)
         follow(model.modules(), END if self.step is None else self.step)
         model.trained_on = self.domain
+        data = self.recipe.data_config
+        # Older files do not record the image sizes of their training.
+        if data and self.domain.values:
+            sizes = (data.image_size, *self.recipe.training.image_sizes)
+            self.domain.values.setdefault("side", [float(min(size)) for size in sizes])
         local = Path(self.name).expanduser().exists()
         model.loaded_from = str(self.path.resolve()) if local else self.name
         return (model if device is None else model.to(device)).eval()

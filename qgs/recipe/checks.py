@@ -4,8 +4,9 @@ Each field of the model's state must be written before a component reads it, in 
 forward pass.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from itertools import product
 from typing import Any
 
 from qgs.contracts import (
@@ -33,8 +34,8 @@ def check(draft: Draft, problems: Problems) -> Parts:
     Sublayers that no decoder layer uses are left out. Raises RecipeError with all problems.
     """
     parts = _without_idle_sublayers(draft, problems)
-    context = _context(draft)
-    sound = [_check_options(part, context, problems) for part in parts.values()]
+    contexts = _contexts(draft)
+    sound = [_check_options(part, contexts, problems) for part in parts.values()]
     if all(sound):
         check_flow(parts, draft.dims.depth, draft.registry, problems)
     for path, reason, fix in _contradictions(draft, parts):
@@ -44,16 +45,20 @@ def check(draft: Draft, problems: Problems) -> Parts:
     return parts
 
 
-def _context(draft: Draft) -> RecipeContext:
+def _contexts(draft: Draft) -> Sequence[RecipeContext]:
+    """Return a context for each image size of the data and of the training."""
     data: Any = draft.parts.get(("data",))
     if data is None:
-        return RecipeContext(draft.dims)
+        return [RecipeContext(draft.dims)]
     source = data.config
     size = source.image_size if isinstance(source, SceneSourceConfig) else None
-    return RecipeContext(draft.dims, size, draft.settings.views.inputs, data.component.tells_times)
+    inputs = draft.settings.views.inputs
+    times = data.component.tells_times
+    sizes = (size, *draft.settings.training.image_sizes)
+    return [RecipeContext(draft.dims, each, inputs, times) for each in sizes]
 
 
-def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
+def _check_options(chosen: Chosen, contexts: Sequence[RecipeContext], problems: Problems) -> bool:
     """Report problems of a component's options; return False if a method of the component fails.
 
     Otherwise returns True, even if there are problems.
@@ -72,7 +77,7 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
         called = "problems"
         # A scheduled option must be valid at every extreme of its schedule.
         found: dict[Problem, None] = {}
-        for options in (config, *chosen.later):
+        for options, context in product((config, *chosen.later), contexts):
             found |= dict.fromkeys(component.problems(options, context))
     # Code of a plugin may raise anything.
     except Exception as error:

@@ -186,6 +186,9 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
+    # A size that was found better needs no warning.
+    if result.size:
+        del found.values["side"]
     remarks = (
         result.scale.poor if result.scale else "",
         result.worse_than_nearest,

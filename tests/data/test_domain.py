@@ -11,7 +11,7 @@ from line_scenes import DOWN, judged_samples
 from training_runs import resume, run, stream_of, tiny
 from walk import along_x, pinhole
 
-from qgs.checkpoint.model_file import CheckpointFile, save
+from qgs.checkpoint.model_file import CheckpointFile, load, save
 from qgs.checkpoint.tensors import CheckpointError
 from qgs.data import stream
 from qgs.data.stream import trained_domain
@@ -49,6 +49,7 @@ def test_what_is_measured():
     assert found["turn"] == pytest.approx([2 * math.degrees(math.atan(0.25))] * 2, rel=1e-3)
     assert found["depth"] == pytest.approx([math.sqrt(4.25)] * 2, rel=1e-3)
     assert found["fov"] == pytest.approx((90, 90))
+    assert found["side"] == (32, 32)
 
 
 def test_axes_that_do_not_meet_before_the_cameras_look_infinitely_far():
@@ -70,6 +71,13 @@ def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_train
         mixed = domain(*[PAIR] * (100 - few), *[PARALLEL] * few)
         assert mixed.ranges["depth"] == pytest.approx((2.062, largest))
     assert "look at is infinitely far" in str(mixed.differences(domain(PARALLEL)))
+
+
+def test_a_file_without_image_sizes_has_those_of_its_recipe(tmp_path):
+    file = tmp_path / "a.safetensors"
+    older = '{"samples": 1, "ranges": {"fov": [50, 60]}}'
+    save(recipe("training.image_sizes=[[16,24],[32,32]]").build_model(), file, extra={KEY: older})
+    assert load(file).trained_on.ranges == {"fov": (50, 60), "side": (16, 32)}
 
 
 def test_a_damaged_domain_is_one_error_with_the_file(tmp_path):
