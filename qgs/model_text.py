@@ -44,11 +44,10 @@ def model_text(model: Any) -> str:
 
 def heading(model: Any) -> str:
     """Return one line: the model's class, device, and numbers of parameters, layers and queries."""
-    tree = (model.recipe or {}).get("model", {})
-    options = {**tree.get("queries", {}), **tree.get("head", {})}
     parts = [f"{_count(model):,} parameters", f"{len(model.decoder)} decoder layers"]
-    if {"count", "gaussians_per_query"} <= options.keys():
-        parts.append(f"{options['count']:,} queries of {options['gaussians_per_query']} Gaussians")
+    # Queries that depend on the photos have no number of their own.
+    if count := model.queries.count:
+        parts.append(f"{count:,} queries of {model.head.gaussians_per_query} Gaussians")
     device = next((parameter.device for parameter in model.parameters()), "cpu")
     return f"{type(model).__name__}: {', '.join(parts)}, on {device}"
 

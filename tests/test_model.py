@@ -57,3 +57,4 @@ def test_a_model_says_its_slots_in_a_few_lines():
     cells = r"^  decoder\.cross_attention +qgs/content, locus/ray_biased +[\d,]+$"
     assert re.search(cells, repr(model), re.M)
     assert sum(int(line.split()[-1].replace(",", "")) for line in lines[:10]) == total
+    assert "queries of" not in repr(qgs.compose("tiny/landmark.yaml", device="meta"))
