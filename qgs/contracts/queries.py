@@ -62,11 +62,8 @@ class LearnedQueries(Queries):
     """Queries whose initial state depends only on parameters, so it is the same in all scenes."""
 
     reads_cameras = False
-
-    @property
-    def count(self) -> int:
-        """Number N of queries: the option `count`."""
-        return getattr(self.config, "count")  # noqa: B009 (an option of subclasses)
+    count: int  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Number N of queries: the option `count`, which subclasses have."""
 
     @abstractmethod
     def start(self, batch_size: int) -> QueryState:

@@ -84,7 +84,8 @@ def make_sample(
     Depths are 0 (unknown) in views with noisy poses, because they do not fit the moved camera.
     """
     world = own_world(scene, input_frames, views)
-    both = views_in(world, scene, (*input_frames, *target_frames), depths)
+    frames = (*input_frames, *target_frames)
+    both = views_in(world, scene, frames, depths)
     count = len(input_frames)
     if both.times is not None:
         both = replace(both, target_time=_asked(both.times, count))
@@ -94,7 +95,7 @@ def make_sample(
         if both.depths is not None:
             both.depths[:, 1:count] = 0
     both = mirrored_views(both) if mirror else both
-    names = {frame: scene.frame_name(frame) for frame in (*input_frames, *target_frames)}
+    names = {frame: scene.frame_name(frame) for frame in frames}
     return Sample(
         scene=scene.name,
         inputs=both.select(slice(0, count)),
