@@ -94,24 +94,20 @@ class QueryGaussianModel(nn.Module):
         # NumPy's cameras are float64, the weights hardly ever.
         views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))
         if isinstance(views, Photos):
-            views = self._without_cameras(views)
+            readers = [
+                type(part).__name__
+                for part in (self.encoder, self.queries, self.feedback)
+                if part.reads_cameras
+            ]
+            if readers:
+                raise ValueError(
+                    f"{' and '.join(readers)} of this model need cameras, but these photos have "
+                    "none; give Views with cameras, or use components with `reads_cameras = False`"
+                )
+            # Photos have all other fields that are read.
+            views = cast(Views, views)
         memory = self.encoder(views)
         return self.predict(views, memory, self.queries(memory, views), layers)
-
-    def _without_cameras(self, photos: Photos) -> Views:
-        """Return `photos` typed as Views; raise ValueError if the model needs cameras."""
-        readers = [
-            type(part).__name__
-            for part in (self.encoder, self.queries, self.feedback)
-            if part.reads_cameras
-        ]
-        if readers:
-            raise ValueError(
-                f"{' and '.join(readers)} of this model need cameras, but these photos have none; "
-                "give Views with cameras, or use components with `reads_cameras = False`"
-            )
-        # Photos have all other fields that are read.
-        return cast(Views, photos)
 
     def predict(
         self,
