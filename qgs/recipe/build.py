@@ -17,7 +17,6 @@ from qgs.contracts import (
     LayerParts,
     ModelComponent,
     Optimizer,
-    OptimizerConfig,
     Refinement,
     SceneSource,
 )
@@ -178,12 +177,12 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
     Raises RecipeError for a pattern that matches no parameter. Patterns for `losses` are not
     checked if `module` is a model.
     """
-    config = optimizer.config
+    config: Any = optimizer.config
     model = next(m for m in module.modules() if isinstance(m, QueryGaussianModel))
     factors = {name: 1.0 for name, _ in module.named_parameters()}
     paths = {name: _paths(name.removeprefix("model."), model) for name in factors}
     problems = Problems()
-    for pattern, factor in config.parts.items() if isinstance(config, OptimizerConfig) else ():
+    for pattern, factor in config.parts.items():
         fits = partial(matches, pattern, below=True)
         named = [name for name in factors if any(map(fits, paths[name]))]
         factors |= dict.fromkeys(named, factor)
