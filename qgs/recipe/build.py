@@ -185,7 +185,7 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
     for pattern, factor in config.parts.items():
         fits = partial(matches, pattern, below=True)
         named = [name for name in factors if any(map(fits, paths[name]))]
-        factors |= dict.fromkeys(named, factor)
+        factors |= dict.fromkeys(named, float(factor))
         # The trained module has the model as `model`, a recipe its parts in the section `model`.
         wanted = pattern.removeprefix("model.").split(".")
         if not named and (module is not model or wanted[0] != "losses"):
