@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, PositiveFloat
+from pydantic import NegativeFloat, PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -54,7 +54,7 @@ class RayBiasedCrossAttention(ContentCrossAttention):
         sigma_sq_min: PositiveFloat = 1e-3
         """Lower bound of sigma^2 = (sigma0 r)^2, world units squared. r is the anchor's
         radius."""
-        bias_min: float = Field(default=-20.0, lt=0)
+        bias_min: NegativeFloat = -20.0
         """Lower bound of the bias b, before it is multiplied by gamma."""
         direction_eps: PositiveFloat = 1e-6
         """Lower bound of the length by which a patch's mean ray direction is divided to normalise
