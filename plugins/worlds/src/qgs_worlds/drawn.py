@@ -85,6 +85,17 @@ class DrawnScene(Scene):
         depths = cast(self.tables, self.c2w[list(frames)], self.lens, self._config.image_size)
         return torch.from_numpy(np.where(np.isfinite(depths), depths, 0))[:, None] * self.scale
 
+    def painted(
+        self, frames: list[int], paint: Callable[..., None], kind: type[np.number]
+    ) -> np.ndarray:
+        """Return images (len(frames), H, W, 3) of type `kind` that the kernel `paint` colours."""
+        from qgs_worlds.caster.casting import cast
+
+        size = self._config.image_size
+        images = np.empty((len(frames), *size, 3), kind)
+        cast(self.tables, self.c2w[frames], self.lens, size, self._config.samples, paint, images)
+        return images
+
     @abstractmethod
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
         """Return a rendered image (H, W, 3) uint8 for each of `frames`."""

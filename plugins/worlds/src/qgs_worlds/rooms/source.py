@@ -67,14 +67,9 @@ class RoomScene(DrawnScene):
 
     def cast(self, frames: list[int]) -> np.ndarray:
         """Return rendered images (len(frames), H, W, 3) uint8."""
-        from qgs_worlds.caster.casting import cast
         from qgs_worlds.caster.interiors import paint_room
 
-        size = self._config.image_size
-        images = np.empty((len(frames), *size, 3), np.uint8)
-        c2w = self.c2w[frames]
-        cast(self.tables, c2w, self.lens, size, self._config.samples, paint_room, images)
-        return images
+        return self.painted(frames, paint_room, np.uint8)
 
 
 class RoomsSource(DrawnSource):

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from qgs.types import Size
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.casting import cast
 from qgs_worlds.caster.effects import Effects
@@ -46,15 +45,6 @@ class Drawn(NamedTuple):
     rig: Rig
     effects: Effects
     scale: float
-
-    def photos(self, frames: list[int], size: Size, samples: int) -> list[np.ndarray]:
-        """Return a rendered image (H, W, 3) uint8 for each of `frames`.
-
-        samples: rays per pixel along each axis.
-        """
-        light = np.empty((len(frames), *size, 3), np.float32)
-        cast(self.world, self.rig.c2w[frames], self.rig.lens(size), size, samples, paint, light)
-        return [self.effects.photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
 
 
 def draw(key: list[int], config: "WorldsConfig") -> Drawn:

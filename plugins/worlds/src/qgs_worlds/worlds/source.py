@@ -95,7 +95,11 @@ class WorldScene(DrawnScene):
 
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
         """Return a rendered image (H, W, 3) uint8 for each of `frames`."""
-        return self.drawn.photos(frames, self._config.image_size, self._config.samples)
+        from qgs_worlds.caster.shading import paint
+
+        light = self.painted(frames, paint, np.float32)
+        photo = self.drawn.effects.photo
+        return [photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
 
 
 def world_or_room(
