@@ -193,5 +193,5 @@ def from_points(
     # a point that stands alone, or on others, is as large as the usual one
     middle = gaps.nanmedian().nan_to_num(1.0)
     gaps = gaps.nan_to_num(float(middle)).clamp(0.1 * middle, 5 * middle).clamp_min(1e-6)
-    scales = gaps[None, :, None].expand(-1, -1, 3)
-    return balls(means[None], scales, _OPACITY, colors[drawn].float()[None])
+    scales = gaps[:, None].expand(-1, 3)
+    return balls(means, scales, _OPACITY, colors[drawn].float())

@@ -43,7 +43,7 @@ def surrounded(gaussians: Gaussians, views: Views, color: Sequence[float]) -> Ga
     rays = torch.stack([pixel_rays(cameras, v, rows, columns) for v in range(len(centres))])
     directions = F.normalize(centres[:, None] + radius * rays, dim=-1).flatten(0, 1)
     # Many photos look the same way: one Gaussian for each cell.
-    sphere = F.normalize((directions / _GAP).round().unique(dim=0), dim=-1)[None]
+    sphere = F.normalize((directions / _GAP).round().unique(dim=0), dim=-1)
     means = middle + radius * sphere
     scales = torch.full_like(sphere, radius * _GAP)
     far = balls(means, scales, _OPACITY, sphere.new_tensor(color).expand_as(sphere))

@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.containers import concatenated
 from qgs.types import Cameras, Gaussians, Views
 
 # Hypotheses for a depth.
@@ -43,28 +44,24 @@ def swept(views: Views, count: int, size: float, generator: torch.Generator) -> 
     size: approximate distance of the scene from the cameras, used as the depth of pixels that no
     other photo shows. generator: samples the pixels.
     """
-    height, width = views.cameras.size
-    pixels = height * width
+    pixels = math.prod(views.cameras.size)
     drawn = torch.randint(views.images.shape[1] * pixels, (count,), generator=generator)
     drawn = drawn.sort().values
-    parts = list[tuple[Tensor, Tensor, Tensor]]()
+    parts = list[Gaussians]()
     for photo in range(views.images.shape[1]):
         own = drawn[drawn // pixels == photo] % pixels
         parts += [_on_photo(views, photo, few, size) for few in own.split(_AT_ONCE)]
-    means, scales, colors = (torch.cat(part)[None] for part in zip(*parts, strict=True))
-    return balls(means, scales, _OPACITY, colors)
+    return concatenated(parts, 1)
 
 
 def balls(means: Tensor, scales: Tensor, opacity: float, colors: Tensor) -> Gaussians:
-    """Return unrotated Gaussians (1, G) of one opacity. means, scales, colors: (1, G, 3)."""
-    quats = means.new_tensor([1.0, 0, 0, 0]).expand(*means.shape[:2], 4)
-    return Gaussians(means, scales, quats, torch.full_like(means[..., 0], opacity), colors)
+    """Return unrotated Gaussians (1, G) of one opacity. means, scales, colors: (G, 3)."""
+    quats = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
+    return Gaussians(means, scales, quats, torch.full_like(means[:, 0], opacity), colors)[None]
 
 
-def _on_photo(
-    views: Views, photo: int, pixels: Tensor, size: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return means, scales and colours, each (n, 3), of Gaussians at `pixels` (n,) of a photo.
+def _on_photo(views: Views, photo: int, pixels: Tensor, size: float) -> Gaussians:
+    """Return Gaussians (1, n) at `pixels` (n,) of a photo.
 
     Pixels are numbered row by row.
     """
@@ -76,7 +73,7 @@ def _on_photo(
     rays = pixel_rays(cameras, photo, rows, columns)
     means = cameras.c2w[0, photo, :3, 3] + rays * depths[:, None]
     scales = (_PIXELS * depths / cameras.intrinsics[0, photo, 0])[:, None].expand(-1, 3)
-    return means, scales, views.images[0, photo][:, rows, columns].T
+    return balls(means, scales, _OPACITY, views.images[0, photo][:, rows, columns].T)
 
 
 def pixel_rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
