@@ -1,16 +1,11 @@
 """Sentences on results: scales that were found, photos that were chosen, next commands."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from qgs.wording import counted, listed
-
-if TYPE_CHECKING:
-    from qgs_viewer.comparison import Model
+from qgs_viewer.comparison import Model
 
 
 def scale_remarks(models: Sequence[Model]) -> Iterator[str]:

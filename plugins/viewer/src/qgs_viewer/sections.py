@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
 
@@ -71,7 +71,7 @@ class Section:
     """
 
     name: str
-    rows: Mapping[str, Sequence[Tile | None]] = field(default_factory=dict)
+    rows: Mapping[str, Sequence[Tile | None]]
     figure: Figure | None = None
     width: int = 300
 
@@ -174,7 +174,7 @@ def training_curves(models: Shown, detail: Detail) -> Section:
     """Return a section with loss and PSNR over the training, for models with a history."""
     curves = {model.name: model.curves for model in models if model.curves}
     if not curves:
-        return Section("training")
+        return Section("training", {})
     figure = curves_figure(curves)
     tile = Tile(figure_picture(figure, dpi=168))
     return Section("training", {"": [tile]}, figure, width=600)
