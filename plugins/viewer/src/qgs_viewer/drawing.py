@@ -132,8 +132,8 @@ class Drawing:
         self.photo_depth = FRUSTUM * unit
         self.anchor_radius = 0.01 * unit
         # viser has a background picture, and no background colour
-        plain = np.full((8, 8, 3), 255.0) * scene.background
-        self.api.set_background_image(plain.round().astype(np.uint8), "png")
+        plain = np.full((8, 8, 3), faded(INK, 0.0, scene))
+        self.api.set_background_image(plain, "png")
         self._draw_photos(scene)
         self.update(scene, choice)
 

@@ -118,7 +118,7 @@ def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
     alphas = np.where(depths > 0, np.exp(-distances / 2), 0) * found.opacities[:, 0]
     order = np.argsort(depths)
     # light that is left after the Gaussians before
-    left = np.cumprod(np.concatenate([[1.0], 1 - alphas[order]]))[:-1]
+    left = np.cumprod(np.r_[1.0, 1 - alphas[order]])[:-1]
     weights = alphas[order] * left
     best = int(weights.argmax())
     return int(order[best]) if weights[best] >= LEAST_WEIGHT else None

@@ -44,7 +44,7 @@ class BendingLens(Lens):
         # a quarter clockwise makes (-y, x) of (x, y)
         plane = torch.view_as_complex(points.double().contiguous()).numpy() * (-1j) ** self.turns
         flat = plane.ravel()
-        bent = camera.img_from_cam(np.stack([flat.real, flat.imag, np.ones(len(flat))], -1))
+        bent = camera.img_from_cam(np.c_[flat.real, flat.imag, np.ones(len(flat))])
         turned = (bent @ [1, 1j]).reshape(plane.shape) * 1j**self.turns
         return torch.view_as_real(torch.from_numpy(turned)).to(points)
 

@@ -116,7 +116,7 @@ def off_lines(matches: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray) ->
     points, seen = matches
     lens, own = intrinsics
     relative = np.linalg.inv(poses[1]) @ poses[0]
-    rays = np.concatenate([(points - lens[2:]) / lens[:2], np.ones((len(points), 1))], 1)
+    rays = np.c_[(points - lens[2:]) / lens[:2], np.ones(len(points))]
     far = rays @ relative[:3, :3].T
     near = relative[:3, 3]
     infinity = far[:, :2] / far[:, 2:]
