@@ -60,7 +60,17 @@ def opened_reconstruction(
     if not default:
         scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted, holdout=False)
     refuse_other_photos(record, scene, photos)
-    sample = _sample(record, scene)
+    count = len(record.inputs)
+    views = views_in(record.world, scene, (*record.inputs, *record.compared))
+    sample = Sample(
+        scene=scene.name,
+        inputs=views.select(slice(count)),
+        targets=views.select(slice(count, None)),
+        input_frames=record.inputs,
+        target_frames=record.compared,
+        world=record.world,
+        names=record.photos,
+    )
     start = reconstruct_sample(model, sample, seen or (), record.gaussians.to(device))
     start = replace(start, tuning=record.tuning)
     if size is not None:
@@ -84,20 +94,6 @@ def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
         f"{photos} does not hold the photos from which {record.folder} was made, or their poses "
         f"have changed; the photos were {listed(expected, 3)}: give these photos, or reconstruct "
         "again"
-    )
-
-
-def _sample(record: Record, scene: Scene) -> Sample:
-    count = len(record.inputs)
-    views = views_in(record.world, scene, (*record.inputs, *record.compared))
-    return Sample(
-        scene=scene.name,
-        inputs=views.select(slice(count)),
-        targets=views.select(slice(count, None)),
-        input_frames=record.inputs,
-        target_frames=record.compared,
-        world=record.world,
-        names=record.photos,
     )
 
 
