@@ -65,11 +65,11 @@ def read_record(folder: Path) -> Record:
 
 
 def _parsed(folder: Path, data: dict[str, Any]) -> Record:
-    inputs = [view for view in data["views"] if view["kind"] == "input"]
-    compared = [view for view in data["views"] if view["kind"] != "input"]
     # inputs first, whatever the order in the file: `Record.cameras` promises it
-    views = [*inputs, *compared]
-    height, width = inputs[0]["size"]
+    views = sorted(data["views"], key=lambda view: view["kind"] != "input")
+    frames = [view["frame"] for view in views]
+    inputs = sum(view["kind"] == "input" for view in views)
+    height, width = views[:inputs][0]["size"]
     reference = torch.tensor(data["to_photos"]["reference_c2w"], dtype=torch.float64)
     scale = torch.tensor(data["to_photos"]["scale"], dtype=torch.float64)
     # of models whose background is their default nothing is recorded
@@ -81,8 +81,8 @@ def _parsed(folder: Path, data: dict[str, Any]) -> Record:
         model=data.get("model") or "",
         tuning=data.get("tuning"),
         world=(reference, scale),
-        inputs=tuple(view["frame"] for view in inputs),
-        compared=tuple(view["frame"] for view in compared),
+        inputs=tuple(frames[:inputs]),
+        compared=tuple(frames[inputs:]),
         photos={view["frame"]: view["photo"] for view in views if view.get("photo")},
         cameras=Cameras(
             torch.tensor([view["c2w"] for view in views])[None],

@@ -211,22 +211,21 @@ class _Camera:
             self._wrong(f"{key or 'rotation'!r} has the shape {pose.shape}")
             return _NO_POSE
         if key in _W2C:
-            singular = not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-9
-            return _NO_POSE if singular else np.linalg.inv(pose)
+            # a singular matrix is told as a pose with NaN
+            with suppress(np.linalg.LinAlgError):
+                return np.linalg.inv(pose)
+            return _NO_POSE
         return pose * [1, -1, -1, 1] if key in _OPENGL else pose
 
     def _intrinsics(self) -> np.ndarray:
         """Return fx, fy, cx, cy in pixels; NaN if intrinsics are missing or invalid."""
         key = _first(self.values, _K)
         matrix = numbers(self.values.get(key))
-        names = [_first(self.values, names) for names in _FOCAL]
-        if not key and names[0]:
-            fx = self.values[names[0]]
-            matrix = numbers([fx, self.values.get(names[1], fx)])
-            centre = [self.values.get(name) for name in names[2:]]
+        fx, fy, *centre = (self.values.get(_first(self.values, names)) for names in _FOCAL)
+        if not key and fx is not None:
             if None in centre and (size := self._photo_size()):
                 centre = [size[1] / 2, size[0] / 2]
-            matrix = np.append(matrix, numbers(centre))
+            matrix = np.append(numbers([fx, fx if fy is None else fy]), numbers(centre))
         if matrix.shape in ((3, 3), (4, 4)):
             matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
         if matrix.shape != (4,):

@@ -229,7 +229,7 @@ def require_usable(record: Record) -> None:
             *unit_problems(record, frame),
             *intrinsics_problems(record.intrinsics(frame, size), size),
         )
-        for problem in problems[:1]:
+        for problem in problems:
             raise ValueError(f"{record.place(frame)}: {problem}")
 
 

@@ -160,8 +160,9 @@ def chunk_entry(
         "sizes": torch.tensor([frame.size for frame in frames], dtype=torch.int32),
     }
     if any(frame.mask is not None for frame in frames):
-        masks = [b"" if frame.mask is None else png_bytes(frame.mask) for frame in frames]
-        entry["masks"] = [*map(_bytes, masks)]
+        entry["masks"] = [
+            _bytes(b"" if frame.mask is None else png_bytes(frame.mask)) for frame in frames
+        ]
     if held_out:
         entry["held_out"] = torch.tensor(list(held_out))
     if times is not None:
