@@ -312,9 +312,27 @@ def recipes_alike(
     recipes = dict(trained)
     if photos is not None:
         data = _data_of(photos, recipes.values(), size)
+        plugin = data["type"].split("/")[0]
         first = next(iter(recipes.values())).tree["views"]
         for name, recipe in recipes.items():
-            recipes[name] = resolve(_on_photos(recipe, photos, data, first), overrides)
+            own = is_training_data(photos, recipe.data_config)
+            views = {
+                **recipe.tree["views"],
+                "gap": first["gap"],
+                "targets": first["targets"],
+                # photos that it was not trained on have a unit of their own
+                "scale": photo_settings(recipe.views, own).scale,
+            }
+            tree = {
+                **recipe.tree,
+                "data": data,
+                # photos may need a plug-in that the recipe does not name
+                "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{plugin} - {"qgs"}])],
+                # an index of the recipe's data names none of these photos
+                "evaluation": {**recipe.tree["evaluation"], "scenes": WINDOWS, "index": None},
+                "views": views,
+            }
+            recipes[name] = resolve(tree, overrides)
     refuse_unequal(recipes, JUDGED)
     return recipes
 
@@ -343,31 +361,3 @@ def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dic
     kind = next(name for name, component in sources.items() if component is type(source))
     options = config.model_dump(mode="json")
     return {"type": kind, **options, "image_size": [*(size or config.image_size)]}
-
-
-def _on_photos(
-    recipe: Recipe, photos: str, data: Mapping[str, Any], first: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return the options of `recipe` as a nested dict, with photos as its data.
-
-    photos: folder of the photos, or video. data: recipe section `data` that reads the photos.
-    first: section `views` of the first recipe; all recipes get its `gap` and `targets`.
-    """
-    plugin = data["type"].split("/")[0]
-    own = is_training_data(photos, recipe.data_config)
-    views = {
-        **recipe.tree["views"],
-        "gap": first["gap"],
-        "targets": first["targets"],
-        # photos that it was not trained on have a unit of their own
-        "scale": photo_settings(recipe.views, own).scale,
-    }
-    return {
-        **recipe.tree,
-        "data": data,
-        # photos may need a plug-in that the recipe does not name
-        "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{plugin} - {"qgs"}])],
-        # an index of the recipe's data names none of these photos
-        "evaluation": {**recipe.tree["evaluation"], "scenes": WINDOWS, "index": None},
-        "views": views,
-    }

@@ -145,7 +145,16 @@ class Drawing:
         # another choice may have none of them
         for name in ("/anchors", "/support", "/path", "/reading", "/patches"):
             self.api.remove_by_name(name)
-        self._draw_anchors(scene, choice)
+        found = scene.support(choice.layer)
+        if found is not None and choice.anchors:
+            self.api.add_point_cloud(
+                "/anchors",
+                found.centers[0].float().numpy(),
+                anchor_colors(scene, choice),
+                point_size=self.anchor_radius,
+                point_shape="circle",
+                precision="float32",
+            )
         if choice.query is not None:
             self._draw_support(scene, choice.query, choice.layer)
             self._draw_reading(scene, choice.query, choice)
@@ -180,7 +189,11 @@ class Drawing:
         ends = on_photo(cameras, corners(cameras.size), self.photo_depth / place.scale)
         ends = place.points(ends)
         eyes = place.points(cameras.c2w[:, :3, 3])
-        self._lines("/views/inputs", frustum_lines(eyes, ends), ink(scene), 2.0)
+        # the edges of pyramids: from the eyes to the corners, and around the photos
+        spokes = torch.stack([eyes[:, None].expand_as(ends), ends], 2)
+        rims = torch.stack([ends, ends.roll(-1, 1)], 2)
+        edges = torch.cat([spokes, rims], 1).flatten(0, 1)
+        self._lines("/views/inputs", edges, ink(scene), 2.0)
         for view, image in enumerate(scene.views.images[0]):
             corner, right, _, left = ends[view]
             # viser's pictures lie in the plane of x and y, as those of cameras do
@@ -194,19 +207,6 @@ class Drawing:
                 wxyz=SO3.from_matrix(turned.numpy()).wxyz,
                 position=ends[view].mean(0).numpy(),
             )
-
-    def _draw_anchors(self, scene: QueryScene, choice: Choice) -> None:
-        found = scene.support(choice.layer)
-        if found is None or not choice.anchors:
-            return
-        self.api.add_point_cloud(
-            "/anchors",
-            found.centers[0].float().numpy(),
-            anchor_colors(scene, choice),
-            point_size=self.anchor_radius,
-            point_shape="circle",
-            precision="float32",
-        )
 
     def _draw_support(self, scene: QueryScene, query: int, layer: int) -> None:
         """Draw the support ellipsoid of a query, and the path of the query's anchor.
@@ -273,16 +273,6 @@ class Drawing:
         """
         points = lines.float().cpu().numpy()
         self.api.add_line_segments(name, points, color, thickness=width, thickness_units="screen")
-
-
-def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
-    """Return the edges of V camera pyramids, 8 for each camera, as segments (V * 8, 2, 3).
-
-    eyes: centres of the cameras, (V, 3). ends: corners of the photos in space, (V, 4, 3).
-    """
-    spokes = torch.stack([eyes[:, None].expand_as(ends), ends], 2)
-    rims = torch.stack([ends, ends.roll(-1, 1)], 2)
-    return torch.cat([spokes, rims], 1).flatten(0, 1)
 
 
 def distance_to(scene: QueryScene) -> float:

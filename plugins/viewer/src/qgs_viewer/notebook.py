@@ -29,9 +29,7 @@ def prediction_png(prediction: Prediction) -> bytes | None:
     gaussians = prediction.gaussians[:1]
     means = gaussians.means[0].float()
     # predictions on the meta device have shapes, but no numbers
-    if means.is_meta or not means.isfinite().all():
-        return None
-    if not (means[:, 2] > 0).any():
+    if means.is_meta or not means.isfinite().all() or not (means[:, 2] > 0).any():
         return None
     lens = means.new_tensor([[[SIDE, SIDE, SIDE / 2, SIDE / 2]]])
     camera = Cameras(torch.eye(4).to(means)[None, None], lens, (SIDE, SIDE))

@@ -304,10 +304,11 @@ class FinishedScene(GivenScene):
         return str(view.get("photo") or f"frame {view['frame']}")
 
 
-def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str, Any]]:
-    """Read the Gaussians, the photos and cameras.json of a finished reconstruction.
+def open_finished(folder: Path, device: str) -> Source:
+    """Open a finished reconstruction, with its queries if its model is known.
 
-    The files do not store queries. Raises a ValueError that names the broken file.
+    If the model no longer makes the Gaussians of the PLY file, these are shown without queries, and
+    a note says why. Raises a ValueError that names a broken file.
     """
     path = folder / CAMERAS
     gaussians = load_ply(folder / PLY)
@@ -325,16 +326,6 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
             "`qgs reconstruct`, or view its PLY file alone"
         ) from error
     plain = QueryScene(gaussians, photos, inputs, background=(red, green, blue))
-    return plain, scene, record
-
-
-def open_finished(folder: Path, device: str) -> Source:
-    """Open a finished reconstruction, with its queries if its model is known.
-
-    If the model no longer makes the Gaussians of the PLY file, these are shown without queries, and
-    a note says why.
-    """
-    plain, scene, record = read_finished(folder)
     title = f"{scene.name} ({folder.name})"
     notes = []
     if is_finished(folder / REFINED):

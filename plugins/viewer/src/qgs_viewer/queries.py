@@ -196,7 +196,11 @@ def notable_queries(
     seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
     places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / torch.tensor(cameras.size[::-1])
     outside_N = ((places_N2 - 0.5).abs() >= 0.5 - MARGIN).any(1)
-    wide_N = (_widths(gaussians, cameras).view_as(weights_NK) >= 0.5).any(1)
+    depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2]
+    focal = cameras.intrinsics[0, 0, :2].mean()
+    pixels = 4 * gaussians.scales[0].amax(-1) * focal / depths.clamp_min(1e-3)
+    wide = (depths > 0) & (pixels >= 0.5 * max(cameras.size))
+    wide_N = wide.view_as(weights_NK).any(1).cpu()
     faults_N = (2 * outside_N + wide_N).tolist()
     order = sorted(weights_N.argsort(descending=True).tolist(), key=faults_N.__getitem__)
     chosen = list[int]()
@@ -207,17 +211,6 @@ def notable_queries(
             if far and n not in chosen and len(chosen) < count:
                 chosen.append(n)
     return colored_queries(gaussians, len(weights_N), chosen)
-
-
-def _widths(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return the widths (G,) of G Gaussians in the first view, relative to the longer image side.
-
-    The width is 4 sigma on a Gaussian's longest axis; it is 0 for Gaussians behind the camera.
-    """
-    depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2]
-    focal = cameras.intrinsics[0, 0, :2].mean()
-    pixels = 4 * gaussians.scales[0].amax(-1) * focal / depths.clamp_min(1e-3)
-    return torch.where(depths > 0, pixels / max(cameras.size), 0).cpu()
 
 
 def query_picture(

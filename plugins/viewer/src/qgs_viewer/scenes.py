@@ -41,12 +41,10 @@ class ModelScenes:
     def notable(self, count: int, cameras: Cameras, query: int | None) -> list[DrawnQuery]:
         """Return the query with the index `query`; if it is None, `count` well visible queries.
 
-        cameras: (1, V); only the first camera is used (see `notable_queries`). Raises ValueError
-        for a query that does not exist.
+        cameras: (1, V); only the first camera is used (see `notable_queries`).
         """
         if query is None:
             return notable_queries(self.network, self.gaussians[0], cameras, count)
-        self.scene.refuse_missing(query)
         return colored_queries(self.gaussians[0], self.scene.queries, [query])
 
 
@@ -66,7 +64,7 @@ def model_scenes(
     if most is not None:
         evaluation = evaluation.model_copy(update={"scenes": most, "samples": 1})
     source = first.build_data()
-    samples: Sequence[Sample] = ()
+    samples: list[Sample] = []
     shown = []
     for model in models:
         views = model.recipe.views
@@ -82,7 +80,15 @@ def model_scenes(
                 depths=not shown,
             )
             samples = _samples(plan)[:most]
-        shown.append(scenes_of(model.name, model.network, _with_first(samples, scene), model.file))
+            names = dict.fromkeys(sample.scene for sample in samples)
+            if scene is not None and scene not in names:
+                raise ValueError(
+                    f"--scene {scene!r} is not one of the evaluated scenes: choose from "
+                    f"{listed(names)}"
+                )
+            # sorting is stable: the others keep their order
+            samples.sort(key=lambda sample: sample.scene != scene)
+        shown.append(scenes_of(model.name, model.network, samples, model.file))
     return shown
 
 
@@ -95,16 +101,6 @@ def _samples(plan: EvaluationPlan) -> list[Sample]:
         except Exception as error:  # whatever a reader raises
             raise ValueError(f"scene {scene!r} cannot be evaluated: {one_line(error)}") from error
     return samples
-
-
-def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample]:
-    names = dict.fromkeys(sample.scene for sample in samples)
-    if scene is not None and scene not in names:
-        raise ValueError(
-            f"--scene {scene!r} is not one of the evaluated scenes: choose from {listed(names)}"
-        )
-    # sorting is stable: the others keep their order
-    return sorted(samples, key=lambda sample: sample.scene != scene)
 
 
 @torch.no_grad()
