@@ -244,17 +244,14 @@ class _Run:
         self.free.optimizer.step()
         self.adjustments.step(used)
         self.step += 1
-        self._grow(used)
-        return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))
-
-    def _grow(self, used: float) -> None:
-        """Relocate and add Gaussians every few steps. used: fraction of the time already spent."""
+        # relocated and added every few steps
         regular = self.step - self.grown >= _STEPS_BETWEEN_GROWTHS and used < _SETTLED
         if regular or (used >= _GROWN and self.free.count < self.wanted):
             self.grown = self.step
             share = min(used / _GROWN, 1.0)
             now = round(self.start * (self.wanted / self.start) ** share)
             self.free.grow(now, self.generator)
+        return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))
 
 
 def partly_swept(
