@@ -14,6 +14,7 @@ from qgs.data.photos.reader import (
     pose_problems,
     size_problems,
 )
+from qgs.wording import numbered
 from qgs_photos.datatools.findings import Finding
 from qgs_photos.datatools.photos import Decoded, DecodedScene
 
@@ -103,7 +104,9 @@ def sharing_findings(scene: DecodedScene, usable: Sequence[int]) -> Iterator[Fin
             continue
         told.add(frame)
         one, other = poses[[*pair], :3, :3]
-        label = scene.label(first)
+        name = scene.photos[first].listed.name
+        number = scene.numbers[first]
+        label = name if number is None else f"frame {numbered(number, name)}"
         digest = scene.decoded[first].digest
         if np.abs(one - other).max() > _SAME:
             reason = f"the camera stands on the same point as that of {label}"

@@ -14,7 +14,7 @@ from PIL import Image
 from qgs.data.images import decode_rgb, eight_bits, opened_image, orientation
 from qgs.data.photos.reader import FrameProblem, PhotoFrame, Size, size_problems
 from qgs.data.photos.source import turned, turned_size
-from qgs.wording import numbered, one_line
+from qgs.wording import one_line
 from qgs_photos.datatools.findings import Finding, Severity
 
 _ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
@@ -119,15 +119,6 @@ class DecodedScene:
             for photo in self.photos
         ]
 
-    def label(self, frame: int) -> str:
-        """Return a photo's name in messages: frame number and file name, or the file name alone.
-
-        frame: index in `photos`.
-        """
-        name = self.photos[frame].listed.name
-        number = self.numbers[frame]
-        return name if number is None else f"frame {numbered(number, name)}"
-
 
 def decode(photo: Photo, headers_only: bool) -> Decoded:
     """Decode a photo, its mask and its depth map, and report what fails.
@@ -149,7 +140,8 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
             image.draft(None, _SMALLEST)
             image.load()
             pixels = eight_bits(image)
-            black = _is_black(pixels)
+            rgba = np.array(pixels.resize((96, 96)).convert("RGBA"))
+            black = rgba[..., :3].max() <= _BLACK and rgba[..., 3].min() == 255
             # EXIF may stand behind the pixels
             unturned = orientation(image) != 1 and not photo.listed.turns
     except Exception as error:
@@ -180,12 +172,6 @@ def _edges(image: Image.Image) -> np.ndarray:
     """Return the lengths of the gradients of an image, after it is resized to _SQUARE."""
     x, y = np.gradient(np.array(image.resize(_SQUARE), np.float32))
     return np.hypot(x, y).flatten()
-
-
-def _is_black(image: Image.Image) -> bool:
-    """Return whether the image is opaque and no pixel is brighter than _BLACK."""
-    rgba = np.array(image.resize((96, 96)).convert("RGBA"))
-    return bool(rgba[..., :3].max() <= _BLACK and rgba[..., 3].min() == 255)
 
 
 def error_text(error: Exception) -> str:
