@@ -11,7 +11,7 @@ from torch import Tensor
 from qgs.contracts import Column
 from qgs.data.samples import Sample
 from qgs.metrics.baselines import nearest_input
-from qgs.types import Cameras, Rendering
+from qgs.types import Rendering
 from qgs.wording import listed
 from qgs_viewer.placement import depths_in_view, on_photo, patch_centers
 
@@ -50,21 +50,6 @@ ScoredView: TypeAlias = tuple[str, Mapping[str, Part]]
 """Name of a scored view, and its parts by name. The part WHOLE is the whole view."""
 
 
-def seen_by(inputs: Cameras, targets: Cameras, rendering: Rendering) -> Tensor:
-    """Return which pixels of T renders show a point that lies in the image of an input.
-
-    inputs: (1, V). targets: cameras (1, T) of the rendering. The point of a pixel lies at the
-    rendered depth. Pixels that show more background than Gaussians do not count. Returns bool
-    (T, H, W).
-    """
-    alpha = rendering.alpha[0, :, 0]
-    centers = patch_centers((1, *targets.size), targets.size)
-    depths = rendering.depth[0].flatten(1)[..., None]
-    points = on_photo(targets[0], centers, depths).flatten(0, 1)
-    unseen = depths_in_view(points, inputs).isnan().all(0)
-    return ~unseen.view_as(alpha) & (alpha > SOLID)
-
-
 def scored_views(sample: Sample, rendering: Rendering) -> Iterator[ScoredView]:
     """Yield the T target views of a sample, of which `rendering` is (1, T).
 
@@ -72,7 +57,14 @@ def scored_views(sample: Sample, rendering: Rendering) -> Iterator[ScoredView]:
     """
     rendering = rendering.to("cpu")
     targets = sample.targets
-    seen = seen_by(sample.inputs.cameras, targets.cameras, rendering)
+    size = targets.cameras.size
+    centers = patch_centers((1, *size), size)
+    depths = rendering.depth[0].flatten(1)[..., None]
+    points = on_photo(targets.cameras[0], centers, depths).flatten(0, 1)
+    unseen = depths_in_view(points, sample.inputs.cameras).isnan().all(0)
+    alpha = rendering.alpha[0, :, 0]
+    # an input sees the point at the rendered depth; pixels of background do not count
+    seen = ~unseen.view_as(alpha) & (alpha > SOLID)
     images = (rendering.rgb.clamp(0, 1), nearest_input(sample.inputs, targets.cameras))
     errors = [(image - targets.images)[0].square().mean(1) for image in images]
     for view, frame in enumerate(sample.target_frames):
