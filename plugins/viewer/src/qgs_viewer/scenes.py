@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 
@@ -31,7 +30,7 @@ class ModelScenes:
     samples: Sequence[Sample]
     gaussians: Sequence[Gaussians]
     scene: QueryScene
-    curves: Curves
+    curves: Curves = ()
 
     @property
     def target_camera(self) -> Cameras:
@@ -88,7 +87,8 @@ def model_scenes(
                 )
             # sorting is stable: the others keep their order
             samples.sort(key=lambda sample: sample.scene != scene)
-        shown.append(scenes_of(model.name, model.network, samples, model.file))
+        found = scenes_of(model.name, model.network, samples)
+        shown.append(replace(found, curves=curves_of(model.file)))
     return shown
 
 
@@ -104,14 +104,8 @@ def _samples(plan: EvaluationPlan) -> list[Sample]:
 
 
 @torch.no_grad()
-def scenes_of(
-    name: str, network: QueryGaussianModel, samples: Sequence[Sample], file: Path | None = None
-) -> ModelScenes:
-    """Reconstruct `samples` by `network`, and keep the queries of the first sample.
-
-    file: checkpoint of the network. If the training history lies beside it, the result has the
-    training curves. None gives no curves.
-    """
+def scenes_of(name: str, network: QueryGaussianModel, samples: Sequence[Sample]) -> ModelScenes:
+    """Reconstruct `samples` by `network`, and keep the queries of the first sample."""
     # components draw random numbers in training mode
     network.eval()
     device = next(network.parameters()).device
@@ -121,5 +115,4 @@ def scenes_of(
     ]
     scene = explained(network, own[0].inputs, own[0].input_frames)
     others = [network(sample.inputs).gaussians for sample in own[1:]]
-    curves = curves_of(file) if file else ()
-    return ModelScenes(name, network, own, [scene.gaussians, *others], scene, curves)
+    return ModelScenes(name, network, own, [scene.gaussians, *others], scene)
