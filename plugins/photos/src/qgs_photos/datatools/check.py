@@ -10,6 +10,7 @@ import torch
 from upath import UPath
 
 from qgs.data.photos import read_listing, readers
+from qgs.data.recognition import recognised
 from qgs.geometry.poses import look_at_depth
 from qgs.wording import listed
 from qgs_photos.datatools.chunks import chunk_scenes
@@ -19,7 +20,7 @@ from qgs_photos.datatools.folders import dl3dv_scenes, photo_folders
 from qgs_photos.datatools.geometry import TOO_FEW, geometry_findings, judge_scene
 from qgs_photos.datatools.indices import found_indices, index_findings
 from qgs_photos.datatools.photos import Candidate, DecodedScene, Photo, decode, error_text
-from qgs_photos.datatools.sources import OF_FILES, kind_of, source_scenes, sources
+from qgs_photos.datatools.sources import OF_FILES, source_scenes, sources
 
 PHOTOS = 400
 """Number of photos to match in a data set, divided among the scenes whose poses are checked.
@@ -123,7 +124,9 @@ def _items(path: UPath, options: Options) -> Iterator[Candidate | Finding]:
     kind = options.format
     if kind == "auto":
         is_chunk = path.is_file() and path.suffix == ".torch"
-        kind = "chunks" if is_chunk else kind_of(path)
+        kind = "chunks" if is_chunk else recognised(path, sources())
+        for plugin in OF_FILES:
+            kind = kind.removeprefix(f"{plugin}/")
     if kind == "chunks":
         if options.images is not None:
             raise ValueError("chunks have no folders of images to choose: leave --images out")

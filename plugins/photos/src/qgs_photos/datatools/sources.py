@@ -61,16 +61,6 @@ def opened_source(
     return source if image_size is None else resized(source, source.config, image_size)
 
 
-def kind_of(path: UPath) -> str:
-    """Return the type PLUGIN/NAME of the data source that recognises `path`.
-
-    For a source of a plugin in OF_FILES, return NAME alone. Return "photos" if no source does.
-    """
-    kind = recognised(path, sources())
-    plugin, _, name = kind.partition("/")
-    return name if plugin in OF_FILES else kind
-
-
 def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candidate]:
     """Yield the scenes at `path` that are to be checked, opened by a plugin's data source.
 
