@@ -45,14 +45,14 @@ def test_supports_and_attention_are_those_of_a_traced_pass(kind):
 
 def test_lines_end_on_the_patches_that_are_read_most():
     scene = model_scenes_of("locus").scene
-    reading = scene.strongest(3, 2, 5, 0.4)
+    points, read, _ = scene.strongest(3, 2, 5, 0.4)
     shares = scene.attention(3, 2).weights[0, :, 0].mean(0).topk(5)
-    assert_equal(reading.shares, shares.values)
+    assert_equal(read, shares.values)
     tokens = shares.indices
     _, rows, columns = scene.grid
     patches = torch.stack([tokens % columns, tokens // columns % rows], -1)
     views = scene.views.cameras.to(torch.float64)
-    seen = to_camera(reading.points[None], views)[0]
+    seen = to_camera(points[None], views)[0]
     place = tokens // (rows * columns), torch.arange(5)
     pixels = to_pixels(seen, views.intrinsics[0])[place]
     assert_close(pixels, (patches + 0.5).double() * SIDE / columns, rtol=0, atol=1e-3)

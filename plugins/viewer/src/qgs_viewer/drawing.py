@@ -245,23 +245,24 @@ class Drawing:
         width. More attention gives a stronger colour, relative to the patch with the most
         attention.
         """
-        if not choice.layer or not choice.patches:
+        if not choice.patches:
             return
         # a little nearer to the camera than the photo, which would hide the squares
         depth = 0.97 * self.photo_depth
         reading = scene.strongest(query, choice.layer, choice.patches, depth)
         if reading is None:
             return
-        hub = scene.hub(query, choice.layer - 1).expand_as(reading.points)
-        shares = (reading.shares / reading.shares.max().clamp_min(1e-30)).numpy()
-        colors = faded(query_color(query), shares[:, None], scene)
-        ends = torch.stack([hub, reading.points], 1)
+        points, shares, side = reading
+        hub = scene.hub(query, choice.layer - 1).expand_as(points)
+        strengths = (shares / shares.max().clamp_min(1e-30)).numpy()
+        colors = faded(query_color(query), strengths[:, None], scene)
+        ends = torch.stack([hub, points], 1)
         self._lines("/reading", ends, colors[:, None].repeat(2, 1), 2.5)
         self.api.add_point_cloud(
             "/patches",
-            reading.points.float().numpy(),
+            points.float().numpy(),
             colors,
-            point_size=reading.side / 4,
+            point_size=side / 4,
             point_shape="square",
             precision="float32",
         )

@@ -31,19 +31,6 @@ class Inside:
     states: Sequence[QueryState]
 
 
-@dataclass(frozen=True)
-class Reading:
-    """The k photo patches that a query attends to most.
-
-    points: centres of the patches in space, (k, 3), in the viewer's world. shares: the query's
-    attention to each patch, (k,). side: width of a patch in the viewer's world.
-    """
-
-    points: Tensor
-    shares: Tensor
-    side: float
-
-
 @dataclass(frozen=True, eq=False)
 class QueryScene:
     """A reconstruction: Gaussians (1, G), the input views (1, V), and the model's queries.
@@ -143,11 +130,14 @@ class QueryScene:
             return found.centers[0, query]
         return self.placement.points(self.gaussians.means[0, self.members(query)]).mean(0)
 
-    def strongest(self, query: int, layer: int, count: int, depth: float) -> Reading | None:
-        """Return the `count` photo patches that a query attends to most, averaged over heads.
+    def strongest(
+        self, query: int, layer: int, count: int, depth: float
+    ) -> tuple[Tensor, Tensor, float] | None:
+        """Return the k = `count` photo patches that a query attends to most, averaged over heads.
 
-        depth: distance from a camera at which its photo is drawn, in the viewer's world. Returns
-        None if `attention` gives None for the query and layer.
+        Returns their centres (k, 3), the query's attention to each (k,), and the width of a patch,
+        all in the viewer's world; None if `attention` gives None for the query and layer. depth:
+        distance from a camera at which its photo is drawn, in the viewer's world.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:
@@ -160,7 +150,7 @@ class QueryScene:
         strongest = shares.topk(min(count, len(shares)))
         side = depth * cameras.size[1] / self.grid[2] / float(cameras.intrinsics[0, 0])
         read = self.placement.points(points.cpu()[strongest.indices])
-        return Reading(read, strongest.values, side)
+        return read, strongest.values, side
 
 
 @torch.no_grad()
