@@ -202,7 +202,7 @@ class ChunksSource(LazySource):
         splits: dict[Split, LazyScenes] = {"train": self._nothing}
         for split, folder in _folders(opened_path(config.path)).items():
             files = _long_enough(folder, config, opener)
-            splits[split] = first_scenes(files, config.max_scenes, opener)
+            splits[split] = first_scenes(files, config, opener)
         self.splits = splits
 
     @classmethod
@@ -234,14 +234,14 @@ class ChunksSource(LazySource):
 
 
 def first_scenes(
-    places: Mapping[str, UPath], limit: int, opener: Callable[[str, UPath], Scene]
+    places: Mapping[str, UPath], config: ManyScenesConfig, opener: Callable[[str, UPath], Scene]
 ) -> LazyScenes:
-    """Return the first `limit` scenes of `places`; a limit of 0 returns all.
+    """Return the first `config.max_scenes` scenes of `places`; 0 returns all.
 
     places: folder or file of each scene by name. opener: function that opens a scene; it takes the
     scene's name and its folder or file.
     """
-    return LazyScenes(dict(islice(places.items(), limit or None)), opener)
+    return LazyScenes(dict(islice(places.items(), config.max_scenes or None)), opener)
 
 
 def _folders(path: UPath) -> dict[Split, UPath]:
@@ -250,15 +250,15 @@ def _folders(path: UPath) -> dict[Split, UPath]:
             f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
         )
     found: dict[Split, UPath] = {s: path / s for s in get_args(Split) if has_chunks(path / s)}
-    if not found and has_chunks(path):
+    if found:
+        return found
+    if has_chunks(path):
         return {"train": path}
-    if not found:
-        inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
-        raise FileNotFoundError(
-            f"{path} holds no chunks: expected train/ or test/ with index.json and .torch files, "
-            f"found {inside}. `qgs data pack` makes chunks of other formats"
-        )
-    return found
+    inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
+    raise FileNotFoundError(
+        f"{path} holds no chunks: expected train/ or test/ with index.json and .torch files, "
+        f"found {inside}. `qgs data pack` makes chunks of other formats"
+    )
 
 
 def _long_enough(

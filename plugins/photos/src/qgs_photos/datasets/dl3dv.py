@@ -72,8 +72,8 @@ class Dl3dvSource(LazySource):
         photos = PhotosConfig(format="nerfstudio", **same)
         opener = partial(_opened, config=photos, cache=BoundedCache(0))
         self.splits = {
-            "train": first_scenes(train, config.max_scenes, opener),
-            "test": first_scenes(test, config.max_scenes, opener),
+            "train": first_scenes(train, config, opener),
+            "test": first_scenes(test, config, opener),
         }
 
     @classmethod
