@@ -124,7 +124,7 @@ Source: TypeAlias = FixedSource | ModelSource
 """Content of the viewer."""
 
 
-def photo_model(size: Size | None = None) -> str:
+def photo_model(size: Size | None) -> str:
     """Return the name of the default model for a user's photos.
 
     size: (H, W) of the photos in pixels, if the user gives it.
@@ -172,7 +172,7 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
 
 def open_model(
     name: str,
-    device: str = "cpu",
+    device: str,
     photos: str | None = None,
     scene: str | None = None,
     frames: str | None = None,

@@ -102,7 +102,7 @@ def check(
 
     console = Console()
     options = Options(geometry, quick, threads, format, images)
-    indices = [opened_path(name) for name in index or []]
+    indices = [*map(opened_path, index or [])]
     with console.status("listing scenes") as status:
 
         def progress(done: int, total: int, name: str) -> None:
@@ -172,7 +172,7 @@ def pack(
             splits,
             opened_path(out),
             {"test_scenes": test_scenes, "test_every": test_every},
-            Encoding(resized=image_size is not None, jpeg=jpeg),
+            Encoding(image_size is not None, jpeg),
             chunk_bytes=chunk_mb * 2**20,
             leave_out_broken=leave_out_broken,
             progress=lambda name: bar.update(task, advance=1, description=name),

@@ -17,7 +17,6 @@ from qgs.wording import listed
 from qgs_photos.datasets.chunk_files import INDEX, SUFFIX, load_chunk
 from qgs_photos.datatools.entries import ChunkEntry, Encoding, chunk_entry, encoded_frames
 
-CHUNK_BYTES = 100 * 2**20
 SETTINGS = "packing.json"
 """File in the output folder with the settings of the packing; deleted when it is finished."""
 
@@ -142,9 +141,9 @@ def pack(
     splits: Splits,
     folder: UPath,
     settings: Mapping[str, Any],
-    encoding: Encoding | None = None,
+    encoding: Encoding,
     *,
-    chunk_bytes: int = CHUNK_BYTES,
+    chunk_bytes: int = 100 * 2**20,
     leave_out_broken: bool = False,
     progress: Callable[[str], None] = lambda scene: None,
 ) -> Packed:
@@ -159,7 +158,6 @@ def pack(
     content, ValueError for an unfinished packing with other settings, and the errors of reading
     scenes.
     """
-    encoding = encoding or Encoding()
     # chunks of two settings in one folder would be a data set that nobody asked for
     options = {"source": type(source).name, **source.config.model_dump(mode="json"), **settings}
     _begin(folder, {**options, **asdict(encoding), "chunk_bytes": chunk_bytes})
