@@ -4,7 +4,6 @@ Published weights are flat state dicts in safetensors files or torch files. A pu
 is neither used nor listed as unused by its layout is an error.
 """
 
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, refuse_nonfinite, write_checkpoint
 from qgs.checkpoint.tensors import CheckpointError, TensorFile, nonfinite, pickle_kind, shapes_of
-from qgs.files import refuse_existing, write_text
+from qgs.files import AnyPath, refuse_existing, write_text
 from qgs.recipe import Recipe, resolve
 from qgs.recipe.recipe import differing_predictions
 from qgs.recipe.yaml_text import dump
@@ -48,13 +47,12 @@ class WeightFile:
     notes: tuple[str, ...] = ()
 
 
-def read_weight_file(path: str | Path) -> WeightFile:
+def read_weight_file(path: Path) -> WeightFile:
     """Open the state dict in a file. Memory-mapped tensors are read when they are used.
 
     Raises FileNotFoundError for a missing file, and CheckpointError for a file that does not hold a
     state dict of tensors.
     """
-    path = Path(path)
     notes = list[str]()
     if not path.is_file():
         raise FileNotFoundError(f"there is no file of weights {path}; correct the path")
@@ -121,9 +119,9 @@ def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]
 
 
 def import_weights(
-    weights: str | Path,
+    weights: Path,
     recipe: Recipe | None,
-    out: str | Path,
+    out: Path,
     *,
     overrides: Sequence[str] = (),
 ) -> list[str]:
@@ -138,7 +136,7 @@ def import_weights(
     Raises FileNotFoundError, FileExistsError, ValueError for a wrong suffix of `out`, RecipeError,
     CheckpointError and PublishedError. After an error no file is left.
     """
-    out = new_checkpoint_path(out)
+    check_new_checkpoint(out)
     # A given recipe needs no second file.
     recipe_file = out.with_suffix(".yaml") if recipe is None else None
     if recipe_file:
@@ -234,12 +232,12 @@ def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list
     return tensors, [f"converted to float32: {report}"] if others else []
 
 
-def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool) -> None:
+def export_checkpoint(name: AnyPath, out: Path, half: bool) -> None:
     """Copy a checkpoint to a new file. half: True stores floating-point weights as float16.
 
     Raises the errors of `CheckpointFile`, and CheckpointError if a weight is too large for float16.
     """
-    out = new_checkpoint_path(out)
+    check_new_checkpoint(out)
     with CheckpointFile(name) as file:
         tensors = file.tensors
         refuse_nonfinite(tensors, file.path)
@@ -255,15 +253,10 @@ def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool)
         write_checkpoint(out, tensors, file.recipe.tree, file.recipe.releases, file.extra)
 
 
-def new_checkpoint_path(path: str | Path) -> Path:
-    """Return `path`, after a check that no such file exists and that it ends in .safetensors.
-
-    Raises ValueError for another suffix, and FileExistsError for an existing file.
-    """
-    path = Path(path)
+def check_new_checkpoint(path: Path) -> None:
+    """Raise FileExistsError for an existing file, and ValueError unless it is a .safetensors."""
     if path.suffix.lower() != ".safetensors":
         raise ValueError(
             f"{path}: checkpoints are safetensors files; choose a name that ends in .safetensors"
         )
     refuse_existing(path)
-    return path
