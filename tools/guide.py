@@ -59,8 +59,8 @@ def written(page: str, folder: Path) -> str:
     """
     up = "../" * len(folder.relative_to(ROOT).parts)
     page = CROSS.sub(lambda found: _link(found[1], up), page)
-    page = DOCUMENTED.sub(lambda found: _entry(found[1], found[2]), page)
-    page = ENTRY.sub(lambda found: _entry(found[1], found[2]), page)
+    for pattern in (DOCUMENTED, ENTRY):
+        page = pattern.sub(lambda found: _entry(found[1], found[2]), page)
     return PART.sub(lambda found: _part(found[1], found[2]), page)
 
 

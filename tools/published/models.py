@@ -21,8 +21,7 @@ from published.depthsplat import depthsplat_tensors
 from published.files import GoldenFile
 from published.mvsplat import mvsplat_tensors
 from published.recipes import locusgs_recipe, tokengs_recipe
-from published.recording import Recorder
-from published.splats import cases_tensors
+from published.splats import Recorder, cases_tensors
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import QueryGaussianModel
 from qgs.recipe import resolve

@@ -11,8 +11,8 @@ from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
 from published.files import GoldenFile
-from published.recording import Recorder
 from published.splats import (
+    Recorder,
     gaussians,
     model_of,
     of_views,

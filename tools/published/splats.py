@@ -1,6 +1,9 @@
-"""Shared parts of the golden files of MVSplat and DepthSplat, and files of single cases."""
+"""Shared parts of the golden files of MVSplat and DepthSplat, and files of single cases.
 
-from collections.abc import Sequence
+A recorder keeps inputs and outputs of modules inside a model.
+"""
+
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -15,11 +18,10 @@ from qgs_zoo.mvsplat.head import mapped_opacity
 from qgs_zoo.mvsplat.pixels import PIXEL, degree_of, ray_directions
 from qgs_zoo.mvsplat.sweep import feature_lenses, warp_grid, warped
 from qgs_zoo.mvsplat.windows import out_of_windows
-from torch import Tensor
+from torch import Tensor, nn
 
 import qgs
 from published.files import GoldenFile
-from published.recording import Recorder
 from published.seeded_weights import seeded_weight
 from qgs.checkpoint.tensors import shapes_of
 from qgs.geometry.harmonics import SH_C0
@@ -27,6 +29,36 @@ from qgs.geometry.transforms import quat_to_matrix
 from qgs.model import QueryGaussianModel
 from qgs.recipe import resolve
 from qgs.types import Cameras, ImageMemory, Prediction, Views
+
+Change = Callable[[Tensor], Tensor]
+
+
+class Recorder:
+    """Recorder of inputs and outputs of modules, by name.
+
+    shaped: function that changes each tensor before it is kept.
+    """
+
+    def __init__(self, shaped: Change = Tensor.detach) -> None:
+        self.shaped = shaped
+        self.found: dict[str, Tensor] = {}
+
+    def output(self, name: str, module: nn.Module, shaped: Change | None = None) -> None:
+        """Record the outputs of a module as `name`."""
+        change = shaped or self.shaped
+        module.register_forward_hook(lambda _, __, out: self.found.update({name: change(out)}))
+
+    def input(self, name: str, module: nn.Module, channels: slice = slice(None)) -> None:
+        """Record some channels of the inputs of a module as `name`."""
+        module.register_forward_pre_hook(
+            lambda _, given: self.found.update({name: self.shaped(given[0][:, channels])})
+        )
+
+    def outputs(self, root: nn.Module, text: str) -> None:
+        """Record outputs. Each line of `text` is a name and the path of a module in `root`."""
+        for line in text.strip().splitlines():
+            name, path = line.split()
+            self.output(name, root.get_submodule(path))
 
 
 def views_of(golden: GoldenFile) -> Views:
