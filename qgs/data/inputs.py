@@ -195,6 +195,18 @@ class Frusta:
             chosen.append(min({*near} - {*chosen, last}, key=lambda f: (distances[f], f)))
         return (*chosen, last)
 
+    def with_middle(self, window: Frames, left_out: Sequence[int]) -> Frames:
+        """Return `window`, and a window of two frames with a third in the middle, if there is one.
+
+        It is nearer to both frames than they are to each other, and not in `left_out`.
+        """
+        reach = self.far[list(window)].max(0)
+        reach[list(left_out)] = math.inf
+        middle = int(reach.argmin())
+        if len(window) != 2 or reach[middle] >= self.far[window]:
+            return window
+        return window[0], middle, window[1]
+
     def compared(self, window: Frames, target: int | None = None) -> Frames:
         """Return up to NOVEL frames to score: the target, and frames that overlap with the inputs.
 

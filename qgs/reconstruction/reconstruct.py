@@ -46,7 +46,8 @@ def reconstruct(
     Cameras are moved to the frame of the model's recipe. For photos that are no training data,
     `find_scale` replaces a constant scale, and `find_size` may halve the size from `whole_size`.
     photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras, which are all inputs
-        unless `inputs` or `frames` is given. inputs: number of input photos; None: the recipe's.
+        unless `inputs` or `frames` is given. inputs: number of input photos; None: the recipe's,
+        and a third one between two if possible.
         frames: input photos, by number or file name; None chooses photos that overlap.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
     size: (H, W) to crop and resize photos to. scene: name of a scene in the folder.
@@ -88,7 +89,11 @@ def reconstruct(
     finally:
         model.train(training)
     result = replace(result, scale=scale, size=chosen, tuning=tuning)
-    return replace(result, remarks=_remarks(result, found))
+    # What was chosen because it is better needs no warning.
+    chosen = [
+        name for name, given in (("views", inputs or wanted), ("side", not free)) if not given
+    ]
+    return replace(result, remarks=_remarks(result, found, chosen))
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
@@ -114,7 +119,7 @@ def choose_frames(
 ) -> Window:
     """Return the input frames of `scene` and the frames to compare the result with.
 
-    inputs: number of inputs; None uses `views.inputs`.
+    inputs: number of inputs; None uses `views.inputs`, and a third one between two if possible.
     frames: input frames that the user chose; None spreads them over time if the scene has times,
         and otherwise takes them from the best window of `ranked_windows`.
     compare: the user's choice of frames to compare with. None chooses frames that the inputs see;
@@ -132,8 +137,14 @@ def choose_frames(
         frames, novel = _over_time(scene, scene.times, views, frames)
     elif frames is None:
         frusta = Frusta(scene, domain)
-        ranked = ranked_windows(frusta, views.inputs, compare)
-        _, frames, target = ranked[0] if ranked else (0, tuple(range(len(scene))), None)
+        frames = tuple(range(len(scene)))
+        target = None
+        if ranked := ranked_windows(frusta, views.inputs, compare):
+            _, frames, target = ranked[0]
+            held_out = scene.held_out if compare is None else compare
+            # Novel views between two inputs gain 1 to 3 dB from a third one there.
+            if not inputs:
+                frames = frusta.with_middle(frames, (target, *held_out))
         novel = frusta.compared(frames, target)
     elif compare is None:
         novel = Frusta(scene, domain).compared(tuple(frames))
@@ -181,14 +192,16 @@ def _over_time(
     return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
 
 
-def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
-    """Return remarks for the user on the photos and on the result's quality."""
+def _remarks(result: Reconstruction, scene: Scene, chosen: Sequence[str]) -> list[str]:
+    """Return remarks for the user on the photos and on the result's quality.
+
+    chosen: names of measurements of `Domain` that nobody but qgs chose.
+    """
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    # A size that was found better needs no warning.
-    if result.size:
-        del found.values["side"]
+    for name in chosen:
+        del found.values[name]
     remarks = (
         result.scale.poor if result.scale else "",
         result.worse_than_nearest,

@@ -69,6 +69,14 @@ def test_inputs_are_as_far_apart_as_in_training_whatever_the_unit():
         assert 2 * abs(first - last) <= turn
 
 
+def test_a_third_input_stands_between_two():
+    frusta = Frusta(scene_of(along_x([0.0, 0.1, 0.2, 0.3, 0.4, 0.9])), TRAINED, 1.0)
+    assert frusta.with_middle((0, 4), (5,)) == (0, 2, 4)
+    assert frusta.with_middle((4, 0), (2, 5)) in ((4, 1, 0), (4, 3, 0))
+    assert frusta.with_middle((0, 1), ()) == (0, 1)
+    assert frusta.with_middle((0, 2, 4), ()) == (0, 2, 4)
+
+
 def test_a_training_with_all_distances_says_nothing_about_the_best():
     ranges = "{baseline: [0.002, 0.9], turn: [0.4, 43.0], depth: [0.002, 4.0]}"
     assert trained_ratios(Domain(yaml.safe_load(ranges), 512)) == trained_ratios(Domain())

@@ -6,8 +6,10 @@ import pytest
 import torch
 from photo_formats import noisy_photos
 from tables import must_refuse
+from walk import Walk
 
 from qgs.contracts import ViewsConfig
+from qgs.domain import Domain
 from qgs.reconstruction.reconstruct import checked_window, choose_frames
 from qgs.reconstruction.scenes import GivenScene, read_photos
 
@@ -40,3 +42,16 @@ def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
     assert choose_frames(GivenScene(photos), ViewsConfig(), None, [1, 3], [2]) == ((1, 3), (2,))
     for compared, *frames in ((0, 1, 5), (0, -1, 2), (0, 1, 1), (3, 0, 3)):
         must_refuse("frames", checked_window, 5, frames, [compared])
+
+
+def test_a_photo_between_two_inputs_is_an_input_unless_two_are_asked_for():
+    walk = Walk()
+    wide = Domain({"baseline": [1.8, 1.9], "depth": [3.0, 3.0], "turn": [30.0, 40.0]}, 4)
+    for inputs, held_out, compare, expected in (
+        (None, (2,), None, (1, 3, 4)),
+        (2, (2,), None, (1, 4)),
+        (None, (), (2,), (1, 3, 4)),
+    ):
+        walk.held_out = held_out
+        found, _ = choose_frames(walk, ViewsConfig(inputs=2), inputs, None, compare, wide)
+        assert found == expected
