@@ -66,8 +66,7 @@ packed = partial(photo_formats.opened, size=SIZE, source=ChunksSource)
 
 def pack(photos, out, encoding=None, **options):
     splits = packing.chosen_splits(photos)
-    coded = encoding or packing.Encoding()
-    return packing.pack(photos, splits, UPath(out), {"path": "photos"}, coded, **options)
+    return packing.pack(photos, splits, UPath(out), {"path": "photos"}, encoding, **options)
 
 
 def same(before, after, tolerance=0.0, split="train"):
@@ -184,7 +183,6 @@ def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path
         {"train": {"s3": ("train", 3)}, "test": {}},
         UPath(tmp_path / "none"),
         {},
-        packing.Encoding(),
         leave_out_broken=True,
     )
 

@@ -141,7 +141,7 @@ def pack(
     splits: Splits,
     folder: UPath,
     settings: Mapping[str, Any],
-    encoding: Encoding,
+    encoding: Encoding | None = None,
     *,
     chunk_bytes: int = 100 * 2**20,
     leave_out_broken: bool = False,
@@ -159,6 +159,7 @@ def pack(
     scenes.
     """
     # chunks of two settings in one folder would be a data set that nobody asked for
+    encoding = encoding or Encoding()
     options = {"source": type(source).name, **source.config.model_dump(mode="json"), **settings}
     _begin(folder, {**options, **asdict(encoding), "chunk_bytes": chunk_bytes})
     packed = Packed()
