@@ -119,11 +119,7 @@ def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]
 
 
 def import_weights(
-    weights: Path,
-    recipe: Recipe | None,
-    out: Path,
-    *,
-    overrides: Sequence[str] = (),
+    weights: Path, recipe: Recipe | None, out: Path, *, overrides: Sequence[str] = ()
 ) -> list[str]:
     """Write a checkpoint of `recipe` with published weights, and return a report as lines of text.
 
