@@ -90,10 +90,10 @@ def reconstruct(
         model.train(training)
     result = replace(result, scale=scale, size=chosen, tuning=tuning)
     # What was chosen because it is better needs no warning.
-    chosen = [
-        name for name, given in (("views", inputs or wanted), ("side", not free)) if not given
-    ]
-    return replace(result, remarks=_remarks(result, found, chosen))
+    by_qgs = [] if inputs or wanted else ["views"]
+    if free:
+        by_qgs.append("side")
+    return replace(result, remarks=_remarks(result, found, by_qgs))
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
@@ -192,15 +192,15 @@ def _over_time(
     return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
 
 
-def _remarks(result: Reconstruction, scene: Scene, chosen: Sequence[str]) -> list[str]:
+def _remarks(result: Reconstruction, scene: Scene, by_qgs: Sequence[str]) -> list[str]:
     """Return remarks for the user on the photos and on the result's quality.
 
-    chosen: names of measurements of `Domain` that nobody but qgs chose.
+    by_qgs: names of measurements of `Domain` that the user left to qgs.
     """
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    for name in chosen:
+    for name in by_qgs:
         del found.values[name]
     remarks = (
         result.scale.poor if result.scale else "",

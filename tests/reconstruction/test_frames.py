@@ -48,9 +48,9 @@ def test_a_photo_between_two_inputs_is_an_input_unless_two_are_asked_for():
     walk = Walk()
     wide = Domain({"baseline": [1.8, 1.9], "depth": [3.0, 3.0], "turn": [30.0, 40.0]}, 4)
     for inputs, held_out, compare, expected in (
-        (None, (2,), None, (1, 3, 4)),
-        (2, (2,), None, (1, 4)),
-        (None, (), (2,), (1, 3, 4)),
+        (None, (2,), None, (0, 1, 3)),
+        (2, (2,), None, (0, 3)),
+        (None, (), (0,), (1, 2, 4)),
     ):
         walk.held_out = held_out
         found, _ = choose_frames(walk, ViewsConfig(inputs=2), inputs, None, compare, wide)

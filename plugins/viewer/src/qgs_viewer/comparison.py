@@ -69,13 +69,16 @@ fast, and the scale of the model's world. No score depends on the unit of that w
 POOR = 1.0
 
 
-def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) -> list[Window]:
+def spread_windows(
+    scene: Scene, inputs: int, trained_on: Domain, count: int, middle: bool = False
+) -> list[Window]:
     """Choose at most `count` windows: input photos, with the photos that renders are compared to.
 
     The first window is the best of `ranked_windows`. Each further window is nearly as good, and far
     from the windows chosen before it. inputs: number of input photos in a window. trained_on:
     ranges of distances and angles between the cameras in training, by which windows are ranked.
-    Raises ValueError if the scene has fewer photos than `inputs`.
+    middle: whether to add the photo in the middle between two inputs, if there is one. Raises
+    ValueError if the scene has fewer photos than `inputs`.
     """
     frusta = Frusta(scene, trained_on)
     ranked = ranked_windows(frusta, inputs)
@@ -84,7 +87,13 @@ def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) ->
     while len(chosen) < min(count, len(good)):
         # the farthest from all chosen ones; of equal ones the best
         chosen.append(max(good.keys() - {*chosen}, key=lambda t: frusta.far[t, chosen].min()))
-    return [(good[target], frusta.compared(good[target], target)) for target in chosen]
+    windows = []
+    for target in chosen:
+        window = good[target]
+        if middle:
+            window = frusta.with_middle(window, (target, *scene.held_out))
+        windows.append((window, frusta.compared(window, target)))
+    return windows
 
 
 class PhotoWindows(Span):
@@ -110,7 +119,7 @@ class PhotoWindows(Span):
             # a moment of a moving scene has few views; the recipe's sampler knows which
             return []
         if scene.name not in self._known:
-            windows = spread_windows(scene, views.inputs, self._trained_on, self._count)
+            windows = spread_windows(scene, views.inputs, self._trained_on, self._count, True)
             if not any(compared for _, compared in windows):
                 raise ValueError(
                     f"all {len(scene)} photos are inputs, so no photo is left to compare renders "
