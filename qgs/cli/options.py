@@ -32,11 +32,16 @@ Size: TypeAlias = Annotated[
     typer.Option(
         metavar="HxW",
         help="Height and width to which photos are cropped and resized. Default: photos are not "
-        "cropped; the shorter side gets the length that it has in the recipe's data.image_size.",
+        "cropped; the shorter side gets the length of training, and models of 128 pixels and more "
+        "try 256 pixels too.",
     ),
 ]
 Inputs: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Number of input views. Default: as in the recipe.")
+    int | None,
+    typer.Option(
+        min=1,
+        help="Number of input views. Default: as in the recipe, and one more if it lies between two.",
+    ),
 ]
 Frames: TypeAlias = Annotated[
     str | None,
