@@ -40,7 +40,7 @@ Inputs: TypeAlias = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="Number of input views. Default: as in the recipe, and one more if it lies between two.",
+        help="Number of input views. Default: as in the recipe, and one more if it is between two.",
     ),
 ]
 Frames: TypeAlias = Annotated[
