@@ -46,9 +46,8 @@ def reconstruct(
     Cameras are moved to the frame of the model's recipe. For photos that are no training data,
     `find_scale` replaces a constant scale, and `find_size` may halve the size from `whole_size`.
     photos: a folder of photos, its URL, or Views (1, V) with OpenCV cameras, which are all inputs
-        unless `inputs` or `frames` is given. inputs: number of input photos; None: the recipe's,
-        and a third one between two if possible.
-        frames: input photos, by number or file name; None chooses photos that overlap.
+        unless `inputs` or `frames` is given. inputs: number of input photos; None: see
+        `choose_frames`. frames: input photos, by number or file name; None chooses photos.
     compare: photos to score; "none": no photos; None: held-out photos (every eighth) near inputs.
     size: (H, W) to crop and resize photos to. scene: name of a scene in the folder.
     overrides: changes of the recipe's `views`. tune: what to fit first, such as "queries:50".
@@ -89,11 +88,7 @@ def reconstruct(
     finally:
         model.train(training)
     result = replace(result, scale=scale, size=chosen, tuning=tuning)
-    # What was chosen because it is better needs no warning.
-    by_qgs = [] if inputs or wanted else ["views"]
-    if free:
-        by_qgs.append("side")
-    return replace(result, remarks=_remarks(result, found, by_qgs))
+    return replace(result, remarks=_remarks(result, found, not inputs and not wanted, free))
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
@@ -192,16 +187,21 @@ def _over_time(
     return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
 
 
-def _remarks(result: Reconstruction, scene: Scene, by_qgs: Sequence[str]) -> list[str]:
+def _remarks(
+    result: Reconstruction, scene: Scene, inputs_chosen: bool, size_chosen: bool
+) -> list[str]:
     """Return remarks for the user on the photos and on the result's quality.
 
-    by_qgs: names of measurements of `Domain` that the user left to qgs.
+    inputs_chosen, size_chosen: whether the user left the number of inputs and the size to qgs.
     """
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    for name in by_qgs:
-        del found.values[name]
+    # What was chosen because it is better needs no warning.
+    if inputs_chosen:
+        del found.values["views"]
+    if size_chosen:
+        del found.values["side"]
     remarks = (
         result.scale.poor if result.scale else "",
         result.worse_than_nearest,
