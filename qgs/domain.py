@@ -114,7 +114,11 @@ class Domain:
         seen = found.ranges
         for name, trained in self.ranges.items():
             low, high = seen.get(name, trained)
-            if low * TOLERANCE < trained[0] or high > trained[1] * TOLERANCE:
+            most = trained[1] * TOLERANCE
+            # A third input between two gives better results than two.
+            if name == "views":
+                most = max(most, trained[1] + 1)
+            if low * TOLERANCE < trained[0] or high > most:
                 words = WORDS[name].format(_shown((low, high)))
                 phrases.append(f"{words} (trained: {_shown(trained)})")
         return phrases

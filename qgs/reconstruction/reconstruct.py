@@ -88,7 +88,7 @@ def reconstruct(
     finally:
         model.train(training)
     result = replace(result, scale=scale, size=chosen, tuning=tuning)
-    return replace(result, remarks=_remarks(result, found, not inputs and not wanted, free))
+    return replace(result, remarks=_remarks(result, found, free))
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
@@ -187,19 +187,15 @@ def _over_time(
     return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
 
 
-def _remarks(
-    result: Reconstruction, scene: Scene, inputs_chosen: bool, size_chosen: bool
-) -> list[str]:
+def _remarks(result: Reconstruction, scene: Scene, size_chosen: bool) -> list[str]:
     """Return remarks for the user on the photos and on the result's quality.
 
-    inputs_chosen, size_chosen: whether the user left the number of inputs and the size to qgs.
+    size_chosen: whether the user left the size to qgs.
     """
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    # What was chosen because it is better needs no warning.
-    if inputs_chosen:
-        del found.values["views"]
+    # A size that was chosen because it is better needs no warning.
     if size_chosen:
         del found.values["side"]
     remarks = (

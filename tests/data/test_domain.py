@@ -98,9 +98,10 @@ def test_the_sentence():
     trained = domain(around(1, (-0.1, 0.1)), around(2, (-0.2, 0.2)))
     within = domain(around(1.5, (-0.15, 0.15)))
     assert not trained.differences(within)
-    wide = domain(around(1.5, (-1.5, 1.5, 0), focal=4.0))
+    assert not trained.differences(domain(around(1.5, (-0.15, 0.15, 0))))
+    wide = domain(around(1.5, (-1.5, 1.5, 0, 0.5), focal=4.0))
     outside = trained.differences(wide)
-    assert [float(re.findall(r"[\d.]+", text)[0]) for text in outside] == [3, 3, 90, 152]
+    assert [float(re.findall(r"[\d.]+", text)[0]) for text in outside] == [4, 3, 90, 152]
     assert all(text in verdict(trained, wide) for text in outside)
     assert "checkpoint does not record" in verdict(Domain(), within)
 
