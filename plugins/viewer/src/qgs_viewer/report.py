@@ -117,7 +117,8 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
     judged = "beside" if first.windows else "between"
     samples = counted(first.evaluation.samples, "sample")
-    views = f"{samples}, {first.recipe.views.inputs} inputs, scored on views {judged} the inputs"
+    inputs = sorted({len(sample.input_frames) for sample in shown[0].samples})
+    views = f"{samples}, {listed(inputs)} inputs, scored on views {judged} the inputs"
     names = listed((model.name for model in models), most=3)
     parts = first.recipe.parts.items()
     meanings = [summary_of(part.component) for place, part in parts if place[0] == "metrics"]
