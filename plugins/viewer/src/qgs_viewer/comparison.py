@@ -100,11 +100,13 @@ class PhotoWindows(Span):
     """View sampler that chooses at most `count` windows of each scene by `spread_windows`.
 
     A window is a set of input photos with the photos that renders are compared to. The choice is
-    made once for each scene.
+    made once for each scene. alone: whether renders of a scene whose photos are all inputs are
+    compared with the inputs.
     """
 
-    def __init__(self, trained_on: Domain, count: int) -> None:
+    def __init__(self, trained_on: Domain, count: int, alone: bool) -> None:
         super().__init__(Span.Config())
+        self._alone = alone
         self._trained_on = trained_on
         self._count = count
         self._known: dict[str, list[Window]] = {}
@@ -113,20 +115,20 @@ class PhotoWindows(Span):
         """Return pairs (input photos, photos to compare with) of a scene.
 
         The list is empty for a moving scene, whose photos have times. Raises ValueError if all
-        photos are inputs, so that no photo is left to compare with.
+        photos are inputs, so that no photo is left to compare with, unless the scene is `alone`.
         """
         if scene.times is not None:
             # a moment of a moving scene has few views; the recipe's sampler knows which
             return []
         if scene.name not in self._known:
             windows = spread_windows(scene, views.inputs, self._trained_on, self._count, True)
-            if not any(compared for _, compared in windows):
+            if not windows and not self._alone:
                 raise ValueError(
                     f"all {len(scene)} photos are inputs, so no photo is left to compare renders "
-                    "with: add a photo taken between them, or view the reconstruction without a "
-                    "comparison by `qgs view MODEL PHOTOS`"
+                    "with: add a photo taken between them"
                 )
-            self._known[scene.name] = windows
+            every = tuple(range(len(scene)))
+            self._known[scene.name] = windows or [(every, every)]
         return self._known[scene.name]
 
 
@@ -240,7 +242,9 @@ def open_models(
     first = models[0]
     # those of the first model for all, so that one protocol judges them
     count = ALONE if len(models) == 1 else WINDOWS
-    windows = PhotoWindows(first.network.trained_on or Domain(), count)
+    data = recipes[first.name].build_data()
+    alone = len({*data.names("train"), *data.names("test")}) == 1
+    windows = PhotoWindows(first.network.trained_on or Domain(), count, alone)
     fixed = any(
         is_training_data(photos, recipe.data_config) or size_multiple(recipe) is None
         for recipe in trained.values()

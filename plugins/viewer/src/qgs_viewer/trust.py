@@ -1,5 +1,6 @@
 """Verdict on a reconstruction: what its inputs see of scored views, and how close that is."""
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -97,10 +98,16 @@ def verdict(views: Sequence[ScoredView]) -> str:
     2. A third of a view is grey or guessed if the inputs see less than half of it.
     3. A third is wrong if inputs see half of it, but the nearest photo is as close to the truth.
     4. A third, such as the left one, is not to be trusted if 2 or 3 holds in half of the views.
+    5. Scored inputs tell nothing of other views.
     """
     coverage, quality, copied = means(views)
     if not coverage:
         return "The inputs see nothing of the scored views. Do not trust any part."
+    if math.isinf(copied):
+        return (
+            f"The inputs are rendered with {quality:.1f} dB. No other photo shows how good new "
+            "views are: add one from between the inputs."
+        )
     word = next((word for word, least in QUALITY.items() if quality >= least), "Wrong")
     if quality <= copied:
         word = "Wrong"
