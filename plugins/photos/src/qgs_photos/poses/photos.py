@@ -19,7 +19,7 @@ from qgs.data.images import eight_bits, opened_image, orientation
 from qgs.wording import counted, listed
 from qgs_photos.image_files import image_files
 
-LEAST = 3
+LEAST = 2
 # Pixels of a side.
 SMALLEST = 64
 _FOREIGN = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".jxl")

@@ -18,7 +18,9 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from qgs_photos.poses import few
 from qgs_photos.poses.job import Job
+from qgs_photos.poses.two_views import two_views
 
 # Takes dictionaries for options, which its types do not say.
 COLMAP: Any = pycolmap
@@ -97,12 +99,14 @@ def mapped(job: Job) -> Mapping[str, Any]:
     with COLMAP.Database.open(job.database) as opened:
         images = opened.read_all_images()
         counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
-    if sum(count >= FEW_FEATURES for count in counts) < 3:
+    if sum(count >= FEW_FEATURES for count in counts) < 2:
         reason = (
-            f"fewer than three of {total} photos have enough features to match: the photos are "
+            f"fewer than two of {total} photos have enough features to match: the photos are "
             "blurred, or show surfaces without texture. Take sharp photos of something with texture"
         )
         return {"refused": reason}
+    if total == 2:
+        return _two(job)
     tell("matching", 0, total)
     settings = {
         "matching_options": {"num_threads": job.threads},
@@ -129,6 +133,16 @@ def mapped(job: Job) -> Mapping[str, Any]:
         )
         return {"refused": reason}
     return _models(job, total)
+
+
+def _two(job: Job) -> Mapping[str, Any]:
+    with COLMAP.Database.open(job.database) as opened:
+        found = few.views(opened)
+        pair = two_views(*found.values())
+        if reason := few.refusal(pair):
+            return {"refused": reason}
+        model = few.model(opened, tuple(found), pair)
+    return _written(model, job)
 
 
 def _leave_out_unlikely_pairs(database: str) -> None:
@@ -218,10 +232,14 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
         )
         return {"refused": reason}
     largest = max(solid, key=COLMAP.Reconstruction.num_reg_images)
+    return _written(_centred(largest, job.threads), job)
+
+
+def _written(model: Any, job: Job) -> Mapping[str, Any]:
     best = Path(job.models, "best")
     best.mkdir()
-    _scaled(_centred(largest, job.threads), job.sizes).write(best)
-    return {"posed": sorted(image.name for image in largest.images.values())}
+    _scaled(model, job.sizes).write(best)
+    return {"posed": sorted(image.name for image in model.images.values())}
 
 
 def _centred(model: Any, threads: int) -> Any:

@@ -1,0 +1,328 @@
+"""Find the relative pose and the focal length of two photos from their matching features.
+
+Matches of all qualities take part: how much nearer a match is than the second best says how likely
+it is right, and a mixture of noise and of wrong matches scores poses. So no threshold decides which
+matches count. COLMAP's RANSAC only proposes poses, at several focal lengths if none is known.
+
+Points are in pixels from the middle of a photo. Those of the second photo are scaled, so that both
+photos have the focal length of the first. A pose maps points of the first camera to the second,
+y = rotation @ x + translation, in OpenCV axes; the translation has length 1.
+Axes: K hypotheses, N matches.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+Array: TypeAlias = npt.NDArray[Any]
+# Takes dictionaries for options, which its types do not say.
+COLMAP: Any = pycolmap
+
+FOCALS = tuple(np.geomspace(0.6, 3.2, 8))
+"""Focal lengths to propose if the true one is unknown, in units of the longer side."""
+USUAL = (1.2, 0.8)
+"""Median of usual focal lengths in units of the longer side, and deviation of their logarithm."""
+EXIF = 0.01
+"""Deviation of the logarithm of focal lengths that EXIF gives."""
+SETS = ((0.8, 2.0), (0.9, 2.0), (0.7, 2.0), (0.8, 1.0))
+"""Matches for RANSAC: largest ratio of distances, and largest error in pixels. Only the first set
+is used if the focal length is unknown."""
+LEAST_SET = 6
+MOST_MATCHES = 1500
+WORST_RATIO = 0.97
+REFINED = 8
+"""Number of proposed poses that are refined."""
+NOISE = ((0.5, 0.25), (0.35, 0.8), (0.15, 3.0))
+"""Weights and standard deviations in pixels of the errors of right matches."""
+WRONG = 0.4
+"""Range of the errors of wrong matches, in units of the longer side."""
+STEPS = 15
+"""Largest number of steps of the refinement."""
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class View:
+    """Features of a photo.
+
+    points: (n, 2). descriptors: (n, 128), of length 1. side: longer side in pixels. focal: focal
+    length in pixels; None if unknown.
+    """
+
+    points: Array
+    descriptors: Array
+    side: float
+    focal: float | None
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matches of two photos.
+
+    indices: (N, 2) of the features of both. one, other: (N, 2) points. ratios: (N,) distance of a
+    match over that of the second best, the larger of both directions. scale: factor of the points
+    of the second photo. side: longer side in pixels of the first photo. prior: mean and deviation
+    of the logarithm of its focal length in pixels.
+    """
+
+    indices: Array
+    one: Array
+    other: Array
+    ratios: Array
+    scale: float
+    side: float
+    prior: tuple[float, float]
+
+    @property
+    def right(self) -> Array:
+        """(N,) probability of each match to be right, before a pose is known."""
+        return 0.01 + 0.9 / (1 + np.exp((self.ratios - 0.82) / 0.04))
+
+
+@dataclass(frozen=True)
+class Poses:
+    """K poses: rotations (K, 3, 3), unit translations (K, 3), focals (K,) in pixels.
+
+    scores: (K,) log likelihood ratio to wrong matches alone, and log prior. errors: (K, N) signed
+    Sampson errors in pixels. weights: (K, N) of their squares.
+    """
+
+    rotations: Array
+    translations: Array
+    focals: Array
+    scores: Array
+    errors: Array
+    weights: Array
+
+    def chosen(self, index: Any) -> "Poses":
+        """Return the poses at `index`."""
+        return Poses(*(own[index] for own in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class TwoViews:
+    """Pose of the second camera, focal lengths of both in pixels, and how sure they are.
+
+    rotation: (3, 3). translation: (3,). points: (n, 3) of right matches, in the frame of the first
+    camera. indices: (n, 2) of their features. score: log likelihood ratio to wrong matches alone.
+    doubt: standard deviation of the direction of translation, degrees. focal_doubt: that of the
+    logarithm of the focal length. parallax: median distance in pixels of right matches after the
+    rotation that fits best.
+    """
+
+    rotation: Array
+    translation: Array
+    focals: tuple[float, float]
+    points: Array
+    indices: Array
+    score: float
+    doubt: float
+    focal_doubt: float
+    parallax: float
+
+
+def two_views(one: View, other: View) -> TwoViews | None:
+    """Return the most likely pose and focal length; None if there are too few matches."""
+    matches = matched(one, other)
+    found = [*_proposed(matches)]
+    if not found:
+        return None
+    rows = np.array(found)
+    poses = _scored(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12], rows[:, 12], matches)
+    first = (-poses.scores).argsort(kind="stable")[:REFINED]
+    poses = refined(poses.chosen(first), matches)
+    return _verdict(poses.chosen([poses.scores.argmax()]), matches)
+
+
+def matched(one: View, other: View) -> Matches:
+    """Return mutual nearest features, at most MOST_MATCHES of the least ratios."""
+    similar = one.descriptors @ other.descriptors.T
+    best = similar.argmax(1)
+    rows = np.nonzero(similar.argmax(0)[best] == np.arange(len(best)))[0]
+    best = best[rows]
+    first = similar[rows, best]
+    # without the mutual matches, the second best of both directions are left
+    similar[rows, best] = -1
+    second = np.maximum(similar[rows].max(1), similar.max(0)[best])
+    ratios = np.arccos(first.clip(0, 1 - 1e-6)) / np.arccos(second.clip(0, 1 - 1e-6))
+    order = ratios.argsort(kind="stable")[:MOST_MATCHES]
+    order = order[ratios[order] < WORST_RATIO]
+    indices = np.stack([rows, best], 1)[order]
+    if one.focal and other.focal:
+        scale = one.focal / other.focal
+        prior = np.log(one.focal), EXIF
+    else:
+        scale = one.side / other.side
+        prior = np.log(USUAL[0] * one.side), USUAL[1]
+    points = one.points[indices[:, 0]].astype(float)
+    others = other.points[indices[:, 1]].astype(float) * scale
+    return Matches(indices, points, others, ratios[order], scale, one.side, prior)
+
+
+def _proposed(matches: Matches) -> Iterator[Array]:
+    """Yield poses that RANSAC finds: a row (13,) of rotation, translation and focal length."""
+    known = matches.prior[1] == EXIF
+    sets = SETS if known else SETS[:1]
+    for focal in [np.exp(matches.prior[0])] if known else np.multiply(FOCALS, matches.side):
+        # points are from the middle, so the size does not matter
+        camera = COLMAP.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0, 0])
+        for ratio, error in sets:
+            kept = matches.ratios < ratio
+            if kept.sum() < LEAST_SET:
+                continue
+            options = {
+                "random_seed": 0,
+                "max_error": error,
+                "min_num_trials": 100,
+                "max_num_trials": 2000,
+            }
+            result = COLMAP.estimate_relative_pose(
+                camera, matches.one[kept], camera, matches.other[kept], COLMAP.RANSACOptions(options)
+            )
+            if result is not None:
+                pose = result["cam2_from_cam1"].matrix()
+                length = np.linalg.norm(pose[:, 3])
+                yield np.concatenate([pose[:, :3].ravel(), pose[:, 3] / length, [focal]])
+
+
+def _scored(rotations: Array, translations: Array, focals: Array, matches: Matches) -> Poses:
+    errors = _errors(rotations, translations, focals, matches)
+    gains, weights = likelihood(errors, matches)
+    mean, deviation = matches.prior
+    scores = gains.sum(-1) - 0.5 * ((np.log(focals) - mean) / deviation) ** 2
+    return Poses(rotations, translations, focals, scores, errors, weights)
+
+
+def _errors(rotations: Array, translations: Array, focals: Array, matches: Matches) -> Array:
+    """Return signed Sampson errors (K, N) in pixels."""
+    one = _rays(matches.one, focals)
+    other = _rays(matches.other, focals)
+    essential = _crossing(translations) @ rotations
+    lines = one @ essential.mT
+    back = other @ essential
+    slope = (lines[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1)
+    return (other * lines).sum(-1) / np.sqrt(slope + 1e-24) * focals[:, None]
+
+
+def _rays(points: Array, focals: Array) -> Array:
+    """Return directions (K, N, 3) of points (N, 2), with z = 1."""
+    scaled = points / focals[:, None, None]
+    return np.concatenate([scaled, np.ones_like(scaled[..., :1])], -1)
+
+
+def _crossing(vectors: Array) -> Array:
+    """Return matrices (K, 3, 3) of the cross product with vectors (K, 3)."""
+    return np.cross(vectors[:, None], np.eye(3)).mT
+
+
+def likelihood(errors: Array, matches: Matches) -> tuple[Array, Array]:
+    """Return log likelihood ratios of errors (K, N) to wrong matches, and weights of squares."""
+    wrong = WRONG * matches.side
+    total = (1 - matches.right) / wrong + np.zeros_like(errors)
+    slope = np.zeros_like(errors)
+    for weight, deviation in NOISE:
+        density = np.exp(-0.5 * (errors / deviation) ** 2) / (np.sqrt(2 * np.pi) * deviation)
+        density *= weight * matches.right
+        total += density
+        slope += density / deviation**2
+    return np.log(total * wrong), slope / total
+
+
+def refined(poses: Poses, matches: Matches) -> Poses:
+    """Refine rotations, translations and focal lengths by Levenberg and Marquardt's method."""
+    damping = np.full(len(poses.focals), 1e-3)
+    for _ in range(STEPS):
+        normal, slope = _normal(poses, matches)
+        diagonal = np.einsum("kii->ki", normal)
+        diagonal += damping[:, None] * diagonal + 1e-6
+        step = -np.linalg.solve(normal, slope[..., None])[..., 0].clip(-0.3, 0.3)
+        tried = _stepped(poses, step, matches)
+        gain = tried.scores - poses.scores
+        better = gain > 0
+        damping = np.where(better, damping / 5, damping * 8)
+        poses = Poses(
+            *(
+                np.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+                for old, new in zip(vars(poses).values(), vars(tried).values(), strict=True)
+            )
+        )
+        if (better & (gain < 0.01) | (damping > 100)).all():
+            break
+    return poses
+
+
+def _normal(poses: Poses, matches: Matches) -> tuple[Array, Array]:
+    """Return the normal matrices (K, 6, 6) of one step and the gradients (K, 6)."""
+    moved = (_stepped(poses, _STEP * row, matches) for row in np.eye(6))
+    slopes = np.stack([(each.errors - poses.errors) / _STEP for each in moved], -1)
+    weighted = slopes * poses.weights[..., None]
+    normal = weighted.mT @ slopes
+    gradient = (weighted * poses.errors[..., None]).sum(1)
+    mean, deviation = matches.prior
+    normal[:, 5, 5] += deviation**-2
+    gradient[:, 5] += (np.log(poses.focals) - mean) * deviation**-2
+    return normal, gradient
+
+
+def _stepped(poses: Poses, step: Array, matches: Matches) -> Poses:
+    """Return moved poses.
+
+    step: (K, 6) or (6,), rotation vector, translation in its tangent plane, log focal length.
+    """
+    step = np.broadcast_to(step, (len(poses.focals), 6))
+    angle = np.linalg.norm(step[:, :3], axis=1)[:, None, None].clip(1e-12)
+    turn = _crossing(step[:, :3]) / angle
+    rotations = np.eye(3) + np.sin(angle) * turn + (1 - np.cos(angle)) * turn @ turn
+    own = poses.translations
+    # the axis that is least parallel
+    side = np.cross(own, np.eye(3)[abs(own).argmin(1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    translations = own + step[:, 3:4] * side + step[:, 4:5] * np.cross(own, side)
+    translations /= np.linalg.norm(translations, axis=1, keepdims=True)
+    focals = poses.focals * np.exp(step[:, 5])
+    return _scored(rotations @ poses.rotations, translations, focals, matches)
+
+
+def _verdict(best: Poses, matches: Matches) -> TwoViews:
+    """Return the pose `best` (K = 1), with the sign of translation at which points are in front."""
+    gains = likelihood(best.errors, matches)[0][0]
+    # probability to be right, now that the pose is known
+    chances = 1 - (1 - matches.right) * np.exp(-gains)
+    one = _rays(matches.one, best.focals)[0]
+    other = _rays(matches.other, best.focals)[0]
+    rotation = best.rotations[0]
+    translation = best.translations[0]
+    # depths in both cameras, by least squares: depth * one @ rotation.T + translation = other
+    system = np.stack([-one @ rotation.T, other], -1)
+    depths = (np.linalg.pinv(system) @ translation[:, None])[..., 0]
+    sign = 1.0 if (np.sign(depths) * chances[:, None]).sum() >= 0 else -1.0
+    depths = sign * depths
+    right = (depths.min(1) > 0) & (chances > 0.5)
+    covariance = np.linalg.inv(_normal(best, matches)[0])[0]
+    focal = float(best.focals[0])
+    return TwoViews(
+        rotation=rotation,
+        translation=sign * translation,
+        focals=(focal, focal / matches.scale),
+        points=(one * depths[:, :1])[right],
+        indices=matches.indices[right],
+        score=float(best.scores[0]),
+        doubt=float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[-1]))),
+        focal_doubt=float(np.sqrt(covariance[5, 5])),
+        parallax=focal * _turned_apart(one[right], other[right]),
+    )
+
+
+def _turned_apart(one: Array, other: Array) -> float:
+    """Return the median angle of rays (n, 3) after the rotation that fits best, in radians."""
+    if not len(one):
+        return 0.0
+    one = one / np.linalg.norm(one, axis=1, keepdims=True)
+    other = other / np.linalg.norm(other, axis=1, keepdims=True)
+    left, _, right = np.linalg.svd(other.T @ one)
+    turn = left * [1, 1, np.linalg.det(left @ right)] @ right
+    return float(np.median(np.linalg.norm(one @ turn.T - other, axis=1)))
