@@ -18,8 +18,8 @@ _LINES = 30
 _STEP = re.compile(r"Process(?:ed file|ing image|ing block) \[(\d+)/(\d+)")
 
 
-def run(job: Job, show: Show) -> Sequence[str]:
-    """Run `job` in a separate process; return the names of the photos in the largest model.
+def run(job: Job, show: Show) -> tuple[Sequence[str], Sequence[str]]:
+    """Run `job` in a separate process; return the names of the photos with poses, and remarks.
 
     show: called with the stage, the number of steps done and the number of all steps. Raises
     PosesError if COLMAP finds no model or its process crashes.
@@ -67,4 +67,4 @@ def run(job: Job, show: Show) -> Sequence[str]:
             f"COLMAP ended in the stage {told.get('stage')!r} by {how} ({reason[:200]}): repeat "
             "the command, with a smaller --side if memory is short"
         )
-    return told["posed"]
+    return told["posed"], told["remarks"]

@@ -189,8 +189,8 @@ def _made(source: Path, out: Path, working: Path, options: Options, show: Show) 
         threads=options.threads,
         seed=options.seed,
     )
-    posed = run(job, show)
+    posed, told = run(job, show)
     (out / "sparse").mkdir()
     (models / "best").rename(out / "sparse/0")
     without = [photo.name for photo in photos if photo.name not in {*posed}]
-    return Poses(posed, without, faulty, remarks)
+    return Poses(posed, without, faulty, [*remarks, *told])

@@ -26,16 +26,14 @@ FOCALS = tuple(np.geomspace(0.6, 3.2, 8))
 """Focal lengths to propose if the true one is unknown, in units of the longer side."""
 USUAL = (1.2, 0.8)
 """Median of usual focal lengths in units of the longer side, and deviation of their logarithm."""
-EXIF = 0.01
+EXIF = 0.02
 """Deviation of the logarithm of focal lengths that EXIF gives."""
 SETS = ((0.8, 2.0), (0.9, 2.0), (0.7, 2.0), (0.8, 1.0))
-"""Matches for RANSAC: largest ratio of distances, and largest error in pixels. Only the first set
-is used if the focal length is unknown."""
+"""Matches for RANSAC: largest ratio of distances, and largest error in pixels. Only the first two
+sets are used if the focal length is unknown."""
 LEAST_SET = 6
 MOST_MATCHES = 1500
 WORST_RATIO = 0.97
-REFINED = 8
-"""Number of proposed poses that are refined."""
 NOISE = ((0.5, 0.25), (0.35, 0.8), (0.15, 3.0))
 """Weights and standard deviations in pixels of the errors of right matches."""
 WRONG = 0.4
@@ -133,8 +131,7 @@ def two_views(one: View, other: View) -> TwoViews | None:
         return None
     rows = np.array(found)
     poses = _scored(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12], rows[:, 12], matches)
-    first = (-poses.scores).argsort(kind="stable")[:REFINED]
-    poses = refined(poses.chosen(first), matches)
+    poses = refined(poses, matches)
     return _verdict(poses.chosen([poses.scores.argmax()]), matches)
 
 
@@ -166,7 +163,7 @@ def matched(one: View, other: View) -> Matches:
 def _proposed(matches: Matches) -> Iterator[Array]:
     """Yield poses that RANSAC finds: a row (13,) of rotation, translation and focal length."""
     known = matches.prior[1] == EXIF
-    sets = SETS if known else SETS[:1]
+    sets = SETS if known else SETS[:2]
     for focal in [np.exp(matches.prior[0])] if known else np.multiply(FOCALS, matches.side):
         # points are from the middle, so the size does not matter
         camera = COLMAP.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0, 0])
@@ -181,7 +178,11 @@ def _proposed(matches: Matches) -> Iterator[Array]:
                 "max_num_trials": 2000,
             }
             result = COLMAP.estimate_relative_pose(
-                camera, matches.one[kept], camera, matches.other[kept], COLMAP.RANSACOptions(options)
+                camera,
+                matches.one[kept],
+                camera,
+                matches.other[kept],
+                COLMAP.RANSACOptions(options),
             )
             if result is not None:
                 pose = result["cam2_from_cam1"].matrix()

@@ -18,9 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from qgs_photos.poses import few
+from qgs_photos.poses.few import FEW, Refused, beginning, no_matches, one_place
 from qgs_photos.poses.job import Job
-from qgs_photos.poses.two_views import two_views
 
 # Takes dictionaries for options, which its types do not say.
 COLMAP: Any = pycolmap
@@ -35,6 +34,12 @@ FEW_POINTS = 30
 SMALL = {"init_min_tri_angle": 4.0, "init_min_num_inliers": 50}
 """Least triangulation angle (degrees) and number of inliers of the first pair of photos. Used if
 COLMAP finds no pair with its defaults of 16 degrees and 100 inliers."""
+OWN = {
+    "abs_pose_min_num_inliers": 15,
+    "abs_pose_min_inlier_ratio": 0.15,
+    "filter_min_tri_angle": 0.5,
+}
+"""Limits for photos that COLMAP adds to the best pair of few photos."""
 SMALL_SIDE = 1000
 """Longer side in pixels up to which features are searched at twice the photo's size. This finds
 more features and takes longer."""
@@ -57,7 +62,11 @@ def main() -> None:
     """Read a job from standard input, run it, and print its result."""
     job = Job(**json.loads(sys.stdin.readline()))
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    print(json.dumps(mapped(job)), flush=True)
+    try:
+        told = mapped(job)
+    except Refused as reason:
+        told = {"refused": str(reason)}
+    print(json.dumps(told), flush=True)
 
 
 def _end_with_parent() -> None:
@@ -77,9 +86,24 @@ def mapped(job: Job) -> Mapping[str, Any]:
     """Find features, matches and poses; write the models that COLMAP finds into `job.models`.
 
     The largest model is in its subfolder `best`. Returns {"posed": names of the photos in this
-    model}, or {"refused": reason} if the photos give no model.
+    model, "remarks": sentences for the user}. Raises Refused if the photos give no model.
     """
     COLMAP.set_random_seed(job.seed)
+    total = len(job.sizes)
+    _find_features(job)
+    start = None
+    remarks = list[str]()
+    if total <= FEW:
+        tell("pairs", 0, 1)
+        with COLMAP.Database.open(job.database) as opened:
+            start, remarks = beginning(opened)
+    if total > 2:
+        _match(job)
+        start = _largest_model(job, start)
+    return {"posed": _written(start, job), "remarks": remarks}
+
+
+def _find_features(job: Job) -> None:
     total = len(job.sizes)
     tell("features", 0, total)
     for group in job.groups:
@@ -100,13 +124,14 @@ def mapped(job: Job) -> Mapping[str, Any]:
         images = opened.read_all_images()
         counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
     if sum(count >= FEW_FEATURES for count in counts) < 2:
-        reason = (
+        raise Refused(
             f"fewer than two of {total} photos have enough features to match: the photos are "
             "blurred, or show surfaces without texture. Take sharp photos of something with texture"
         )
-        return {"refused": reason}
-    if total == 2:
-        return _two(job)
+
+
+def _match(job: Job) -> None:
+    total = len(job.sizes)
     tell("matching", 0, total)
     settings = {
         "matching_options": {"num_threads": job.threads},
@@ -124,25 +149,8 @@ def mapped(job: Job) -> Mapping[str, Any]:
         COLMAP.match_exhaustive(job.database, pairing_options={"block_size": 5}, **settings)
     with COLMAP.Database.open(job.database) as opened:
         _, counts = opened.read_two_view_geometry_num_inliers()
-    pairs = sum(count >= FEW_MATCHES for count in counts)
-    # a model needs three photos, so two pairs
-    if pairs < 2:
-        reason = (
-            f"only {pairs} pairs of {total} photos have enough matches. Take more photos, a step "
-            "apart, so that each shows half of what the photo before shows"
-        )
-        return {"refused": reason}
-    return _models(job, total)
-
-
-def _two(job: Job) -> Mapping[str, Any]:
-    with COLMAP.Database.open(job.database) as opened:
-        found = few.views(opened)
-        pair = two_views(*found.values())
-        if reason := few.refusal(pair):
-            return {"refused": reason}
-        model = few.model(opened, tuple(found), pair)
-    return _written(model, job)
+    if not any(count >= FEW_MATCHES for count in counts):
+        raise Refused(no_matches(total))
 
 
 def _leave_out_unlikely_pairs(database: str) -> None:
@@ -191,7 +199,12 @@ def likely(features: Array) -> Array:
     return wanted | wanted.T
 
 
-def _models(job: Job, total: int) -> Mapping[str, Any]:
+def _largest_model(job: Job, start: Any) -> Any:
+    """Return the model with most photos that COLMAP finds.
+
+    start: model of two photos, to which COLMAP adds the others; None lets COLMAP choose them.
+    """
+    total = len(job.sizes)
     done = 0
 
     def began() -> None:
@@ -212,34 +225,36 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
         "ba_global_frames_ratio": GROWTH,
         "ba_global_points_ratio": GROWTH,
     }
+    begun = Path(job.models, "start")
+    if start is not None:
+        begun.mkdir()
+        start.write(begun)
     # COLMAP's own limits first: easier ones accept first pairs with little parallax
-    for mapper in ({}, SMALL):
+    for mapper in ({}, SMALL) if start is None else (OWN,):
         models = COLMAP.incremental_mapping(
             job.database,
             job.images,
             job.models,
             options={**options, "mapper": mapper},
+            input_path="" if start is None else begun,
             initial_image_pair_callback=began,
             next_image_callback=further,
         )
         solid = [model for model in models.values() if model.num_points3D() >= FEW_POINTS]
         if solid:
-            break
-    else:
-        reason = (
-            f"the {total} photos match, but no two of them show the same from positions far enough "
-            "apart. Take more photos, and walk around your subject: do not turn on the spot"
-        )
-        return {"refused": reason}
-    largest = max(solid, key=COLMAP.Reconstruction.num_reg_images)
-    return _written(_centred(largest, job.threads), job)
+            largest = max(solid, key=COLMAP.Reconstruction.num_reg_images)
+            return _centred(largest, job.threads)
+    if start is None:
+        raise Refused(one_place(total))
+    return start
 
 
-def _written(model: Any, job: Job) -> Mapping[str, Any]:
+def _written(model: Any, job: Job) -> list[str]:
+    """Write `model` for photos of their original sizes; return the names of its photos."""
     best = Path(job.models, "best")
     best.mkdir()
     _scaled(model, job.sizes).write(best)
-    return {"posed": sorted(image.name for image in model.images.values())}
+    return sorted(image.name for image in model.images.values())
 
 
 def _centred(model: Any, threads: int) -> Any:
