@@ -22,7 +22,7 @@ def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
     images = [image[::2, ::2] for image in images[:4]]
     pictures = {
         "none": [],
-        "two photos": images[:2],
+        "one photo": images[:1],
         "one view": images[:1] * 4,
         "bare": [np.full_like(image, 127) for image in images],
         "blurred": [np.array(Image.fromarray(i).resize((9, 6)).resize((180, 120))) for i in images],

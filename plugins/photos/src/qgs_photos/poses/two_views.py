@@ -26,7 +26,7 @@ FOCALS = tuple(np.geomspace(0.6, 3.2, 8))
 """Focal lengths to propose if the true one is unknown, in units of the longer side."""
 USUAL = (1.2, 0.8)
 """Median of usual focal lengths in units of the longer side, and deviation of their logarithm."""
-EXIF = 0.02
+EXIF = 0.01
 """Deviation of the logarithm of focal lengths that EXIF gives."""
 SETS = ((0.8, 2.0), (0.9, 2.0), (0.7, 2.0), (0.8, 1.0))
 """Matches for RANSAC: largest ratio of distances, and largest error in pixels. Only the first two
@@ -96,10 +96,6 @@ class Poses:
     errors: Array
     weights: Array
 
-    def chosen(self, index: Any) -> "Poses":
-        """Return the poses at `index`."""
-        return Poses(*(own[index] for own in vars(self).values()))
-
 
 @dataclass(frozen=True)
 class TwoViews:
@@ -107,9 +103,8 @@ class TwoViews:
 
     rotation: (3, 3). translation: (3,). points: (n, 3) of right matches, in the frame of the first
     camera. indices: (n, 2) of their features. score: log likelihood ratio to wrong matches alone.
-    doubt: standard deviation of the direction of translation, degrees. focal_doubt: that of the
-    logarithm of the focal length. parallax: median distance in pixels of right matches after the
-    rotation that fits best.
+    focal_doubt: standard deviation of the logarithm of the focal length. flat: share of right
+    matches that a plane explains.
     """
 
     rotation: Array
@@ -118,9 +113,13 @@ class TwoViews:
     points: Array
     indices: Array
     score: float
-    doubt: float
     focal_doubt: float
-    parallax: float
+    flat: float
+
+    @property
+    def depth(self) -> float:
+        """Median depth of the points; infinite without points."""
+        return float(np.median(self.points[:, 2])) if len(self.points) else np.inf
 
 
 def two_views(one: View, other: View) -> TwoViews | None:
@@ -132,7 +131,8 @@ def two_views(one: View, other: View) -> TwoViews | None:
     rows = np.array(found)
     poses = _scored(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12], rows[:, 12], matches)
     poses = refined(poses, matches)
-    return _verdict(poses.chosen([poses.scores.argmax()]), matches)
+    best = poses.scores.argmax()
+    return _verdict(Poses(*(own[[best]] for own in vars(poses).values())), matches)
 
 
 def matched(one: View, other: View) -> Matches:
@@ -182,7 +182,7 @@ def _proposed(matches: Matches) -> Iterator[Array]:
                 matches.one[kept],
                 camera,
                 matches.other[kept],
-                COLMAP.RANSACOptions(options),
+                options,
             )
             if result is not None:
                 pose = result["cam2_from_cam1"].matrix()
@@ -239,7 +239,7 @@ def refined(poses: Poses, matches: Matches) -> Poses:
     for _ in range(STEPS):
         normal, slope = _normal(poses, matches)
         diagonal = np.einsum("kii->ki", normal)
-        diagonal += damping[:, None] * diagonal + 1e-6
+        diagonal += damping[:, None] * diagonal
         step = -np.linalg.solve(normal, slope[..., None])[..., 0].clip(-0.3, 0.3)
         tried = _stepped(poses, step, matches)
         gain = tried.scores - poses.scores
@@ -257,34 +257,32 @@ def refined(poses: Poses, matches: Matches) -> Poses:
 
 
 def _normal(poses: Poses, matches: Matches) -> tuple[Array, Array]:
-    """Return the normal matrices (K, 6, 6) of one step and the gradients (K, 6)."""
-    moved = (_stepped(poses, _STEP * row, matches) for row in np.eye(6))
+    """Return the normal matrices (K, 7, 7) of one step and the gradients (K, 7)."""
+    moved = (_stepped(poses, _STEP * row, matches) for row in np.eye(7))
     slopes = np.stack([(each.errors - poses.errors) / _STEP for each in moved], -1)
     weighted = slopes * poses.weights[..., None]
     normal = weighted.mT @ slopes
     gradient = (weighted * poses.errors[..., None]).sum(1)
+    # the length of a translation has no effect
+    normal += 1e-6 * np.eye(7)
     mean, deviation = matches.prior
-    normal[:, 5, 5] += deviation**-2
-    gradient[:, 5] += (np.log(poses.focals) - mean) * deviation**-2
+    normal[:, 6, 6] += deviation**-2
+    gradient[:, 6] += (np.log(poses.focals) - mean) * deviation**-2
     return normal, gradient
 
 
 def _stepped(poses: Poses, step: Array, matches: Matches) -> Poses:
     """Return moved poses.
 
-    step: (K, 6) or (6,), rotation vector, translation in its tangent plane, log focal length.
+    step: (K, 7) or (7,), rotation vector, translation, logarithm of the focal length.
     """
-    step = np.broadcast_to(step, (len(poses.focals), 6))
+    step = np.broadcast_to(step, (len(poses.focals), 7))
     angle = np.linalg.norm(step[:, :3], axis=1)[:, None, None].clip(1e-12)
     turn = _crossing(step[:, :3]) / angle
     rotations = np.eye(3) + np.sin(angle) * turn + (1 - np.cos(angle)) * turn @ turn
-    own = poses.translations
-    # the axis that is least parallel
-    side = np.cross(own, np.eye(3)[abs(own).argmin(1)])
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    translations = own + step[:, 3:4] * side + step[:, 4:5] * np.cross(own, side)
+    translations = poses.translations + step[:, 3:6]
     translations /= np.linalg.norm(translations, axis=1, keepdims=True)
-    focals = poses.focals * np.exp(step[:, 5])
+    focals = poses.focals * np.exp(step[:, 6])
     return _scored(rotations @ poses.rotations, translations, focals, matches)
 
 
@@ -312,18 +310,13 @@ def _verdict(best: Poses, matches: Matches) -> TwoViews:
         points=(one * depths[:, :1])[right],
         indices=matches.indices[right],
         score=float(best.scores[0]),
-        doubt=float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[-1]))),
-        focal_doubt=float(np.sqrt(covariance[5, 5])),
-        parallax=focal * _turned_apart(one[right], other[right]),
+        focal_doubt=float(np.sqrt(covariance[6, 6])),
+        flat=_flat(matches.one[right], matches.other[right]),
     )
 
 
-def _turned_apart(one: Array, other: Array) -> float:
-    """Return the median angle of rays (n, 3) after the rotation that fits best, in radians."""
-    if not len(one):
-        return 0.0
-    one = one / np.linalg.norm(one, axis=1, keepdims=True)
-    other = other / np.linalg.norm(other, axis=1, keepdims=True)
-    left, _, right = np.linalg.svd(other.T @ one)
-    turn = left * [1, 1, np.linalg.det(left @ right)] @ right
-    return float(np.median(np.linalg.norm(one @ turn.T - other, axis=1)))
+def _flat(one: Array, other: Array) -> float:
+    """Return the share of matches (n, 2) that one plane explains."""
+    options = {"random_seed": 0, "max_error": 3.0}
+    found = COLMAP.estimate_homography_matrix(one, other, options)
+    return found["num_inliers"] / len(one) if found else 0.0

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from qgs_photos.poses.few import FEW, Refused, beginning, no_matches, one_place
+from qgs_photos.poses.few import FEW, RefusedError, beginning, no_matches, one_place
 from qgs_photos.poses.job import Job
 
 # Takes dictionaries for options, which its types do not say.
@@ -64,7 +64,7 @@ def main() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         told = mapped(job)
-    except Refused as reason:
+    except RefusedError as reason:
         told = {"refused": str(reason)}
     print(json.dumps(told), flush=True)
 
@@ -86,7 +86,7 @@ def mapped(job: Job) -> Mapping[str, Any]:
     """Find features, matches and poses; write the models that COLMAP finds into `job.models`.
 
     The largest model is in its subfolder `best`. Returns {"posed": names of the photos in this
-    model, "remarks": sentences for the user}. Raises Refused if the photos give no model.
+    model, "remarks": sentences for the user}. Raises RefusedError if the photos give no model.
     """
     COLMAP.set_random_seed(job.seed)
     total = len(job.sizes)
@@ -124,7 +124,7 @@ def _find_features(job: Job) -> None:
         images = opened.read_all_images()
         counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
     if sum(count >= FEW_FEATURES for count in counts) < 2:
-        raise Refused(
+        raise RefusedError(
             f"fewer than two of {total} photos have enough features to match: the photos are "
             "blurred, or show surfaces without texture. Take sharp photos of something with texture"
         )
@@ -150,7 +150,7 @@ def _match(job: Job) -> None:
     with COLMAP.Database.open(job.database) as opened:
         _, counts = opened.read_two_view_geometry_num_inliers()
     if not any(count >= FEW_MATCHES for count in counts):
-        raise Refused(no_matches(total))
+        raise RefusedError(no_matches(total))
 
 
 def _leave_out_unlikely_pairs(database: str) -> None:
@@ -245,7 +245,7 @@ def _largest_model(job: Job, start: Any) -> Any:
             largest = max(solid, key=COLMAP.Reconstruction.num_reg_images)
             return _centred(largest, job.threads)
     if start is None:
-        raise Refused(one_place(total))
+        raise RefusedError(one_place(total))
     return start
 
 

@@ -1,0 +1,114 @@
+"""Poses of two photos: from features whose truth is known, and of a textured room."""
+
+import numpy as np
+import pycolmap
+import pytest
+from commands import run_qgs
+from qgs_photos.poses.few import RefusedError, beginning
+from upath import UPath
+from walked import write_photos
+
+from qgs.data.photos import read_listing
+
+SIZE = (640, 480)
+FOCAL = 700.0
+
+
+def turned(degrees):
+    """About the vertical axis."""
+    angle = np.radians(degrees)
+    return np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
+
+
+def seen_twice(degrees, translation, wrong=0.3, depths=(4, 9)):
+    """Pixels (2, N, 2) of points from two cameras with noise; some of the second are elsewhere."""
+    rotation = turned(degrees)
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-2, -1.5, depths[0]], [2, 1.5, depths[1]], (400, 3))
+    pixels = []
+    for camera in (points, points @ rotation.T + translation):
+        found = FOCAL * camera[:, :2] / camera[:, 2:] + np.array(SIZE) / 2
+        pixels.append(found + rng.normal(0, 0.3, found.shape))
+    count = int(wrong * len(points))
+    pixels[1][:count] = rng.uniform(0, SIZE, (count, 2))
+    return np.stack(pixels)
+
+
+@pytest.fixture
+def found(tmp_path):
+    """What begins from pixels of two photos, whose descriptors match unless `alike` is False."""
+
+    def found(pixels, known=True, alike=True):
+        rng = np.random.default_rng(1)
+        descriptors = rng.integers(0, 256, (2, len(pixels[0]), 128))
+        descriptors[1] = (descriptors[0] * 0.95 if alike else descriptors[1]).astype(int)
+        with pycolmap.Database.open(tmp_path / f"{known}.db") as database:
+            camera = pycolmap.Camera.create_from_model_name(
+                1, "SIMPLE_RADIAL", FOCAL if known else 1, *SIZE
+            )
+            camera.has_prior_focal_length = known
+            database.write_camera(camera, True)
+            for place in (0, 1):
+                image = database.write_image(pycolmap.Image(name=f"{place}", camera_id=1))
+                database.write_keypoints(image, pixels[place].astype(np.float32))
+                database.write_descriptors(
+                    image,
+                    pycolmap.FeatureDescriptors(
+                        data=descriptors[place].astype(np.uint8),
+                        type=pycolmap.FeatureExtractorType.SIFT,
+                    ),
+                )
+            return beginning(database)
+
+    return found
+
+
+def assert_within(degrees, pose, rotation, translation):
+    direction = pose[:3, 3] / np.linalg.norm(pose[:3, 3])
+    cosines = [
+        (np.trace(pose[:3, :3].T @ rotation) - 1) / 2,
+        direction @ translation / np.linalg.norm(translation),
+    ]
+    assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < degrees
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_two_views_give_pose_focal_length_and_points(found, known):
+    translation = np.array([-1.2, 0.1, 0.3])
+    model, remarks = found(seen_twice(12, translation), known)
+    one, other = (model.images[place].cam_from_world().matrix() for place in (1, 2))
+    assert np.array_equal(one, np.eye(3, 4))
+    assert_within(1, other, turned(12), translation)
+    assert model.cameras[1].focal_length == pytest.approx(FOCAL, rel=0.04)
+    points = np.array([point.xyz for point in model.points3D.values()])
+    assert 260 <= len(points) <= 300
+    assert np.median(points[:, 2]) == pytest.approx(1)
+    assert bool(remarks) != known
+
+
+@pytest.mark.parametrize(
+    ("pixels", "alike", "reason"),
+    [
+        (seen_twice(8, np.zeros(3)), True, "turn on the spot"),
+        (seen_twice(0, np.zeros(3)), True, "turn on the spot"),
+        (seen_twice(8, np.array([-1, 0, 0])), False, "enough matches"),
+        (seen_twice(8, np.array([-1, 0, 0]), wrong=0.97), True, "enough matches"),
+        (seen_twice(8, np.array([-1, 0, 0]), depths=(6, 6)), True, "one flat thing"),
+    ],
+    ids=["turned", "same", "unlike", "wrong", "flat"],
+)
+def test_two_photos_without_a_pose_are_refused(found, pixels, alike, reason):
+    with pytest.raises(RefusedError, match=reason):
+        found(pixels, False, alike)
+
+
+def test_two_photos_get_poses(images, shots, tmp_path):
+    write_photos(tmp_path / "two", [images[3], images[5]])
+    shown = run_qgs("poses", tmp_path / "two", "--threads", 1).output
+    assert "2 of 2 photos have poses" in shown
+    assert "times their longer side" in shown
+    one, other = (frame.c2w for frame in read_listing(UPath(tmp_path / "two_poses")).frames)
+    true = np.linalg.inv(shots[5].c2w) @ shots[3].c2w
+    assert_within(2, np.linalg.inv(other) @ one, true[:3, :3], true[:3, 3])
