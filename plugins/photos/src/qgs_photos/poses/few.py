@@ -27,6 +27,18 @@ FLAT = 0.97
 """Share of matches that a plane explains, from which on a pair does not give the focal length."""
 LEAST_DOUBT = 0.1
 """Least deviation of the logarithm of a focal length that matches of a pair give."""
+NO_MATCHES = (
+    "no two photos have enough matches. Take photos a step apart, so that each shows half of what "
+    "the photo before shows"
+)
+ONE_PLACE = (
+    "the photos match, but no two of them show the same from positions far enough apart. Take more "
+    "photos, and walk around your subject: do not turn on the spot"
+)
+FLAT_THING = (
+    "EXIF data give no focal length, and the photos show one flat thing, from which it cannot be "
+    "found. Take photos of something with depth, or keep EXIF data in the files"
+)
 
 
 class RefusedError(Exception):
@@ -36,16 +48,15 @@ class RefusedError(Exception):
 def beginning(database: Any) -> tuple[Any, list[str]]:
     """Return a model of the best two photos in an open database of COLMAP, and remarks.
 
-    Focal lengths that EXIF does not give are set in the database. Raises RefusedError if no two photos
-    give a pose.
+    Focal lengths that EXIF does not give are set in the database. Raises RefusedError if no two
+    photos give a pose.
     """
-    total = database.num_images()
     found = pairs(database)
     if not found:
-        raise RefusedError(no_matches(total))
+        raise RefusedError(NO_MATCHES)
     apart = {images: one for images, one in found.items() if one.focals[0] > PARALLAX * one.depth}
     if not apart:
-        raise RefusedError(one_place(total))
+        raise RefusedError(ONE_PLACE)
     deep = {images: pair for images, pair in apart.items() if pair.flat < FLAT}
     remarks = set_focals(database, deep)
     best = max(deep or apart, key=lambda images: found[images].score / found[images].depth)
@@ -54,22 +65,6 @@ def beginning(database: Any) -> tuple[Any, list[str]]:
     pair = two_views(*(seen[image] for image in best))
     assert pair is not None
     return model(database, best, pair), remarks
-
-
-def no_matches(total: int) -> str:
-    """Return why `total` photos of different things give no poses."""
-    return (
-        f"no two of {total} photos have enough matches. Take photos, a step apart, so that each "
-        "shows half of what the photo before shows"
-    )
-
-
-def one_place(total: int) -> str:
-    """Return why `total` photos that match give no poses."""
-    return (
-        f"the {total} photos match, but no two of them show the same from positions far enough "
-        "apart. Take more photos, and walk around your subject: do not turn on the spot"
-    )
 
 
 def pairs(database: Any) -> Pairs:
@@ -105,10 +100,7 @@ def set_focals(database: Any, found: Pairs) -> list[str]:
     if not unknown:
         return []
     if not found:
-        raise RefusedError(
-            "EXIF data give no focal length, and the photos show one flat thing, from which it "
-            "cannot be found. Take photos of something with depth, or keep EXIF data in the files"
-        )
+        raise RefusedError(FLAT_THING)
     seen = views(database)
     doubts = np.hypot([pair.focal_doubt for pair in found.values()], LEAST_DOUBT)
     focals = [pair.focals[0] / seen[one].side for (one, _), pair in found.items()]

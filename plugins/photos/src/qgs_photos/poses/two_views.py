@@ -12,7 +12,7 @@ Axes: K hypotheses, N matches.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,7 @@ SETS = ((0.8, 2.0), (0.9, 2.0), (0.7, 2.0), (0.8, 1.0))
 """Matches for RANSAC: largest ratio of distances, and largest error in pixels. Only the first two
 sets are used if the focal length is unknown."""
 LEAST_SET = 6
+TRIALS = {"random_seed": 0, "min_num_trials": 100, "max_num_trials": 2000}
 MOST_MATCHES = 1500
 WORST_RATIO = 0.97
 NOISE = ((0.5, 0.25), (0.35, 0.8), (0.15, 3.0))
@@ -81,8 +82,7 @@ class Matches:
         return 0.01 + 0.9 / (1 + np.exp((self.ratios - 0.82) / 0.04))
 
 
-@dataclass(frozen=True)
-class Poses:
+class Poses(NamedTuple):
     """K poses: rotations (K, 3, 3), unit translations (K, 3), focals (K,) in pixels.
 
     scores: (K,) log likelihood ratio to wrong matches alone, and log prior. errors: (K, N) signed
@@ -128,11 +128,9 @@ def two_views(one: View, other: View) -> TwoViews | None:
     found = [*_proposed(matches)]
     if not found:
         return None
-    rows = np.array(found)
-    poses = _scored(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12], rows[:, 12], matches)
-    poses = refined(poses, matches)
+    poses = refined(_scored(*map(np.array, zip(*found, strict=True)), matches), matches)
     best = poses.scores.argmax()
-    return _verdict(Poses(*(own[[best]] for own in vars(poses).values())), matches)
+    return _verdict(Poses(*(own[[best]] for own in poses)), matches)
 
 
 def matched(one: View, other: View) -> Matches:
@@ -160,8 +158,8 @@ def matched(one: View, other: View) -> Matches:
     return Matches(indices, points, others, ratios[order], scale, one.side, prior)
 
 
-def _proposed(matches: Matches) -> Iterator[Array]:
-    """Yield poses that RANSAC finds: a row (13,) of rotation, translation and focal length."""
+def _proposed(matches: Matches) -> Iterator[tuple[Array, Array, float]]:
+    """Yield the rotation, translation and focal length of each pose that RANSAC finds."""
     known = matches.prior[1] == EXIF
     sets = SETS if known else SETS[:2]
     for focal in [np.exp(matches.prior[0])] if known else np.multiply(FOCALS, matches.side):
@@ -171,23 +169,13 @@ def _proposed(matches: Matches) -> Iterator[Array]:
             kept = matches.ratios < ratio
             if kept.sum() < LEAST_SET:
                 continue
-            options = {
-                "random_seed": 0,
-                "max_error": error,
-                "min_num_trials": 100,
-                "max_num_trials": 2000,
-            }
+            options = TRIALS | {"max_error": error}
             result = COLMAP.estimate_relative_pose(
-                camera,
-                matches.one[kept],
-                camera,
-                matches.other[kept],
-                options,
+                camera, matches.one[kept], camera, matches.other[kept], options
             )
             if result is not None:
                 pose = result["cam2_from_cam1"].matrix()
-                length = np.linalg.norm(pose[:, 3])
-                yield np.concatenate([pose[:, :3].ravel(), pose[:, 3] / length, [focal]])
+                yield pose[:, :3], pose[:, 3] / np.linalg.norm(pose[:, 3]), focal
 
 
 def _scored(rotations: Array, translations: Array, focals: Array, matches: Matches) -> Poses:
@@ -222,15 +210,12 @@ def _crossing(vectors: Array) -> Array:
 
 def likelihood(errors: Array, matches: Matches) -> tuple[Array, Array]:
     """Return log likelihood ratios of errors (K, N) to wrong matches, and weights of squares."""
+    weights, deviations = np.array(NOISE).T[..., None, None]
+    densities = np.exp(-0.5 * (errors / deviations) ** 2) / (np.sqrt(2 * np.pi) * deviations)
+    densities *= weights * matches.right
     wrong = WRONG * matches.side
-    total = (1 - matches.right) / wrong + np.zeros_like(errors)
-    slope = np.zeros_like(errors)
-    for weight, deviation in NOISE:
-        density = np.exp(-0.5 * (errors / deviation) ** 2) / (np.sqrt(2 * np.pi) * deviation)
-        density *= weight * matches.right
-        total += density
-        slope += density / deviation**2
-    return np.log(total * wrong), slope / total
+    total = densities.sum(0) + (1 - matches.right) / wrong
+    return np.log(total * wrong), (densities / deviations**2).sum(0) / total
 
 
 def refined(poses: Poses, matches: Matches) -> Poses:
@@ -248,7 +233,7 @@ def refined(poses: Poses, matches: Matches) -> Poses:
         poses = Poses(
             *(
                 np.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-                for old, new in zip(vars(poses).values(), vars(tried).values(), strict=True)
+                for old, new in zip(poses, tried, strict=True)
             )
         )
         if (better & (gain < 0.01) | (damping > 100)).all():

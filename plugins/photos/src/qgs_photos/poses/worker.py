@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from qgs_photos.poses.few import FEW, RefusedError, beginning, no_matches, one_place
+from qgs_photos.poses.few import FEW, NO_MATCHES, ONE_PLACE, RefusedError, beginning
 from qgs_photos.poses.job import Job
 
 # Takes dictionaries for options, which its types do not say.
@@ -150,7 +150,7 @@ def _match(job: Job) -> None:
     with COLMAP.Database.open(job.database) as opened:
         _, counts = opened.read_two_view_geometry_num_inliers()
     if not any(count >= FEW_MATCHES for count in counts):
-        raise RefusedError(no_matches(total))
+        raise RefusedError(NO_MATCHES)
 
 
 def _leave_out_unlikely_pairs(database: str) -> None:
@@ -245,7 +245,7 @@ def _largest_model(job: Job, start: Any) -> Any:
             largest = max(solid, key=COLMAP.Reconstruction.num_reg_images)
             return _centred(largest, job.threads)
     if start is None:
-        raise RefusedError(one_place(total))
+        raise RefusedError(ONE_PLACE)
     return start
 
 
