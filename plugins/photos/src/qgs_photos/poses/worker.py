@@ -40,6 +40,9 @@ OWN = {
     "filter_min_tri_angle": 0.5,
 }
 """Limits for photos that COLMAP adds to the best pair of few photos."""
+OWN_FIRST = 4
+"""Largest number of photos for which this pair is the only start. Of more photos, COLMAP's own
+choice of the first pair gives better poses, if it gives any."""
 SMALL_SIDE = 1000
 """Longer side in pixels up to which features are searched at twice the photo's size. This finds
 more features and takes longer."""
@@ -225,18 +228,20 @@ def _largest_model(job: Job, start: Any) -> Any:
         "ba_global_frames_ratio": GROWTH,
         "ba_global_points_ratio": GROWTH,
     }
-    begun = Path(job.models, "start")
+    # COLMAP's own limits first: easier ones accept first pairs with little parallax
+    tries = [("", {}), ("", SMALL)]
     if start is not None:
+        begun = Path(job.models, "start")
         begun.mkdir()
         start.write(begun)
-    # COLMAP's own limits first: easier ones accept first pairs with little parallax
-    for mapper in ({}, SMALL) if start is None else (OWN,):
+        tries = [("", {}), (begun, OWN)] if total > OWN_FIRST else [(begun, OWN)]
+    for begin, mapper in tries:
         models = COLMAP.incremental_mapping(
             job.database,
             job.images,
             job.models,
             options={**options, "mapper": mapper},
-            input_path="" if start is None else begun,
+            input_path=begin,
             initial_image_pair_callback=began,
             next_image_callback=further,
         )
