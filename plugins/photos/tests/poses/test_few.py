@@ -104,10 +104,11 @@ def test_two_photos_without_a_pose_are_refused(found, pixels, alike, reason):
         found(pixels, False, alike)
 
 
-def test_two_photos_get_poses(images, shots, tmp_path):
-    write_photos(tmp_path / "two", [images[3], images[5]])
+def test_two_photos_get_poses_and_a_blank_one_none(images, shots, tmp_path):
+    blank = np.full_like(images[0], 127)
+    write_photos(tmp_path / "two", [images[3], images[5], blank])
     shown = run_qgs("poses", tmp_path / "two", "--threads", 1).output
-    assert "2 of 2 photos have poses" in shown
+    assert "2 of 3 photos have poses" in shown
     assert "times their longer side" in shown
     one, other = (frame.c2w for frame in read_listing(UPath(tmp_path / "two_poses")).frames)
     true = np.linalg.inv(shots[5].c2w) @ shots[3].c2w

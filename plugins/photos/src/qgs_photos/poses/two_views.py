@@ -31,16 +31,14 @@ EXIF = 0.01
 SETS = ((0.8, 2.0), (0.9, 2.0), (0.7, 2.0), (0.8, 1.0))
 """Matches for RANSAC: largest ratio of distances, and largest error in pixels. Only the first two
 sets are used if the focal length is unknown."""
-LEAST_SET = 6
 TRIALS = {"random_seed": 0, "min_num_trials": 100, "max_num_trials": 2000}
-MOST_MATCHES = 1500
-WORST_RATIO = 0.97
+MOST_MATCHES = 1000
 NOISE = ((0.5, 0.25), (0.35, 0.8), (0.15, 3.0))
 """Weights and standard deviations in pixels of the errors of right matches."""
 WRONG = 0.4
 """Range of the errors of wrong matches, in units of the longer side."""
-STEPS = 15
-"""Largest number of steps of the refinement."""
+STEPS = 12
+"""Number of steps of the refinement."""
 _STEP = 1e-5
 
 
@@ -128,7 +126,8 @@ def two_views(one: View, other: View) -> TwoViews | None:
     found = [*_proposed(matches)]
     if not found:
         return None
-    poses = refined(_scored(*map(np.array, zip(*found, strict=True)), matches), matches)
+    rotations, translations, focals = map(np.array, zip(*found, strict=True))
+    poses = refined(_scored(rotations, translations, focals, matches), matches)
     best = poses.scores.argmax()
     return _verdict(Poses(*(own[[best]] for own in poses)), matches)
 
@@ -145,7 +144,6 @@ def matched(one: View, other: View) -> Matches:
     second = np.maximum(similar[rows].max(1), similar.max(0)[best])
     ratios = np.arccos(first.clip(0, 1 - 1e-6)) / np.arccos(second.clip(0, 1 - 1e-6))
     order = ratios.argsort(kind="stable")[:MOST_MATCHES]
-    order = order[ratios[order] < WORST_RATIO]
     indices = np.stack([rows, best], 1)[order]
     if one.focal and other.focal:
         scale = one.focal / other.focal
@@ -167,8 +165,6 @@ def _proposed(matches: Matches) -> Iterator[tuple[Array, Array, float]]:
         camera = COLMAP.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0, 0])
         for ratio, error in sets:
             kept = matches.ratios < ratio
-            if kept.sum() < LEAST_SET:
-                continue
             options = TRIALS | {"max_error": error}
             result = COLMAP.estimate_relative_pose(
                 camera, matches.one[kept], camera, matches.other[kept], options
@@ -225,7 +221,7 @@ def refined(poses: Poses, matches: Matches) -> Poses:
         normal, slope = _normal(poses, matches)
         diagonal = np.einsum("kii->ki", normal)
         diagonal += damping[:, None] * diagonal
-        step = -np.linalg.solve(normal, slope[..., None])[..., 0].clip(-0.3, 0.3)
+        step = -np.linalg.solve(normal, slope[..., None])[..., 0]
         tried = _stepped(poses, step, matches)
         gain = tried.scores - poses.scores
         better = gain > 0
@@ -236,8 +232,6 @@ def refined(poses: Poses, matches: Matches) -> Poses:
                 for old, new in zip(poses, tried, strict=True)
             )
         )
-        if (better & (gain < 0.01) | (damping > 100)).all():
-            break
     return poses
 
 
