@@ -33,6 +33,7 @@ SETS = ((0.8, 2.0), (0.9, 2.0), (0.7, 2.0), (0.8, 1.0))
 sets are used if the focal length is unknown."""
 TRIALS = {"random_seed": 0, "min_num_trials": 100, "max_num_trials": 2000}
 MOST_MATCHES = 1000
+WORST_RATIO = 0.97
 NOISE = ((0.5, 0.25), (0.35, 0.8), (0.15, 3.0))
 """Weights and standard deviations in pixels of the errors of right matches."""
 WRONG = 0.4
@@ -144,6 +145,7 @@ def matched(one: View, other: View) -> Matches:
     second = np.maximum(similar[rows].max(1), similar.max(0)[best])
     ratios = np.arccos(first.clip(0, 1 - 1e-6)) / np.arccos(second.clip(0, 1 - 1e-6))
     order = ratios.argsort(kind="stable")[:MOST_MATCHES]
+    order = order[ratios[order] < WORST_RATIO]
     indices = np.stack([rows, best], 1)[order]
     if one.focal and other.focal:
         scale = one.focal / other.focal
