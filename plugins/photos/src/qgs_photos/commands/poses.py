@@ -80,10 +80,13 @@ def poses(
     console = Console()
     options = Options(frames, side, matching, features, threads or os.cpu_count() or 1, seed)
     folder = out or beside(source)
-    print_lines(console, make_poses(source, folder, options, console).summary)
+    found = make_poses(source, folder, options, console)
+    print_lines(console, found.summary)
     with console.status("checking"):
         report = check.check(opened_path(folder), check.Options())
     print_lines(console, map(str, report.findings))
     (scene,) = report.scenes
     distance = f"median distance of matches from epipolar lines, pixels: {scene.epipolar}"
-    print_lines(console, [distance, f"wrote {folder}; next: qgs demo {folder}"])
+    # of two photos, none is left to compare with
+    following = "demo" if len(found.posed) > 2 else "view"
+    print_lines(console, [distance, f"wrote {folder}; next: qgs {following} {folder}"])

@@ -59,7 +59,7 @@ def beginning(database: Any) -> tuple[Any, list[str]]:
         raise RefusedError(ONE_PLACE)
     deep = {images: pair for images, pair in apart.items() if pair.flat < FLAT}
     remarks = set_focals(database, deep)
-    best = max(deep or apart, key=lambda images: found[images].score / found[images].depth)
+    best = max(deep or apart, key=lambda images: found[images].score / found[images].depth ** 0.5)
     # all focal lengths are known now
     seen = views(database)
     pair = two_views(*(seen[image] for image in best))

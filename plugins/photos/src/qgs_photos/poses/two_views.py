@@ -38,7 +38,7 @@ NOISE = ((0.5, 0.25), (0.35, 0.8), (0.15, 3.0))
 """Weights and standard deviations in pixels of the errors of right matches."""
 WRONG = 0.4
 """Range of the errors of wrong matches, in units of the longer side."""
-STEPS = 12
+STEPS = 20
 """Number of steps of the refinement."""
 _STEP = 1e-5
 
@@ -188,7 +188,8 @@ def _errors(rotations: Array, translations: Array, focals: Array, matches: Match
     """Return signed Sampson errors (K, N) in pixels."""
     one = _rays(matches.one, focals)
     other = _rays(matches.other, focals)
-    essential = _crossing(translations) @ rotations
+    # of the cross product with the translation, times the rotation
+    essential = np.cross(translations[:, None], rotations.mT).mT
     lines = one @ essential.mT
     back = other @ essential
     slope = (lines[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1)
@@ -199,11 +200,6 @@ def _rays(points: Array, focals: Array) -> Array:
     """Return directions (K, N, 3) of points (N, 2), with z = 1."""
     scaled = points / focals[:, None, None]
     return np.concatenate([scaled, np.ones_like(scaled[..., :1])], -1)
-
-
-def _crossing(vectors: Array) -> Array:
-    """Return matrices (K, 3, 3) of the cross product with vectors (K, 3)."""
-    return np.cross(vectors[:, None], np.eye(3)).mT
 
 
 def likelihood(errors: Array, matches: Matches) -> tuple[Array, Array]:
@@ -258,13 +254,11 @@ def _stepped(poses: Poses, step: Array, matches: Matches) -> Poses:
     step: (K, 7) or (7,), rotation vector, translation, logarithm of the focal length.
     """
     step = np.broadcast_to(step, (len(poses.focals), 7))
-    angle = np.linalg.norm(step[:, :3], axis=1)[:, None, None].clip(1e-12)
-    turn = _crossing(step[:, :3]) / angle
-    rotations = np.eye(3) + np.sin(angle) * turn + (1 - np.cos(angle)) * turn @ turn
+    turns = np.stack([COLMAP.Rotation3d(axis_angle).matrix() for axis_angle in step[:, :3]])
     translations = poses.translations + step[:, 3:6]
     translations /= np.linalg.norm(translations, axis=1, keepdims=True)
     focals = poses.focals * np.exp(step[:, 6])
-    return _scored(rotations @ poses.rotations, translations, focals, matches)
+    return _scored(turns @ poses.rotations, translations, focals, matches)
 
 
 def _verdict(best: Poses, matches: Matches) -> TwoViews:
