@@ -37,6 +37,8 @@ COLMAP finds no pair with its defaults of 16 degrees and 100 inliers."""
 OWN = {
     "abs_pose_min_num_inliers": 15,
     "abs_pose_min_inlier_ratio": 0.15,
+    "abs_pose_refine_focal_length": False,
+    "abs_pose_refine_extra_params": False,
     "filter_min_tri_angle": 0.5,
 }
 """Limits for photos that COLMAP adds to the best pair of few photos."""
@@ -102,7 +104,7 @@ def mapped(job: Job) -> Mapping[str, Any]:
             start, remarks = beginning(opened)
     if total > 2:
         _match(job)
-        start = _largest_model(job, start)
+        start = _largest_model(job, start, bool(remarks))
     return {"posed": _written(start, job), "remarks": remarks}
 
 
@@ -202,10 +204,11 @@ def likely(features: Array) -> Array:
     return wanted | wanted.T
 
 
-def _largest_model(job: Job, start: Any) -> Any:
+def _largest_model(job: Job, start: Any, estimated: bool) -> Any:
     """Return the model with most photos that COLMAP finds.
 
     start: model of two photos, to which COLMAP adds the others; None lets COLMAP choose them.
+    estimated: True if focal lengths do not come from EXIF, and COLMAP shall refine them.
     """
     total = len(job.sizes)
     done = 0
@@ -229,18 +232,20 @@ def _largest_model(job: Job, start: Any) -> Any:
         "ba_global_points_ratio": GROWTH,
     }
     # COLMAP's own limits first: easier ones accept first pairs with little parallax
-    tries = [("", {}), ("", SMALL)]
+    tries: list[tuple[Any, Any]] = [("", {}), ("", {"mapper": SMALL})]
     if start is not None:
         begun = Path(job.models, "start")
         begun.mkdir()
         start.write(begun)
-        tries = [("", {}), (begun, OWN)] if total > OWN_FIRST else [(begun, OWN)]
-    for begin, mapper in tries:
+        # few photos do not show the distortion of the lens
+        refined = {"ba_refine_focal_length": estimated, "ba_refine_extra_params": False}
+        tries = [("", {}), (begun, {**refined, "mapper": OWN})][total <= OWN_FIRST :]
+    for begin, limits in tries:
         models = COLMAP.incremental_mapping(
             job.database,
             job.images,
             job.models,
-            options={**options, "mapper": mapper},
+            options={**options, **limits},
             input_path=begin,
             initial_image_pair_callback=began,
             next_image_callback=further,
