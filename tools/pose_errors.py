@@ -51,10 +51,11 @@ def main(folder: str, count: str = "2", draws: str = "50", known: str = "") -> N
         rows["all"] += found
         rows[f"up to {bound} degrees"] += found
     for name, found in rows.items():
-        scores = [round(np.mean([max(1 - x / t, 0) for x in found]), 3) for t in (5, 10, 20)]
+        parts = np.clip(1 - np.divide.outer(found, (5, 10, 20)), 0, 1)
         posed = [x for x in found if x < np.inf]
         wrong = sum(x > 20 for x in posed)
-        print(f"{name}: AUC {scores}, {len(posed)} of {len(found)} posed, of these {wrong} wrong")
+        auc = parts.mean(0).round(3)
+        print(f"{name}: AUC {auc}, {len(posed)} of {len(found)} posed, of these {wrong} wrong")
 
 
 def errors(photos: Sequence[Any], known: str) -> list[float]:
