@@ -32,7 +32,7 @@ WORDS = {
     "side": "the shorter side of their images has {} pixels",
 }
 """Phrases for messages, by name of a measurement of a sample's cameras; lengths in model units."""
-REMEDY = "try another scale of the world, other input views, or train on views like these"
+REMEDY = "try another scale of the world, other input views or size, or train on views like these"
 """Advice for views outside of the trained range."""
 
 
@@ -116,8 +116,8 @@ class Domain:
             low, high = seen.get(name, trained)
             most = trained[1] * TOLERANCE
             # A third input between two gives better results than two.
-            if name == "views":
-                most = max(most, trained[1] + 1)
+            if name == "views" and trained[1] == 2:
+                most = 3
             if low * TOLERANCE < trained[0] or high > most:
                 words = WORDS[name].format(_shown((low, high)))
                 phrases.append(f"{words} (trained: {_shown(trained)})")

@@ -88,7 +88,7 @@ def reconstruct(
     finally:
         model.train(training)
     result = replace(result, scale=scale, size=chosen, tuning=tuning)
-    return replace(result, remarks=_remarks(result, found, free))
+    return replace(result, remarks=_remarks(result, found))
 
 
 def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
@@ -136,10 +136,10 @@ def choose_frames(
         target = None
         if ranked := ranked_windows(frusta, views.inputs, compare):
             _, frames, target = ranked[0]
-            held_out = scene.held_out if compare is None else compare
+            scored = (target, *scene.held_out) if compare is None else compare
             # Novel views between two inputs gain 1 to 3 dB from a third one there.
             if not inputs:
-                frames = frusta.with_middle(frames, (target, *held_out))
+                frames = frusta.with_middle(frames, scored)
         novel = frusta.compared(frames, target)
     elif compare is None:
         novel = Frusta(scene, domain).compared(tuple(frames))
@@ -187,16 +187,13 @@ def _over_time(
     return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
 
 
-def _remarks(result: Reconstruction, scene: Scene, size_chosen: bool) -> list[str]:
-    """Return remarks for the user on the photos and on the result's quality.
-
-    size_chosen: whether the user left the size to qgs.
-    """
+def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
+    """Return remarks for the user on the photos and on the result's quality."""
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    # A size that was chosen because it is better needs no warning.
-    if size_chosen:
+    # A size that was found better needs no warning.
+    if result.size:
         del found.values["side"]
     remarks = (
         result.scale.poor if result.scale else "",

@@ -122,7 +122,7 @@ def find_scale(
     If the scene has no further photos, but three or more inputs, the middle input is scored and not
     given to the model.
     model: must be in evaluation mode; the search runs on its device. compared: frames
-        kept for the scores of the result, which the search does not use.
+        kept for the scores of the result, which the search does not render.
     """
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
@@ -152,7 +152,9 @@ def find_scale(
         # Inputs alone would lead further and further away from a depth that is known.
         while (further or not depth) and (end := trial.past(best)) and len(trial.tried) < MOST:
             best = trial.best(end)
-        best = trial.best([best + place for place in (-2, -1, 1, 2)])
+        # The second time, only the place beyond a better one is new.
+        for _ in range(2):
+            best = trial.best([best - 1, best + 1])
         best = trial.best([best + trial.vertex(best)])
     return FoundScale(
         factor=trial.factor(best),
@@ -190,15 +192,18 @@ def search_range(
     """
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
     baseline = float(torch.cdist(centres, centres).max())
-    # Cameras on one point leave nothing to search: no factor changes what they see.
-    if not baseline:
-        return 1.0, 1.0
     least, most = trained.ranges.get("baseline", BASELINES)
+    # Cameras on one point leave nothing to search: no factor changes what they see.
+    if not baseline or not most:
+        return 1.0, 1.0
     # A training may have seen baselines near 0, which no search needs to reach.
     low = max(least, most / 10) / baseline / BELOW
     high = most / baseline * ABOVE
-    # A training in another unit has depths outside of DEPTHS.
-    if depth and low * depth < DEPTHS[1] and high * depth > DEPTHS[0]:
+    near, far = trained.ranges.get("depth", DEPTHS)
+    # A training in another unit has other depths than DEPTHS.
+    if not depth or near >= DEPTHS[1] or far <= DEPTHS[0]:
+        return low, high
+    if low * depth < DEPTHS[1] and high * depth > DEPTHS[0]:
         low = max(low, DEPTHS[0] / depth)
         high = min(high, DEPTHS[1] / depth)
     return low, high

@@ -53,6 +53,10 @@ def test_the_range_follows_the_unit_and_the_training():
     ):
         found = scale.search_range(trained, Walk(), (1, 4), depth)
         assert found == pytest.approx(expected, rel=1e-5)
+    far = Domain({"baseline": [0.1, 0.4], "depth": [5.0, 6.0]}, 4)
+    assert scale.search_range(far, Walk(), (1, 4), 3.0) == pytest.approx(wide, rel=1e-5)
+    turning = Domain({"baseline": [0.0, 0.0]}, 4)
+    assert scale.search_range(turning, Walk(), (1, 4), 3.0) == (1.0, 1.0)
     still = Walk()
     still.cameras = Walk.cameras[[2, 2]]
     assert scale.search_range(Domain(), still, (0, 1), 0.0) == (1.0, 1.0)

@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
@@ -44,7 +44,7 @@ from qgs_viewer.trust import ScoredView, scored_views
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
 WINDOWS = 6
-ALONE = 3
+ALONE = 2
 """Windows of a scene for a model that is compared with no other. Each takes a search for a scale,
 the longest part of a report."""
 # Sections of recipes that must be equal, so that only the models differ.
@@ -263,13 +263,14 @@ def open_models(
 def _found_size(model: Model, windows: PhotoWindows) -> FoundSize | None:
     """Return the better size of photos for `model` in a window; None without a choice."""
     data = model.recipe.build_data()
-    # the evaluation names scenes that fail
-    with suppress(Exception):
+    try:
         scene = data.scenes("test" if data.names("test") else "train")[0]
-        window = windows.windows(scene, model.recipe.views)[0]
-        views = model.views_of(scene, *window)
-        return find_size(model.network, scene, *window, views)
-    return None
+        window, *_ = windows.windows(scene, model.recipe.views)
+    # the evaluation names scenes that fail; a moving scene has no windows
+    except Exception:
+        return None
+    views = model.views_of(scene, *window)
+    return find_size(model.network, scene, *window, views)
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:

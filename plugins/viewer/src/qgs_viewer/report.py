@@ -118,7 +118,12 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     judged = "beside" if first.windows else "between"
     samples = counted(first.evaluation.samples, "sample")
     inputs = sorted({len(sample.input_frames) for sample in shown[0].samples})
-    views = f"{samples}, {listed(inputs)} inputs, scored on views {judged} the inputs"
+    scored = (
+        "the inputs"
+        if any(score.given for score in first.evaluation.scores)
+        else f"views {judged} the inputs"
+    )
+    views = f"{samples}, {listed(inputs)} inputs, scored on {scored}"
     names = listed((model.name for model in models), most=3)
     parts = first.recipe.parts.items()
     meanings = [summary_of(part.component) for place, part in parts if place[0] == "metrics"]
