@@ -17,11 +17,10 @@ from qgs_research.published.weight_layout import real_ratio
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck, time_features
 from torch import Tensor
 
-from published.depthsplat import depthsplat_tensors
 from published.files import GoldenFile
-from published.mvsplat import mvsplat_tensors
 from published.recipes import locusgs_recipe, tokengs_recipe
 from published.splats import Recorder, cases_tensors
+from published.sweeps import sweep_tensors
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import QueryGaussianModel
 from qgs.recipe import resolve
@@ -35,9 +34,9 @@ RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 }
 
 COMPUTED: Mapping[str, Callable[[GoldenFile], dict[str, Tensor]]] = {
-    "mvsplat": mvsplat_tensors,
+    "mvsplat": sweep_tensors,
     "mvsplat_cases": cases_tensors,
-    "depthsplat": depthsplat_tensors,
+    "depthsplat": sweep_tensors,
     "depthsplat_cases": cases_tensors,
 }
 """Functions for kinds of golden files whose weights and inputs are stored in another way."""

@@ -94,22 +94,16 @@ def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
     }
 
 
-def model_of(golden: GoldenFile, overrides: Sequence[str] = ()) -> QueryGaussianModel:
-    """Return the model that fits the weights of a golden file, with these weights.
-
-    overrides: options that weights do not determine.
-    """
+def model_of(golden: GoldenFile) -> QueryGaussianModel:
+    """Return the model that fits the weights of a golden file, with these weights."""
     weights = {f"encoder.{name}": x for name, x in weights_of(golden).items()}
     tree = fitting_recipe(shapes_of(weights), golden.config["kind"])[1]
-    recipe = resolve(tree, overrides)
+    # Weights do not determine it.
+    count = golden.config["options"].get("local_mv_match")
+    recipe = resolve(tree, [f"model.encoder.neighbours={count}"] if count else ())
     model = recipe.build_model(pretrained=False).eval()
     model.load_state_dict(names_of(recipe).from_published(weights))
     return model
-
-
-def of_views(views: int) -> Recorder:
-    """Return a recorder that splits the first axis of outputs into scenes and `views` views."""
-    return Recorder(lambda x: x.detach().unflatten(0, (-1, views)))
 
 
 def watch_transformer(kept: Recorder, transformer: Any, size: Sequence[int], last: str) -> None:
@@ -139,13 +133,13 @@ def watch_unet(kept: Recorder, name: str, unet: Any) -> None:
             kept.input(f"{name}.{path}.attention", module.proj_out)
 
 
-def warps(views: Views, poses_BVJ44: Tensor, low: Sequence[int], inverse_BVD: Tensor) -> Tensor:
+def warps(cameras: Cameras, poses_BVJ44: Tensor, low: Sequence[int], inverse_BVD: Tensor) -> Tensor:
     """Return the positions of pixels in J neighbour views at D depths, (B, V, J, D, h, w, 2).
 
     low: size (h, w) of the feature maps. inverse_BVD: inverse depths.
     """
     pairs = poses_BVJ44.shape[:3]
-    lens = feature_lenses(views.cameras, low)[:, :, None].expand(*pairs, 4)
+    lens = feature_lenses(cameras, low)[:, :, None].expand(*pairs, 4)
     depth = (1 / inverse_BVD)[:, :, None, :, None, None].expand(*pairs, -1, *low)
     grid = warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses_BVJ44)))
     return grid.unflatten(0, pairs)

@@ -1,4 +1,4 @@
-"""Tensors of a golden file of DepthSplat, computed by the components of qgs."""
+"""Tensors of golden files of MVSplat and DepthSplat, computed by the components of qgs."""
 
 from typing import Any
 
@@ -6,9 +6,10 @@ import torch
 from qgs_zoo.dinov2.vit import PATCH
 from qgs_zoo.mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
 from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
-from qgs_zoo.mvsplat.mvsplat import expected_disparity
+from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, expected_disparity
 from qgs_zoo.mvsplat.sweep import (
     Sweep,
+    cyclic_neighbours,
     inverse_depth_candidates,
     relative_poses,
 )
@@ -20,15 +21,24 @@ from published.splats import (
     Recorder,
     gaussians,
     model_of,
-    of_views,
     predicted,
     views_of,
     warps,
     watch_transformer,
     watch_unet,
 )
-from qgs.types import Views
 
+MVSPLAT_OUTPUTS = """
+cnn.layer2                          backbone.backbone.layer2
+features_cnn                        backbone.backbone.conv2
+cost_unet.stem                      depth_predictor.corr_refine_net.2
+cost_volume_unet                    depth_predictor.corr_refine_net
+match_logits                        depth_predictor.depth_head_lowres
+fullres_features                    depth_predictor.upsampler
+projected_features                  depth_predictor.proj_feature
+delta_disparity_and_density_logit   depth_predictor.to_disparity
+"""
+"""Lines with a name in the golden file and the encoder module whose output has this name."""
 OUTPUTS = """
 features_cnn.0                        depth_predictor.backbone.conv2
 dino_block.0                          depth_predictor.pretrained.blocks.0
@@ -56,35 +66,35 @@ features_mono.1   mono_pyramid.stages.1
 """
 
 
-def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
+def sweep_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Compute every output that a golden file has, by name."""
-    neighbours = golden.config["options"]["local_mv_match"]
-    model = model_of(golden, [f"model.encoder.neighbours={neighbours}"])
+    model = model_of(golden)
     encoder = model.encoder
-    assert isinstance(encoder, DepthSplatEncoder)
     views = views_of(golden)
     near = golden.input("near")
     far = golden.input("far")
-    kept = of_views(near.shape[1])
-    watch(kept, encoder, views.cameras.size)
-    numbers = encoder.predict(views, near, far)
+    # The first axis of outputs becomes scenes and views.
+    kept = Recorder(lambda x: x.detach().unflatten(0, (-1, near.shape[1])))
     found = kept.found
-    predictor = encoder.network.depth_predictor
-    neighbours = nearest_neighbours(views.cameras.c2w, encoder.config.neighbours)
-    sweep = Sweep(views.cameras, neighbours, near, far)
-    size = views.cameras.size
-    grid = (size[0] // PATCH, size[1] // PATCH)
-    found["dino_positions"] = predictor.pretrained.positions(*grid)
-    first = torch.arange(near.shape[1]).expand(len(near), -1)[..., None]
-    found["neighbours"] = torch.cat([first, neighbours], -1)
-    found["shift_mask"] = shift_mask(
-        *(side // encoder.config.stride for side in size), device=near.device
-    )
-    swept(found, predictor, views, sweep)
-    numbers = numbers.movedim(2, -1)
+    stride = encoder.config.stride if isinstance(encoder, DepthSplatEncoder) else 4
+    low = tuple(side // stride for side in views.cameras.size)
+    if isinstance(encoder, DepthSplatEncoder):
+        neighbours = nearest_neighbours(views.cameras.c2w, encoder.config.neighbours)
+        watch_depthsplat(kept, encoder, low)
+    else:
+        assert isinstance(encoder, MVSplatEncoder)
+        neighbours = cyclic_neighbours(*near.shape, device=near.device)
+        watch_mvsplat(kept, encoder, low)
+    numbers = encoder.predict(views, near, far).movedim(2, -1)
     prediction = predicted(model, views, numbers)
     found |= gaussians(views, numbers, prediction)
-    found["depth"] = numbers[..., 0].exp()
+    found["shift_mask"] = shift_mask(*low, device=near.device)
+    sweep = Sweep(views.cameras, neighbours, near, far)
+    if isinstance(encoder, MVSplatEncoder):
+        of_mvsplat(found, encoder, sweep, numbers)
+    else:
+        of_depthsplat(found, encoder.network.depth_predictor, sweep)
+        found["depth"] = numbers[..., 0].exp()
     if model.depth:
         # Of both scales, concatenated as in training.
         found["training.depths"] = torch.cat([numbers[..., -1], numbers[..., 0]]).exp()
@@ -93,11 +103,51 @@ def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     return found
 
 
-def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> None:
-    """Record all modules whose output is in the golden file. size: image size (H, W)."""
+def of_mvsplat(
+    found: dict[str, Tensor], encoder: MVSplatEncoder, sweep: Sweep, numbers: Tensor
+) -> None:
+    """Add to `found` the tensors of MVSplat that no module outputs.
+
+    numbers: output of the networks for each pixel, (B, V, H, W, C).
+    """
+    disparity = inverse_depth_candidates(sweep.near, sweep.far, encoder.config.candidates)
+    found["disparity_candidates"] = disparity
+    found["match_pdf"] = found["match_logits"].softmax(2)
+    coarse = encoder.depth_predictor.match(found["features"], sweep)[0]
+    found["coarse_disparity"] = coarse.unflatten(0, sweep.near.shape)
+    poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
+    found["relative_pose"] = poses
+    low = found["cost_volume"].shape[-2:]
+    found["warp_grid"] = warps(sweep.cameras, poses, low, disparity)
+    # The release keeps an axis of Gaussians a pixel here.
+    for name in ("scales", "rotations"):
+        found[name] = found[name][..., None, :]
+    found["depth"] = numbers[..., :1].exp()
+    found["density"] = numbers[..., 1:2].sigmoid()
+    found["raw_gaussians"] = numbers[..., 2:]
+
+
+def watch_mvsplat(kept: Recorder, encoder: MVSplatEncoder, low: tuple[int, ...]) -> None:
+    """Record all modules whose input or output is in the golden file.
+
+    low: size of the feature maps.
+    """
+    predictor = encoder.depth_predictor
+    refined = predictor.corr_refine_net
+    kept.outputs(encoder, MVSPLAT_OUTPUTS)
+    watch_transformer(kept, encoder.backbone.transformer, low, "features")
+    kept.input("cost_volume", refined, slice(encoder.config.candidates))
+    watch_unet(kept, "cost_unet", refined[3])
+    kept.input("cost_volume_refined", predictor.depth_head_lowres)
+    kept.input("fullres_disparity", predictor.refine_unet, slice(-2, -1))
+    kept.input("pdf_max_fullres", predictor.refine_unet, slice(-1, None))
+    watch_unet(kept, "depth_unet", predictor.refine_unet[3])
+
+
+def watch_depthsplat(kept: Recorder, encoder: DepthSplatEncoder, low: tuple[int, ...]) -> None:
+    """Record all modules whose output is in the golden file. low: size of the feature maps."""
     network = encoder.network
-    predictor = encoder.network.depth_predictor
-    low = (size[0] // encoder.config.stride, size[1] // encoder.config.stride)
+    predictor = network.depth_predictor
     kept.outputs(network, OUTPUTS)
     watch_transformer(kept, predictor.transformer, low, "features_mv.0")
     vit = predictor.pretrained
@@ -125,15 +175,19 @@ def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> 
     kept.input("match_probability_max", network.gaussian_regressor, slice(4, 5))
 
 
-def swept(found: dict[str, Tensor], predictor: DepthPredictor, views: Views, sweep: Sweep) -> None:
-    """Add to `found` the tensors of plane sweeps that no module outputs."""
+def of_depthsplat(found: dict[str, Tensor], predictor: DepthPredictor, sweep: Sweep) -> None:
+    """Add to `found` the tensors of DepthSplat that no module outputs."""
     shape = sweep.near.shape
+    height, width = sweep.cameras.size
+    found["dino_positions"] = predictor.pretrained.positions(height // PATCH, width // PATCH)
+    first = torch.arange(shape[1]).expand(shape)[..., None]
+    found["neighbours"] = torch.cat([first, sweep.neighbours], -1)
     poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
     counts = [predictor.candidates(scale) for scale in range(predictor.sizes.scales)]
     candidates = inverse_depth_candidates(sweep.near, sweep.far, counts[0])
     found["inverse_depth_candidates.0"] = candidates
     low = found["cost_volume.0"].shape[-2:]
-    found["warp_grid.0"] = warps(views, poses, low, candidates[..., ::8])
+    found["warp_grid.0"] = warps(sweep.cameras, poses, low, candidates[..., ::8])
     candidates = candidates.flatten(0, 1)[..., None, None]
     for scale, count in enumerate(counts):
         if scale:
