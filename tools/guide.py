@@ -48,7 +48,7 @@ SECTIONS = {".".join(path) or "Top level": config for path, config in SETTINGS.i
 def filled(page: str) -> str:
     """Return a page for the site, with all generated parts filled in."""
     page = PART.sub(lambda found: PARTS[found[1]](), page)
-    page = ENTRY.sub(lambda found: _block(found[1], found[2]), page)
+    page = ENTRY.sub(_block, page)
     return TO_FILE.sub(_cross_reference, page)
 
 
@@ -60,11 +60,12 @@ def written(page: str, folder: Path) -> str:
     up = "../" * len(folder.relative_to(ROOT).parts)
     page = CROSS.sub(lambda found: _link(found[1], up), page)
     for pattern in (DOCUMENTED, ENTRY):
-        page = pattern.sub(lambda found: _entry(found[1], found[2]), page)
-    return PART.sub(lambda found: _part(found[1], found[2]), page)
+        page = pattern.sub(_entry, page)
+    return PART.sub(_part, page)
 
 
-def _block(name: str, options: str | None) -> str:
+def _block(found: re.Match[str]) -> str:
+    name, options = found.groups()
     return f"::: {name}" + (f"\n    {options}" if options else "")
 
 
@@ -89,14 +90,16 @@ def _file(found: Any) -> str:
     return file.relative_to(ROOT).as_posix()
 
 
-def _entry(name: str, options: str | None) -> str:
-    """Return a link from docs/api/ to the file of `name`, with its docstring's first paragraph."""
-    found = resolve_name(name)
-    line = f"[`{name}`](../../{_file(found)}): {summary_of(found)}"
+def _entry(found: re.Match[str]) -> str:
+    """Return a link from docs/api/ to the file of a name, with its docstring's first paragraph."""
+    name, options = found.groups()
+    named = resolve_name(name)
+    line = f"[`{name}`](../../{_file(named)}): {summary_of(named)}"
     return line + (f"\n<!-- {options} -->" if options else "")
 
 
-def _part(name: str, text: str) -> str:
+def _part(found: re.Match[str]) -> str:
+    name, text = found.groups()
     # The recipe reference is long, and every new option changes it: the repository links to it.
     if name != "recipe reference":
         text = PARTS[name]()
