@@ -28,11 +28,11 @@ class PhotoSet:
     size: tuple[int, int]
 
 
-def synthetic(folder, count=6, size=(30, 40), seed=0):
+def synthetic(folder, count=6, size=(30, 40), seed=0, suffix="png"):
     """Photos of noise at random poses."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    files = tuple(folder / f"view_{i:03d}.png" for i in range(count))
+    files = tuple(folder / f"view_{i:03d}.{suffix}" for i in range(count))
     for file in files:
         Image.fromarray(rng.integers(0, 256, (*size, 3), dtype=np.uint8)).save(file)
     c2w = np.tile(np.eye(4), (count, 1, 1))

@@ -38,14 +38,15 @@ def opened(folder: Path) -> SceneSource:
     return open_for(str(folder), (16, 16), None, sources())[0]
 
 
-def write_nerfstudio(folder: Path, photos: Any) -> None:
-    """Write photos to `folder` in nerfstudio's format, with masks and depth maps."""
+def write_nerfstudio(folder: Path, photos: Any) -> Path:
+    """Write photos to `folder` in nerfstudio's format, with masks and depth maps; return it."""
     formats.write_nerfstudio(folder, photos)
     (folder / "mask.png").write_bytes(formats.encoded(np.full(SIZE, 255, np.uint8)))
     np.save(folder / "depth.npy", np.ones(SIZE, np.float32))
     listing = folder / "transforms.json"
     more = '"mask_path": "mask.png", "depth_file_path": "depth.npy", "file_path"'
     listing.write_text(listing.read_text().replace('"file_path"', more))
+    return folder
 
 
 def write_cameras(folder: Path, photos: Any) -> None:
@@ -57,15 +58,12 @@ def write_cameras(folder: Path, photos: Any) -> None:
 
 
 def write_dl3dv(folder: Path, photos: Any) -> None:
-    inner = folder.with_name("inner")
-    write_nerfstudio(inner, photos)
+    inner = write_nerfstudio(folder.with_name("inner"), photos)
     shutil.make_archive(str(folder / ("0123456789abcdef" * 4)), "zip", inner)
 
 
 def write_chunks(folder: Path, photos: Any) -> None:
-    inner = folder.with_name("inner")
-    write_nerfstudio(inner, photos)
-    source = opened(inner)
+    source = opened(write_nerfstudio(folder.with_name("inner"), photos))
     pack(source, chosen_splits(source), UPath(folder), {})
 
 
@@ -125,7 +123,7 @@ def case_in(_: Path, folder: Path) -> tuple[str, Use]:
     data.mkdir()
     kind = choice([*WRITERS])
     suffix = choice(["png", "jpg"])
-    photos = formats.synthetic(folder / "photos", 5, SIZE, suffix, randrange(1000))
+    photos = formats.synthetic(folder / "photos", 5, SIZE, randrange(1000), suffix)
     WRITERS[kind](data, formats.centred(photos))
     found = [file for file in sorted(data.rglob("*")) if file.is_file()]
     listings = [file for file in found if file.suffix not in (".png", ".jpg")]
