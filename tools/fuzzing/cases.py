@@ -17,6 +17,7 @@ from typing import Any
 import torch
 import yaml
 
+RECIPES = Path(__file__).parents[2] / "recipes"
 SECONDS = 60
 BYTES = 2 * 10**9
 LONGEST_MESSAGE = 100_000

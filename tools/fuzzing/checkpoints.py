@@ -27,7 +27,7 @@ from qgs.recipe import resolve
 from qgs.reconstruction.scene_formats import save_splat
 from qgs.train.initial import initialise
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
+RECIPE = "tiny/locus.yaml"
 SMALL = TABLES["small"].split()
 
 

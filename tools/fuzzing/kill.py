@@ -24,11 +24,10 @@ from qgs.containers import map_tensors
 from qgs.files import is_leftover
 from qgs.train.folder import RunFolder, read_state
 
-RECIPES = Path(__file__).parents[2] / "recipes"
 QGS = str(Path(sys.executable).with_name("qgs"))
 
 # The rate does not collapse on a single sample. Saves take about as long as steps.
-TRAINING = """train {recipes}/tiny/tokengs.yaml --out {run} --resume --device cpu --threads 1
+TRAINING = """train tiny/tokengs.yaml --out {run} --resume --device cpu --threads 1
 --set model.width=192 --set training.steps=150 --set training.save_every={save_every}
 --set model.queries.count=16 --set data.image_size=[16,16] --set data.samples=1
 --set training.seconds=null --set optimizer.warmup=2 --set optimizer.learning_rate=1e-4
@@ -36,7 +35,7 @@ TRAINING = """train {recipes}/tiny/tokengs.yaml --out {run} --resume --device cp
 
 STUDY = """study: 1
 title: Killed
-base: {recipes}/tiny/locus.yaml
+base: tiny/locus.yaml
 overlay:
   data: {{image_size: [32, 32], scenes: 50, samples: 1}}
   model: {{width: 32, heads: 2, queries: {{count: 32}}, head: {{gaussians_per_query: 4}}}}
@@ -47,7 +46,7 @@ variants:
   locus:
   free: {{model: {{centers: {{type: qgs/free, z_offset: 0.0}}}}}}
   flat: {{model: {{decoder: {{cross_attention: {{type: qgs/content}}}}}}}}
-  tokengs: {{extends: {recipes}/tiny/tokengs.yaml}}
+  tokengs: {{extends: tiny/tokengs.yaml}}
 reference: locus
 seeds: [0, 1, 2]
 budget: {{steps: {steps}}}
@@ -62,7 +61,7 @@ def started(command: str, log: Path, **values: object) -> Popen[bytes]:
 
     values: replacements for placeholders in the command.
     """
-    words = [word.format(recipes=RECIPES, **values) for word in command.split()]
+    words = [word.format(**values) for word in command.split()]
     with log.open("ab") as file:
         return Popen([QGS, *words], stdout=file, stderr=file)
 
@@ -138,7 +137,7 @@ def study(folder: Path, count: int, steps: int = 60) -> int:
 
     Returns 0 if its tables equal those of a study without kills, else 1.
     """
-    (folder / "study.yaml").write_text(STUDY.format(recipes=RECIPES, steps=steps))
+    (folder / "study.yaml").write_text(STUDY.format(steps=steps))
     command = "study {folder}/study.yaml --out {folder}/{name} --workers 2 --threads 1 --device cpu"
 
     def queue(name: str) -> Popen[bytes]:

@@ -12,14 +12,13 @@ from pathlib import Path
 from random import choice, randrange
 from typing import Any
 
-from fuzzing.cases import TABLES, FaultError, Use, refused
+from fuzzing.cases import RECIPES, TABLES, FaultError, Use, refused
 from qgs.contracts import MissingExtraError
 from qgs.recipe import PluginError, RecipeError, resolve
 from qgs.recipe.recipe import annotated, flat
 from qgs.recipe.registry import load_usable_plugins
 from qgs.recipe.slots import SLOTS
 
-RECIPES = Path(__file__).parents[2] / "recipes"
 PARTS = ("finetune/dl3dv", "rooms/budget", "studies/")
 """Prefixes of recipe files that are not complete recipes."""
 FOUND = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))

@@ -5,7 +5,7 @@ from unittest.mock import Mock
 
 import torch
 from commands import run_qgs
-from fuzzing.kill import RECIPES
+from fuzzing.cases import RECIPES
 from published.files import read_golden
 from qgs_research.published.importing import import_weights
 from qgs_research.published.layouts import PublishedError, fitting_recipe, names_of

@@ -20,7 +20,7 @@ from tables import must_refuse, text_console
 
 @pytest.fixture
 def study(tmp_path):
-    text = kill.STUDY.format(recipes=kill.RECIPES, steps=12)
+    text = kill.STUDY.format(steps=12)
     text = text.replace("seeds: [0, 1, 2]", "seeds: [0, 1]")
     text = re.sub(r"  (free|tokengs):.*\n|differs:.*\n", "", text)
     text = re.sub(r"hypotheses:.*", "hypotheses: [flat < locus]", text)

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 
 import pytest
 from commands import done
-from fuzzing.kill import RECIPES
+from fuzzing.cases import RECIPES
 from qgs_research.studies.plan import composed, planned
 from qgs_research.studies.runs import recipe_file, run_of, write_plan
 from qgs_research.studies.study import parsed, read_study
