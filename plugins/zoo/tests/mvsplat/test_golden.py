@@ -8,18 +8,15 @@ import pytest
 import torch
 import torch.nn.functional as F
 from published.files import read_golden
-from published.splats import views_of, weights_of
-from qgs_research.published.layouts import fitting_recipe, names_of
+from published.splats import model_of, views_of
 from qgs_zoo.mvsplat import sweep
 from qgs_zoo.mvsplat.depthsplat import nearest_neighbours
 from torch import nn
 from torch.testing import assert_close
 
 import qgs
-from qgs.checkpoint.tensors import shapes_of
 from qgs.geometry.harmonics import SH_C0, harmonics
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.recipe import resolve
 
 FILES = """
 mvsplat_a mvsplat_views3_a mvsplat_cases_a depthsplat_a depthsplat_base_a depthsplat_base_eighth_a
@@ -50,11 +47,8 @@ def test_every_tensor():
 def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     """Of the recipe that fits, in worlds in which no camera stands at the origin."""
     golden = read(name)
-    weights = {f"encoder.{name}": x for name, x in weights_of(golden).items()}
     views = views_of(golden)
-    tree = fitting_recipe(shapes_of(weights), name)[1]
-    model = qgs.compose(tree).eval()
-    model.load_state_dict(names_of(resolve(tree)).from_published(weights))
+    model = model_of(golden)
     # near and far of the files differ from view to view
     near = golden.input("near")
     far = golden.input("far")
