@@ -1,12 +1,11 @@
 """The guide's pages as text."""
 
 import re
-from pathlib import Path
 
-from guide import filled
+from guide import ROOT, filled
 from qgs_dev import checks_for, run_check
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = ROOT / "docs"
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 
 

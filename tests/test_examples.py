@@ -3,11 +3,11 @@
 import re
 import runpy
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 import torch
 from odd_views import odd_views
+from size import ROOT
 from torch.testing import assert_close
 
 import qgs
@@ -15,7 +15,7 @@ from qgs.recipe import resolve
 from qgs.recipe.recipe import annotated
 from qgs.train.training_pass import TrainingPass
 
-FOLDER = Path(__file__).parents[1] / "docs/examples"
+FOLDER = ROOT / "docs/examples"
 FILE = FOLDER / "nano_locus.py"
 
 

@@ -4,11 +4,9 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
+from size import ROOT
 from tables import names_in
-
-ROOT = Path(__file__).parents[1]
 
 
 def project(folder):

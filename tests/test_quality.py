@@ -2,11 +2,10 @@
 
 import ast
 import re
-from pathlib import Path
 
 import size
+from size import ROOT
 
-ROOT = Path(__file__).parents[1]
 SOURCES = ("qgs", "plugins", "tests", "tools", "docs/examples")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400

@@ -10,11 +10,11 @@ from guide_pages import contract_failures, text_of
 from photo_formats import centred, synthetic, write_nerfstudio
 from qgs_dev import Case
 from qgs_viewer.comparison import open_models
+from size import ROOT
 
 from qgs.cli import COMMANDS, GROUP
 from qgs.recipe.slots import SECTIONS, SLOTS
 
-ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 

@@ -16,11 +16,11 @@ from published.models import recipe_of
 from qgs_research.studies.plan import composed, planned
 from qgs_research.studies.runs import differences
 from qgs_research.studies.study import read_study
+from size import ROOT
 from tables import read_json
 
 from qgs.recipe import resolve
 
-ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"
 IS_VALID = jsonschema.Draft202012Validator(read_json(RECIPES / "recipe.schema.json")).is_valid
 EVERY = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))

@@ -7,6 +7,7 @@ import pytest
 import typer
 import yaml
 from commands import done
+from size import ROOT
 from tables import rows
 
 from qgs.cli import app, main
@@ -64,7 +65,7 @@ def test_mistakes_are_printed_without_a_traceback(tmp_path, monkeypatch, capsys)
         assert not shown.out
 
 
-RECIPES = Path(__file__).parents[2] / "recipes"
+RECIPES = ROOT / "recipes"
 
 
 def test_all_are_listed_with_what_they_are():

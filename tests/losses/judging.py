@@ -1,13 +1,12 @@
 """What a loss says of given points and images."""
 
-from pathlib import Path
-
 import torch
 from safetensors.torch import load_file
+from size import ROOT
 
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering
 
-GOLDEN = load_file(Path(__file__).parents[1] / "golden" / "loss_a.safetensors")
+GOLDEN = load_file(ROOT / "tests/golden/loss_a.safetensors")
 """Inputs and results of the released losses."""
 CAMERAS = Cameras(GOLDEN["c2w"], GOLDEN["intrinsics"], (16, 24))
 PREDICTED = GOLDEN["images_pred"]

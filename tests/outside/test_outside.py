@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from guide_pages import BLOCK, text_of
 from photo_formats import synthetic, write_nerfstudio
+from size import ROOT
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[2]
 KEPT_BACK = re.compile(
     r"_*(editable_+)?_*(impl_)?(qgs|query_gaussians).*|.*\.pth|pip|pip-.*|__pycache__"
 )

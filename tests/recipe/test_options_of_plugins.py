@@ -3,13 +3,12 @@
 The first line is a recipe. Of each override below it the next line says `option: reason`.
 """
 
-from pathlib import Path
-
 import pytest
 import yaml
 from refusals import refused
+from size import ROOT
 
-FILES = Path(__file__).parents[2].glob("plugins/*/tests/**/refused.txt")
+FILES = ROOT.glob("plugins/*/tests/**/refused.txt")
 
 
 @pytest.mark.parametrize("file", sorted(FILES), ids=str)

@@ -10,6 +10,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from size import ROOT
 from tables import assert_equal, contents, must_refuse
 from training_runs import (
     TRAINED,
@@ -162,7 +163,7 @@ def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, cop
 @pytest.mark.slow
 def test_killed_runs_go_on_from_whole_files(monkeypatch):
     """Some kills must come inside a save, for this to prove anything."""
-    tool = Path(__file__).parents[2] / "tools/fuzz.py"
+    tool = ROOT / "tools/fuzz.py"
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     command = [sys.executable, tool, "kill-training", "--count=12"]
     told = subprocess.check_output(command, text=True)

@@ -1,18 +1,18 @@
 """`qgs list`; the JSON Schema agrees with the composer, and the committed copy with the code."""
 
 import json
-from pathlib import Path
 
 import jsonschema
 import pytest
 import yaml
 from commands import done
 from qgs_dev.schema import recipe_schema
+from size import ROOT
 from tables import read_json, rows
 
 from qgs.recipe.registry import Registry, load_plugin
 
-COMMITTED = Path(__file__).parents[3] / "recipes/recipe.schema.json"
+COMMITTED = ROOT / "recipes/recipe.schema.json"
 SHIPPED = "c3g datasets dinov2 ellipsoid globalsplat gslrm landmark locus lpips mvsplat rooms"
 SHIPPED += " tokengs2026 worlds"
 SOUND = """

@@ -13,7 +13,6 @@ import sys
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from random import Random
 from types import SimpleNamespace
 
@@ -22,6 +21,7 @@ import torch
 from attending import case, exact, found, wrong
 from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.ray_bias import RayBias
+from size import ROOT
 from tables import assert_equal
 from torch.testing import assert_close
 
@@ -48,7 +48,7 @@ def _on_device(given):
 def test_kernels_pass_under_the_interpreter():
     result = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-m", "slow", "-p", "no:cacheprovider", __file__],
-        cwd=Path(__file__).parents[3],
+        cwd=ROOT,
         env={**os.environ, "TRITON_INTERPRET": "1"},
         capture_output=True,
         text=True,
