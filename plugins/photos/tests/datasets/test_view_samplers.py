@@ -5,7 +5,7 @@ from itertools import islice
 
 import numpy as np
 import torch
-from line_scenes import Line, Lines, judged_samples, samples_of
+from line_scenes import Line, Lines, drawn, judged_samples, samples_of
 from qgs_photos.datasets.view_samplers import Bounded, Farthest, Overlapping
 from tables import must_refuse
 from training_runs import stream_of
@@ -33,10 +33,6 @@ farthest = partial(
 )
 
 
-def seeded(seed=0):
-    return np.random.default_rng(seed)
-
-
 def test_the_gap_widens_as_in_pixelsplat():
     """initial + int((final - initial) * step / warm_up_steps), at most the final number."""
     steps = {0: (4, 6), 50: (5, 9), 99: (5, 11), 100: (6, 12), 500: (6, 12), END: (6, 12)}
@@ -44,7 +40,7 @@ def test_the_gap_widens_as_in_pixelsplat():
         gaps = set()
         places = set()
         for seed in range(120):
-            (left, right), targets = bounded().draw(Line(30), TWO, seeded(seed), step)
+            (left, right), targets = drawn(Line(30), TWO, seed, step, bounded())
             gaps.add(right - left)
             places.update(target - left for target in targets)
             assert max(targets) < right
@@ -54,9 +50,9 @@ def test_the_gap_widens_as_in_pixelsplat():
 
 
 def test_short_scenes_and_several_inputs():
-    assert bounded().draw(Line(5), TWO, seeded(), END)[0] == (0, 4)
-    must_refuse("5 frames", bounded(margin=3).draw, Line(5), TWO, seeded(), END)
-    inputs, _ = bounded().draw(Line(30), ViewsConfig(inputs=4, targets=1), seeded(), END)
+    assert drawn(Line(5), TWO, 0, END, bounded())[0] == (0, 4)
+    must_refuse("5 frames", drawn, Line(5), TWO, 0, END, bounded(margin=3))
+    inputs, _ = drawn(Line(30), ViewsConfig(inputs=4, targets=1), 0, END, bounded())
     assert len(inputs) == 4
     assert list(inputs) == sorted({*inputs})
 
@@ -75,8 +71,8 @@ def test_a_training_widens_the_gap_and_resumes_where_it_was():
     recipe = small("view_sampler.warm_up_steps=5", "view_sampler.initial_max_gap=2")
 
     def gaps(start, count):
-        drawn = [x for batch in batches(recipe, start, count) for x in batch.input_frames]
-        return [frames[-1] - frames[0] for frames in drawn]
+        found = [x for batch in batches(recipe, start, count) for x in batch.input_frames]
+        return [frames[-1] - frames[0] for frames in found]
 
     whole = gaps(0, 14)
     assert gaps(9, 5) == whole[18:]
@@ -103,7 +99,7 @@ def test_numbers_of_inputs_and_gaps_as_in_depthsplat():
     ):
         found = set()
         for seed in range(120):
-            inputs, targets = farthest().draw(Line(80), SIX, seeded(seed), step)
+            inputs, targets = drawn(Line(80), SIX, seed, step, farthest())
             assert list(inputs) == sorted({*inputs})
             gap = inputs[-1] - inputs[0]
             found.add(gap)
@@ -125,7 +121,7 @@ class Bend(Line):
 def test_inputs_stand_where_cameras_move():
     sampler = farthest(max_gap=20)
     four = ViewsConfig(inputs=4, targets=8)
-    assert sampler.draw(Bend(21), four, seeded(), END)[0][1:] == (18, 19, 20)
+    assert drawn(Bend(21), four, 0, END, sampler)[0][1:] == (18, 19, 20)
 
 
 def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
@@ -151,7 +147,7 @@ class Arc(Line):
 def draws(count, views=TWO, **options):
     sampler = made(Overlapping, **options)
     scene = Arc(40, held_out=(0, 8, 16))
-    return [sampler.draw(scene, views, seeded(k), 0) for k in range(count)]
+    return [drawn(scene, views, k, 0, sampler) for k in range(count)]
 
 
 def steps(frames):
@@ -213,7 +209,7 @@ def test_any_number_of_inputs():
 
 def test_cameras_without_a_common_point_and_few_photos():
     """Their depth is swept; two photos are inputs, and the third is every target."""
-    inputs, targets = SAMPLER.draw(Line(3, step=0.1), TWO, seeded(), 0)
+    inputs, targets = drawn(Line(3, step=0.1), TWO, 0, 0, SAMPLER)
     assert len({*inputs}) == 2
     assert {*targets} == {0, 1, 2} - {*inputs}
     assert len(targets) == 3
@@ -223,13 +219,11 @@ def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn():
     scene = Arc(40, held_out=(3,))
     scene.times = torch.arange(40).double()
     assert SAMPLER.windows(scene, TWO) == []
-    must_refuse(r"moves, .* qgs/span", SAMPLER.draw, scene, TWO, seeded(), 0)
+    must_refuse(r"moves, .* qgs/span", drawn, scene, TWO, 0, 0, SAMPLER)
 
 
 def test_too_few_photos_are_refused():
-    must_refuse(
-        "'line2' has 2 photos, but a sample needs 3", SAMPLER.draw, Line(2), TWO, seeded(), 0
-    )
+    must_refuse("'line2' has 2 photos, but a sample needs 3", drawn, Line(2), TWO, 0, 0, SAMPLER)
     must_refuse(
         "has 1 photos beside 1 held-out ones, but a sample needs 2",
         SAMPLER.windows,
