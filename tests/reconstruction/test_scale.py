@@ -31,12 +31,15 @@ def test_further_photos_lie_between_and_are_not_compared_with():
     assert scale.further_photos(walk, (0, 4), (3, 5)) == ()
 
 
-def test_without_further_photos_an_input_is_judged_or_inputs_alone():
-    views = ViewsConfig(inputs=2, scale="search")
+def searched(*frames):
+    """What is found for these inputs and compared frames, by an untrained model."""
     model = qgs.compose("tiny/tokengs.yaml", ["model.queries.count=12"]).eval()
-    three = scale.find_scale(model, Walk(), (0, 2, 4), (1, 3, 5), views)
-    assert three.further == (2,)
-    two = scale.find_scale(model, Walk(), (1, 4), (0, 2, 3, 5), views)
+    return scale.find_scale(model, Walk(), *frames, ViewsConfig(inputs=2, scale="search"))
+
+
+def test_without_further_photos_an_input_is_judged_or_inputs_alone():
+    assert searched((0, 2, 4), (1, 3, 5)).further == (2,)
+    two = searched((1, 4), (0, 2, 3, 5))
     assert two.further == ()
     assert two.poor
 
@@ -64,9 +67,7 @@ def test_the_range_follows_the_unit_and_the_training():
 
 def test_depth_maps_keep_a_search_on_inputs_alone_near_their_depth(monkeypatch):
     monkeypatch.setattr(Walk, "depths", lambda self, frames: torch.tensor([0.0, 2.0, 2.0]))
-    views = ViewsConfig(inputs=2, scale="search")
-    model = qgs.compose("tiny/tokengs.yaml", ["model.queries.count=12"]).eval()
-    found = scale.find_scale(model, Walk(), (1, 4), (0, 2, 3, 5), views)
+    found = searched((1, 4), (0, 2, 3, 5))
     assert found.depth == 2
     assert "inputs" not in found.poor.split(";")[0]
     factors = [factor for factor, _ in found.tried]
