@@ -48,9 +48,9 @@ def model_of(kind, *overrides):
         return resolve(f"tiny/{kind}.yaml", settings).build_model().eval()
 
 
-def sample_of(inputs=(1, 4)):
+def sample_of(inputs=(1, 4), targets=(2, 3)):
     """The walk as a model sees it."""
-    return make_sample(Walk(), inputs, (2, 3), VIEWS, mirror=False)
+    return make_sample(Walk(), inputs, targets, VIEWS, mirror=False)
 
 
 @cache

@@ -9,12 +9,11 @@ from commands import record_of
 from photo_formats import noisy_photos
 from qgs_viewer.opening import ModelSource, open_source
 from qgs_viewer.query_scene import NEUTRAL
-from small import VIEWS, model_of
+from small import model_of, sample_of
 from tables import must_refuse, write_json
-from walk import Walk, cloud
+from walk import cloud
 
 import qgs
-from qgs.data.samples import make_sample
 from qgs.reconstruction.result import reconstruct_sample
 from qgs.reconstruction.scene_formats import load_ply, save_splat
 
@@ -25,7 +24,7 @@ def finished(tmp_path_factory, short_orbit):
     folder = tmp_path_factory.mktemp("finished")
     qgs.save(model_of("locus"), folder / "model.safetensors")
     model = qgs.load(folder / "model.safetensors")
-    sample = make_sample(Walk(), (1, 4), (0, 2, 3, 5), VIEWS, mirror=False)
+    sample = sample_of(targets=(0, 2, 3, 5))
     reconstruct_sample(model, sample).save(folder / "scene")
     return folder / "scene"
 
