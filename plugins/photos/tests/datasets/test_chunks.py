@@ -8,6 +8,7 @@ import photo_formats
 import pytest
 import torch
 from PIL import Image
+from planted import save
 from qgs_photos.datasets.chunk_files import load_chunk
 from qgs_photos.datasets.chunks import ChunksSource
 from tables import assert_equal, must_not_find, must_refuse, write_json
@@ -43,11 +44,9 @@ def record(key, frames=4, **extra):
 
 def write(folder, index=True, **chunks):
     """Chunks, by their names without the suffix."""
-    folder.mkdir(parents=True, exist_ok=True)
     keys = {}
     for name, records in chunks.items():
-        with (folder / f"{name}.torch").open("wb") as file:
-            torch.save(records, file)
+        save(folder / f"{name}.torch", records)
         keys |= {entry["key"]: f"{name}.torch" for entry in records if index}
     if index:
         write_json(folder / "index.json", keys)
@@ -87,8 +86,8 @@ def test_listing_opens_no_chunk(tmp_path):
     (tmp_path / "train/b.torch").write_bytes(b"nothing")
     source = opened(tmp_path)
     assert len(source.scenes("train")) == 3
-    with pytest.raises(ValueError, match=r"b\.torch cannot be read as a torch file"):
-        source.scenes("train")[2].cameras  # noqa: B018
+    scene = source.scenes("train")[2]
+    must_refuse(r"b\.torch cannot be read as a torch file", getattr, scene, "cameras")
 
 
 def test_held_out_frames_serve_where_there_are_no_test_chunks(tmp_path):
