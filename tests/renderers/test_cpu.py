@@ -4,7 +4,6 @@ import os
 import signal
 from unittest.mock import Mock
 
-import pytest
 import torch
 from renderers.scenes import differentiate, make_scene
 from tables import assert_equal, must_refuse
@@ -18,31 +17,31 @@ from qgs.renderers import CpuRenderer
 RENDER = CpuRenderer(RendererConfig())
 
 
-@pytest.mark.parametrize("views", [1, 3])
-def test_the_number_of_threads_changes_no_bit(views):
-    scene = make_scene(views=views, count=300, size=(80, 48), scale=0.2)
-    results = []
-    for count in (1, 2, 5):
-        torch.set_num_threads(count)
-        rendering, gradients = differentiate(RENDER, *scene)
-        results.append({**dict(named_tensors(rendering)), **gradients})
-    for found in results[1:]:
-        assert_equal(found, results[0])
+def test_the_number_of_threads_changes_no_bit():
+    for views in (1, 3):
+        scene = make_scene(views=views, count=300, size=(80, 48), scale=0.2)
+        results = []
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            rendering, gradients = differentiate(RENDER, *scene)
+            results.append({**dict(named_tensors(rendering)), **gradients})
+        for found in results[1:]:
+            assert_equal(found, results[0])
 
 
-@pytest.mark.parametrize("more", [{}, {"harmonics": 3, "features": 4}])
-def test_more_gaussians_than_a_unit_of_work_takes(more):
+def test_more_gaussians_than_a_unit_of_work_takes():
     """Repeating a scene with opacity 0 changes neither its images nor its gradients."""
-    gaussians, cameras = make_scene(batch=2, views=2, count=300, **more)
-    fillers = gaussians.replace(opacities=gaussians.opacities * 0)
-    rendering, gradients = differentiate(RENDER, gaussians, cameras)
-    padded, found = differentiate(RENDER, concatenated([fillers, gaussians], 1), cameras)
-    assert_equal(padded.rgb, rendering.rgb)
-    for name, _ in named_tensors(gaussians):
-        of_fillers, found[name] = found[name].split(300, 1)
-        assert not of_fillers.any(), name
-        assert torch.equal(found[name], gradients[name]), name
-    assert_close(found, gradients)
+    for more in ({}, {"harmonics": 3, "features": 4}):
+        gaussians, cameras = make_scene(batch=2, views=2, count=300, **more)
+        fillers = gaussians.replace(opacities=gaussians.opacities * 0)
+        rendering, gradients = differentiate(RENDER, gaussians, cameras)
+        padded, found = differentiate(RENDER, concatenated([fillers, gaussians], 1), cameras)
+        assert_equal(padded.rgb, rendering.rgb)
+        for name, _ in named_tensors(gaussians):
+            of_fillers, found[name] = found[name].split(300, 1)
+            assert not of_fillers.any(), name
+            assert torch.equal(found[name], gradients[name]), name
+        assert_close(found, gradients)
 
 
 def test_tensors_elsewhere_are_refused():

@@ -86,20 +86,17 @@ def test_exemptions_are_of_a_class_or_of_options() -> None:
     assert known == [first, (UNBOUNDED, True, {GRADIENTS: "all", INPUTS: "these"})]
 
 
-@pytest.mark.parametrize(
-    ("exemptions", "examples"),
-    [
+def test_unsound_exemptions_are_refused() -> None:
+    for exemptions, examples in (
         ({FreeCenters: {"large_number_stay_finite": "why"}}, ()),
         ({FreeCenters: {"supervision_weights": "why"}}, ()),
         ({FreeCenters: {LARGE: ""}}, ()),
         ({GaussianHead: {LARGE: "why"}}, ()),
         ({UNBOUNDED: {INPUTS: "why"}}, ()),
         ({UNBOUNDED: {LARGE: "why"}}, (UNBOUNDED,)),  # made of the first case of a class alone
-    ],
-)
-def test_unsound_exemptions_are_refused(exemptions, examples) -> None:
-    installed = _installed(FreeCenters, examples=examples, exemptions=exemptions)
-    must_refuse("exemptions", runs_of, installed, kind=PluginError)
+    ):
+        installed = _installed(FreeCenters, examples=examples, exemptions=exemptions)
+        must_refuse("exemptions", runs_of, installed, kind=PluginError)
 
 
 @pytest.mark.parametrize("component", [CannotDefault, PhotosSource])
@@ -188,14 +185,14 @@ KEPT = {
 }
 
 
-@pytest.mark.parametrize("what", KEPT)
-def test_a_change_is_seen(what: str) -> None:
-    kept, change = KEPT[what]
-    module = Keeper(kept)
-    before = attributes(module)
-    assert attributes(module) == before
-    change(kept)
-    assert [name for name, value in attributes(module).items() if before.get(name) != value]
+def test_a_change_is_seen() -> None:
+    for what, (kept, change) in KEPT.items():
+        module = Keeper(kept)
+        before = attributes(module)
+        assert attributes(module) == before
+        change(kept)
+        after = attributes(module).items()
+        assert [name for name, value in after if before.get(name) != value], what
 
 
 def test_what_contains_itself_comes_to_an_end() -> None:

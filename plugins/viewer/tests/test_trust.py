@@ -40,9 +40,8 @@ DARK = Part(0.2, 30.0, 15.0)
 NONE = Part(0.0, torch.nan, torch.nan)
 
 
-@pytest.mark.parametrize(
-    ("whole", "parts", "said"),
-    [
+def test_words_follow_the_rules():
+    for whole, parts, said in (
         (GOOD, {}, "Sharp where the inputs look, at 100 % of the scored views (26.0 dB"),
         (Part(1.0, 24.9, 15.0), {}, "Soft"),
         (Part(1.0, 19.9, 15.0), {}, "Blurred"),
@@ -51,10 +50,8 @@ NONE = Part(0.0, torch.nan, torch.nan)
         (NONE, {}, "Do not trust any part."),
         (GOOD, {"top": BAD}, f"{WRONG}: the top third of a.jpg. Do not trust the top third."),
         (GOOD, {"top": BAD, "left": DARK}, "Do not trust the top or the left third."),
-    ],
-)
-def test_words_follow_the_rules(whole, parts, said):
-    assert said in verdict([("a.jpg", {WHOLE: whole, **parts})])
+    ):
+        assert said in verdict([("a.jpg", {WHOLE: whole, **parts})])
 
 
 def test_one_bad_view_of_three_is_named_and_no_more():

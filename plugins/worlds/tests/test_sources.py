@@ -107,8 +107,8 @@ def test_colours_reproject_through_depth(mirror):
     assert aligned < 0.5 * unaligned
 
 
-@pytest.mark.parametrize("name", ["locus-64", "tokengs-64"])
-def test_models_come_with_their_training_curves(name):
-    curves = curves_of(checkpoint_path(f"rooms/{name}"))
-    assert [record["step"] for record in curves] == list(range(100, 40_001, 100))
-    assert curves[0]["psnr"] + 5 < curves[-1]["psnr"]
+def test_models_come_with_their_training_curves():
+    for name in ("locus-64", "tokengs-64"):
+        curves = curves_of(checkpoint_path(f"rooms/{name}"))
+        assert [record["step"] for record in curves] == list(range(100, 40_001, 100))
+        assert curves[0]["psnr"] + 5 < curves[-1]["psnr"]
