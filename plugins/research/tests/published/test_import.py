@@ -36,6 +36,14 @@ def imported(folder, weights, **options):
     return import_weights(folder / "w.safetensors", None, folder / "made.safetensors", **options)
 
 
+def arrived(file, weights):
+    """Names of the layout of a checkpoint that holds these weights, bit by bit."""
+    known = names_of(resolve(file.with_suffix(".yaml")))
+    ours = load_file(file)
+    assert_equal(ours, {key: weights[theirs] for key, theirs in known.published.items()})
+    return known
+
+
 FILES = """
 tokengs_a tokengs_latent_a tokengs_multiscale_a tokengs_dynamic_a
 locus_full_a locus_no_radius_state_a locus_content_cross_attn_a
@@ -47,10 +55,8 @@ def test_every_tensor_arrives_bit_equal_or_is_known_as_unused(tmp_path):
         folder = tmp_path / name
         given = published(name)
         imported(folder, given)
-        known = names_of(resolve(folder / "made.yaml"))
-        ours = load_file(folder / "made.safetensors")
+        known = arrived(folder / "made.safetensors", given)
         assert given.keys() == {*known.published.values(), *known.unused}
-        assert_equal(ours, {key: given[theirs] for key, theirs in known.published.items()})
 
 
 def test_an_imported_checkpoint_is_like_any_other(tmp_path):
@@ -137,9 +143,7 @@ def test_parameters_that_share_memory_or_lie_in_strides(tmp_path):
     weights[strided] = weights[strided].t().contiguous().t()
     torch.save(weights, tmp_path / "w.pt")
     import_weights(tmp_path / "w.pt", None, tmp_path / "c.safetensors")
-    ours = load_file(tmp_path / "c.safetensors")
-    known = names_of(resolve(tmp_path / "c.yaml")).published
-    assert_equal(ours, {key: weights[theirs] for key, theirs in known.items()})
+    arrived(tmp_path / "c.safetensors", weights)
 
 
 def test_weights_that_are_no_numbers_are_refused(tmp_path):
