@@ -56,13 +56,6 @@ CENTERS = {
 Options = Mapping[str, Any]
 
 
-def only(options: Options, expected: Options) -> None:
-    """Raise ValueError if one of `options` has another value than in `expected`."""
-    for name, value in expected.items():
-        if options.get(name, value) != value:
-            raise ValueError(f"the option {name} is {options[name]!r}; only {value!r} is supported")
-
-
 def model_of(options: Options, *tables: str) -> dict[str, Any]:
     """Translate published options into the section `model` of a recipe, by `tables`.
 
@@ -122,7 +115,9 @@ def locusgs_recipe(options: Options) -> dict[str, Any]:
 
     `geo_sigma`, a constant in the published code, may be given as an option.
     """
-    only(options, {**UNSUPPORTED_BUT, **OF_2026_6, **OF_MOTION})
+    for name, value in {**UNSUPPORTED_BUT, **OF_2026_6, **OF_MOTION}.items():
+        if options.get(name, value) != value:
+            raise ValueError(f"the option {name} is {options[name]!r}; only {value!r} is supported")
     model = model_of(options, BOTH, LOCUS)
     least = {"radius_min": options["anchor_radius_min"]}
     mean = [0.0, 0.0, options["gaussian_z_offset"]]
