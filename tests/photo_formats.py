@@ -150,8 +150,7 @@ def write_blender(folder, photos, train, val=0, times=()):
     parts = {"train": [], "val": [], "test": []}
     for i, file in enumerate(photos.files):
         part = "train" if i < train else "val" if i < train + val else "test"
-        (folder / part).mkdir(parents=True, exist_ok=True)
-        Image.open(file).save(folder / part / f"{file.stem}.png")
+        put(folder / part / f"{file.stem}.png", encoded(Image.open(file)))
         frame = {"file_path": f"./{part}/{file.stem}", "rotation": 0.01}
         if i < len(times) and times[i] is not ...:
             frame["time"] = times[i]

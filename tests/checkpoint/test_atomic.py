@@ -6,16 +6,16 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from photo_formats import put
 from safetensors import SafetensorError
 
 from qgs.checkpoint.tensors import write_tensors
 from qgs.files import is_leftover, replacing, replacing_entries, write_text
 
 
-def put(folder, text, *names):
-    for name in names:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
+def put_both(folder, content):
+    for name in ("a/x", "b/x"):
+        put(folder / name, content)
 
 
 def texts(folder):
@@ -24,7 +24,7 @@ def texts(folder):
 
 
 def test_entries_come_back_where_moving_fails(tmp_path, monkeypatch):
-    put(tmp_path / "out", "old", "a/x", "b/x")
+    put_both(tmp_path / "out", b"old")
     rename = Path.rename
 
     def interrupted(self, target):
@@ -34,7 +34,7 @@ def test_entries_come_back_where_moving_fails(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "rename", interrupted)
     with pytest.raises(KeyboardInterrupt), replacing_entries(tmp_path / "out", "a") as fresh:
-        put(fresh, "new", "a/x", "b/x")
+        put_both(fresh, b"new")
     assert texts(tmp_path) == {"out/a/x": "old", "out/b/x": "old"}
 
 

@@ -7,6 +7,7 @@ import pytest
 import typer
 import yaml
 from commands import done
+from photo_formats import put
 from size import ROOT
 from tables import rows
 
@@ -82,8 +83,7 @@ def test_a_name_stands_for_a_recipe_that_no_file_hides(name):
     assert resolve(name).tree == recipe
     Path("mine.yaml").write_text("recipe: 1\nextends: tiny/locus.yaml\nseed: 5\n")
     assert resolve("mine.yaml").tree == {**recipe, "seed": 5}
-    Path(name).parent.mkdir(parents=True)
-    Path(name).write_text("recipe: 1\nseed: 7\n")
+    put(Path(name), b"recipe: 1\nseed: 7\n")
     assert resolve(name).tree["seed"] == 7
 
 
@@ -112,9 +112,7 @@ def test_a_copy_brings_what_it_extends_and_overwrites_nothing():
 
 
 def test_the_recipes_of_a_wheel_come_first(tmp_path, monkeypatch):
-    inside = tmp_path / "qgs/recipes/tiny"
-    inside.mkdir(parents=True)
-    (inside / "locus.yaml").write_text("recipe: 1\nseed: 9\n")
+    put(tmp_path / "qgs/recipes/tiny/locus.yaml", b"recipe: 1\nseed: 9\n")
     monkeypatch.setattr(files, "__file__", str(tmp_path / "qgs/recipe/files.py"))
     assert resolve("tiny/locus.yaml").tree["seed"] == 9
 

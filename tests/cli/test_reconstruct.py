@@ -5,7 +5,7 @@ import pytest
 import tape_source
 import torch
 from commands import done, record_of, saved
-from photo_formats import scene
+from photo_formats import put, scene
 from PIL import Image
 from plyfile import PlyData
 from reconstructing import HOLDOUTS, kinds
@@ -27,8 +27,7 @@ def test_everything_is_written_and_what_a_user_made_is_kept(
     notes = tmp_path / "notes.ply"
     old = tmp_path / "views/00099_novel.png"
     notes.write_text("mine")
-    old.parent.mkdir()
-    old.touch()
+    put(old, b"")
     for out, flags, word in (
         (notes, (), "notes"),
         (tmp_path, (), "--overwrite"),

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 from commands import ONE_LAYER
-from photo_formats import centred, opened, synthetic, write_llff, write_nerfstudio
+from photo_formats import centred, opened, put, synthetic, write_llff, write_nerfstudio
 from PIL import Image
 from qgs_photos.datatools import packing
 from tables import must_not_find, must_refuse
@@ -78,8 +78,7 @@ def test_one_scene_of_chunks(folders, tmp_path):
 def test_a_scene_that_is_not_named_or_not_there(folders, tmp_path):
     must_refuse(r"holds 2 scenes: a, b: name one of them as `scene`", chosen, ROOMS, folders)
     must_refuse("holds no scene 'c', but a, b: name one", chosen, ROOMS, folders, name="c")
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "empty/transforms.txt").touch()
+    put(tmp_path / "empty/transforms.txt", b"")
     must_not_find("lists no cameras", chosen, ROOMS, tmp_path / "empty")
 
 

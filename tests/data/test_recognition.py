@@ -1,6 +1,7 @@
 """Which source opens a path: those of qgs and of plugins alike."""
 
 import yaml
+from photo_formats import put
 from qgs_photos.datasets import plugin as datasets
 from tables import must_not_find
 from tape_source import TapeSource, plugin, write_tape
@@ -43,8 +44,7 @@ def test_by_content(tmp_path):
         for number, held in enumerate(expected):
             root = UPath(place) / f"place{number}"
             file = root / held
-            file.parent.mkdir(parents=True)
-            file.write_bytes(b"")
+            put(file, b"")
             found[held] = recognised(root, SOURCES)
         assert found == expected
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from guide_pages import blocks, contract_failures
+from photo_formats import put
 from PIL import Image
 from qgs_dev import Case, cases_of
 from qgs_dev.new_command import rendered
@@ -32,8 +33,7 @@ def package(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("qgs-sightline"))
         for path, text in files.items():
-            Path(path).parent.mkdir(parents=True, exist_ok=True)
-            Path(path).write_text(text)
+            put(Path(path), text.encode())
         patch.syspath_prepend(Path("src").resolve())
         yield import_module("qgs_sightline")
 

@@ -8,7 +8,7 @@ import photo_formats
 import pytest
 import torch
 from commands import done
-from photo_formats import row_of_frames
+from photo_formats import put, row_of_frames
 from PIL import Image
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools import packing
@@ -155,8 +155,7 @@ def test_named_scenes_are_for_testing(six):
 
 
 def test_what_is_there_is_never_overwritten(six, tmp_path):
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes/a.txt").write_text("mine")
+    put(tmp_path / "notes/a.txt", b"mine")
     pack(six, tmp_path / "chunks")
     for folder, held in (("notes", r"not empty \(a\.txt\)"), ("chunks", "never overwrites")):
         must_refuse(held, pack, six, tmp_path / folder, kind=FileExistsError)

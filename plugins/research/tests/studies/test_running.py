@@ -10,6 +10,7 @@ import time
 import pytest
 from commands import done
 from fuzzing import kill
+from photo_formats import put
 from qgs_research.studies import running
 from qgs_research.studies.plan import planned
 from qgs_research.studies.results import Results
@@ -77,8 +78,7 @@ def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted
     study, plan, monkeypatch
 ):
     first, second, *_ = plan.runs
-    first.failure.parent.mkdir(parents=True)
-    first.failure.write_text("CollapseError: training collapsed at step 7: it\nLikely causes")
+    put(first.failure, b"CollapseError: training collapsed at step 7: it\nLikely causes")
     say = "print('threads', os.environ['OMP_NUM_THREADS'], words, flush=True)"
     stub(monkeypatch, f"{say}; os.kill(os.getpid(), 9)")
     failed, stopped, told = trained(plan, 2)
