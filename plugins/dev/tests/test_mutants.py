@@ -24,7 +24,7 @@ def test_every_check_has_a_mutant() -> None:
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=str)
 def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None:
-    case = mutant.to_case()
+    case = Case(mutant.component.Config(**mutant.options), **mutant.case)
     meant = CHECKS[mutant.check]
     result = run_check(meant, case)
     assert result.verdict == "failed", result

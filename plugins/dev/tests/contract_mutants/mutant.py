@@ -5,8 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from qgs_dev import Case
-
 from qgs.contracts import Component
 
 C = TypeVar("C", bound=type[Component])
@@ -26,9 +24,6 @@ class Mutant:
     seen: str
     options: Mapping[str, Any]
     case: Mapping[str, Any]
-
-    def to_case(self) -> Case:
-        return Case(self.component.Config(**self.options), **self.case)
 
     def __str__(self) -> str:
         return f"{self.check}-{self.component.name}"

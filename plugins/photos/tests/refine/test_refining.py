@@ -69,13 +69,6 @@ def free(gaussians):
     return FreeGaussians(gaussians, dict.fromkeys(names, 1e-2))
 
 
-def learn(given, *names):
-    """A step in which all numbers of these names become smaller."""
-    gaussians = given.gaussians()
-    sum(getattr(gaussians, name).sum() for name in names).backward()
-    given.optimizer.step()
-
-
 def generator():
     return torch.Generator().manual_seed(0)
 
@@ -164,7 +157,8 @@ def test_colors_beside_harmonics_may_have_any_value():
     given = free(replace(cloud(20), colors=colors, sh=torch.zeros(1, 20, 3, 3)))
     given.grow(24, generator())
     assert_equal(given.gaussians().colors[:, :20], colors)
-    learn(given, "colors")
+    given.gaussians().colors.sum().backward()
+    given.optimizer.step()
     assert (given.gaussians().colors[:, :20] < colors).all()
 
 
