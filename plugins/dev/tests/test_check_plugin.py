@@ -99,26 +99,25 @@ def test_unsound_exemptions_are_refused() -> None:
         must_refuse("exemptions", runs_of, installed, kind=PluginError)
 
 
-@pytest.mark.parametrize("component", [CannotDefault, PhotosSource])
-def test_what_has_no_default_options_is_named(monkeypatch, component) -> None:
-    output = _report(monkeypatch, _installed(component))
-    assert f"not checked: {component.slot}/{component.name}: " in output
+def test_what_has_no_default_options_is_named(monkeypatch) -> None:
+    for component in (CannotDefault, PhotosSource):
+        output = _report(monkeypatch, _installed(component))
+        assert f"not checked: {component.slot}/{component.name}: " in output
 
 
-@pytest.mark.parametrize(
-    ("component", "why"),
-    [
+def test_what_cannot_be_built_here_is_not_checked(monkeypatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    for component, why in (
         (NeedsMore, 'needs_more needs numba: run `pip install "query-gaussians[cpu]"`'),
         (OnOtherDevices, "runs only on cuda, which this machine does not have"),
-    ],
-)
-def test_what_cannot_be_built_here_is_not_checked(monkeypatch, component, why) -> None:
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    lines = _report(monkeypatch, _installed(FreeCenters, component)).splitlines()
-    unchecked = [line.split(":")[0] for line in lines if line.startswith("not checked ")]
-    assert unchecked == [f"not checked {component.slot}/{component.name}"]
-    assert any(line.startswith("  skipped: ") and line.endswith(f"checks: {why}") for line in lines)
-    assert lines[-1].endswith(", 1 not checked")
+    ):
+        lines = _report(monkeypatch, _installed(FreeCenters, component)).splitlines()
+        unchecked = [line.split(":")[0] for line in lines if line.startswith("not checked ")]
+        assert unchecked == [f"not checked {component.slot}/{component.name}"]
+        assert any(
+            line.startswith("  skipped: ") and line.endswith(f"checks: {why}") for line in lines
+        )
+        assert lines[-1].endswith(", 1 not checked")
 
 
 @pytest.mark.slow
