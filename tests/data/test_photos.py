@@ -71,11 +71,10 @@ def test_folders_and_files_that_are_not_there(tmp_path):
 
 
 def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
-    for name in ("mine", "other"):
-        (tmp_path / name).mkdir()
     far = folder(tmp_path / "other") / "images/far.png"
     Image.new("RGB", (64, 48)).save(far)
     mine = tmp_path / "mine"
+    mine.mkdir()
     (mine / "linked").symlink_to(tmp_path / "other")  # a link in the folder is the user's own
     for of in ("depth_file_path", "mask_path", "file_path"):
         assert read(folder(mine, frame={of: "linked/images/far.png"}))

@@ -29,14 +29,11 @@ def train_in_two_processes(*arguments):
 
 
 def test_two_processes_continue_what_one_began(tmp_path):
-    def ask(trainer, stop):
-        stop.append(signal.SIGINT)
-
     recipe = tiny("locus", "training.ema=0.9", PARTS)
     two = tmp_path / "two"
     alone = tmp_path / "alone"
     run(recipe, alone)
-    assert run_calling(ask, recipe, two).steps == 1
+    assert run_calling(lambda _, stop: stop.append(signal.SIGINT), recipe, two).steps == 1
     train_in_two_processes(recipe, two)
     assert losses(two) == pytest.approx(losses(alone), abs=1e-5)
     ours = parts_of(two)

@@ -32,6 +32,10 @@ def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(here):
     assert names_in(here) == {"my runs"}
 
 
+def steps_in(history):
+    return len(history.read_bytes().splitlines())
+
+
 @pytest.mark.slow
 def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
     """Two processes by torchrun; the script needs of Slurm no more than `scontrol`."""
@@ -54,14 +58,14 @@ def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
     command = ["bash", tmp_path / "run.slurm.sh"]
     history = out / "history.jsonl"
     job = subprocess.Popen(command, env=environment)
-    while not history.exists() or len(history.read_bytes().splitlines()) < 3:
+    while not history.exists() or steps_in(history) < 3:
         assert job.poll() is None  # the training ended too early
         time.sleep(0.1)
     job.terminate()
     job.wait(60)
     assert asked.read_text() == "requeue 7\n"
-    assert len(history.read_bytes().splitlines()) < 300
+    assert steps_in(history) < 300
     assert (out / "state.safetensors").exists()
     assert subprocess.run(command, env=environment, timeout=200).returncode == 0
-    assert len(history.read_bytes().splitlines()) == 300
+    assert steps_in(history) == 300
     assert (out / "evaluation/summary.json").exists()
