@@ -19,28 +19,28 @@ from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Views
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_supports_and_attention_are_those_of_a_traced_pass(kind):
-    model = model_scenes_of(kind).network
-    scene = source_of(kind).scene_of((1, 4))
-    with torch.no_grad(), qgs.trace(model) as record:
-        assert_close(scene.gaussians.means, model(scene.views).gaussians.means)
-    layers = record.layers
-    states = [layers[1].before, *(layer.after for layer in layers.values())]
-    assert scene.attention(5, 0) is None
-    for layer, state in enumerate(states):
-        found = scene.support(layer)
-        expected = model.queries.support(state)
-        assert (found is None) == (expected is None) == (kind == "tokengs")
-        if found:
-            assert_close(vars(found), vars(expected.to(torch.float64)))
-    for layer, traced in layers.items():
-        found = scene.attention(5, layer)
-        for part, values in vars(traced.cross_attention).items():
-            if values is not None:
-                assert_close(getattr(found, part), values[:, :, [5]])
-    parts = ["result", "content", "geometry"][: 2 + (kind != "tokengs")]
-    assert [*attention_pictures_of(scene, 5, 1, 32)] == parts
+def test_supports_and_attention_are_those_of_a_traced_pass():
+    for kind in KINDS:
+        model = model_scenes_of(kind).network
+        scene = source_of(kind).scene_of((1, 4))
+        with torch.no_grad(), qgs.trace(model) as record:
+            assert_close(scene.gaussians.means, model(scene.views).gaussians.means)
+        layers = record.layers
+        states = [layers[1].before, *(layer.after for layer in layers.values())]
+        assert scene.attention(5, 0) is None
+        for layer, state in enumerate(states):
+            found = scene.support(layer)
+            expected = model.queries.support(state)
+            assert (found is None) == (expected is None) == (kind == "tokengs")
+            if found:
+                assert_close(vars(found), vars(expected.to(torch.float64)))
+        for layer, traced in layers.items():
+            found = scene.attention(5, layer)
+            for part, values in vars(traced.cross_attention).items():
+                if values is not None:
+                    assert_close(getattr(found, part), values[:, :, [5]])
+        parts = ["result", "content", "geometry"][: 2 + (kind != "tokengs")]
+        assert [*attention_pictures_of(scene, 5, 1, 32)] == parts
 
 
 def test_lines_end_on_the_patches_that_are_read_most():
