@@ -115,14 +115,11 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     drawn = (sections.queries, sections.anchors, sections.attention, sections.training_curves)
     height, width = first.recipe.tree["data"]["image_size"]
     data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
+    unseen = not any(score.given for score in first.evaluation.scores)
     judged = "beside" if first.windows else "between"
     samples = counted(first.evaluation.samples, "sample")
     inputs = sorted({len(sample.input_frames) for sample in shown[0].samples})
-    scored = (
-        "the inputs"
-        if any(score.given for score in first.evaluation.scores)
-        else f"views {judged} the inputs"
-    )
+    scored = f"views {judged} the inputs" if unseen else "the inputs"
     views = f"{samples}, {listed(inputs)} inputs, scored on {scored}"
     names = listed((model.name for model in models), most=3)
     parts = first.recipe.parts.items()
@@ -141,6 +138,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
         views=ranked,
         turned=sections.scene_to_turn(shown),
         verdicts=verdicts(models),
+        unseen=unseen,
         sections=[section(shown, Detail()) for section in drawn],
     )
 

@@ -112,7 +112,7 @@ def verdict(views: Sequence[ScoredView]) -> str:
     if quality <= copied:
         word = "Wrong"
     place = f"where the inputs look, at {100 * coverage:.0f} % of the scored views"
-    numbers = f"({quality:.1f} dB; a copy of the nearest photo has {copied:.1f} dB)"
+    numbers = f"({quality:.1f} dB there, a copy of the nearest photo {copied:.1f} dB)"
     sentences = [f"{word} {place} {numbers}."]
     doubtful = Counter[str]()
     places: dict[str, list[str]] = {UNSEEN: [], WRONG: []}
