@@ -25,6 +25,7 @@ from qgs.tokengs import GaussianHead, posact
 from qgs.types import ImageMemory, QueryState
 
 HALF = math.sqrt(0.5)
+PHOTOS = odd_views(2, 32, 40)
 OFFSET = {"radius_bound": "offset", "radius_min": 0.05}
 
 
@@ -163,8 +164,7 @@ def _shared(layer):
 @pytest.mark.parametrize(("radius_refined", "bound"), [(False, "floor"), (True, "offset")])
 def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined, bound):
     models = _pair(radius_refined, bound)
-    photos = odd_views(2, 32, 40)
-    theirs, ours = (model(photos, layers=(1, 2, 3)) for model in models)
+    theirs, ours = (model(PHOTOS, layers=(1, 2, 3)) for model in models)
     for number, expected in theirs.layers.items():
         seen = ours.layers[number]
         assert_close(_shared(seen), _shared(expected))
@@ -181,6 +181,5 @@ def test_a_trained_locusgs_is_where_a_model_that_turns_can_start():
     mlps = {name.rpartition(".fc")[0] for name in absent.missing_keys}
     assert mlps == {"refinements.0.rotation_mlp"}
     assert not absent.unexpected_keys
-    photos = odd_views(2, 32, 40)
-    theirs, ours = (model(photos).gaussians.means for model in (locus, turning))
+    theirs, ours = (model(PHOTOS).gaussians.means for model in (locus, turning))
     assert_close(ours, theirs)

@@ -20,6 +20,7 @@ from qgs.recipe import resolve
 
 C = 8
 """Width of the stand-in's tokens in place of 2048."""
+GIVEN = odd_views(3, 28, 42)
 
 
 class Aggregator(nn.Module):
@@ -59,21 +60,20 @@ def encoder(weights, width=C, **options):
 
 def test_it_gives_the_patch_tokens_of_the_last_layer(weights):
     """Of images in [-1, 1] or, as told, in [0, 1]."""
-    given = odd_views(3, 28, 42)
-    for told, images in (({}, given.images * 2 - 1), ({"images": "unit"}, given.images)):
+    for told, images in (({}, GIVEN.images * 2 - 1), ({"images": "unit"}, GIVEN.images)):
         made = encoder(weights, **told)
-        memory = made(given)
+        memory = made(GIVEN)
         expected = made.aggregator(images)[0][-1][:, :, 5:]
         assert_equal(memory.features, expected.flatten(1, 2))
         assert memory.grid == (3, 2, 3)
         assert memory.keys is memory.values is memory.patch_rays is None
-        blind = given.replace(cameras=given.cameras.replace(c2w=given.cameras.c2w + 1))
+        blind = GIVEN.replace(cameras=GIVEN.cameras.replace(c2w=GIVEN.cameras.c2w + 1))
         assert_equal(made(blind).features, memory.features)
 
 
 def test_a_model_of_another_width_has_a_linear_layer(weights):
     narrow = encoder(weights, width=6)
-    assert narrow(odd_views(3, 28, 42)).features.shape[-1] == 6
+    assert narrow(GIVEN).features.shape[-1] == 6
     assert narrow.proj.weight.shape == (6, C)
     assert not [*encoder(weights).proj.parameters()]
 
@@ -115,8 +115,7 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
     qgs.save(model, tmp_path / "checkpoint.safetensors")
     weights.unlink()
     loaded = qgs.load(tmp_path / "checkpoint.safetensors")
-    given = odd_views(3, 28, 42)
-    assert_equal(loaded(given).gaussians.means, model(given).gaussians.means)
+    assert_equal(loaded(GIVEN).gaussians.means, model(GIVEN).gaussians.means)
     must_refuse("cannot read weights", recipe.build_model, kind=MissingExtraError)
 
 
