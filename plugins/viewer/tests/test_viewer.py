@@ -64,18 +64,16 @@ def test_a_query_is_picked_and_followed_through_the_layers(server, panel):
     for layer in range(panel.scene.depth, -1, -1):
         panel.layer.value = layer
         assert panel.choice.layer == layer
-        assert_placed(server.scene.get_handle_by_name("/support"), panel.scene.support(layer), 3)
+        ball = server.scene.get_handle_by_name("/support")
+        support = panel.scene.support(layer)
+        assert ball.position == pytest.approx(support.centers[0, 3].numpy(), abs=1e-4)
+        # the unit ball, scaled, turned and moved, has the semi-axes of the support as columns
+        axes = SO3(np.array(ball.wxyz)).as_matrix() * np.array(ball.scale)
+        assert axes == pytest.approx(support.axes[0, 3].numpy(), abs=1e-4)
     assert nodes(panel) == BASE | {"anchors", "support"}
     assert not any(picture.visible for picture in panel.pictures.values())
     panel.number.value = -1
     assert nodes(panel) == BASE | {"anchors"}
-
-
-def assert_placed(ball, support, query):
-    """The unit ball, scaled, turned and moved, has the semi-axes of the support as columns."""
-    assert ball.position == pytest.approx(support.centers[0, query].numpy(), abs=1e-4)
-    axes = SO3(np.array(ball.wxyz)).as_matrix() * np.array(ball.scale)
-    assert axes == pytest.approx(support.axes[0, query].numpy(), abs=1e-4)
 
 
 def test_text_is_shown_as_it_is(server):
