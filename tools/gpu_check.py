@@ -27,8 +27,8 @@ import yaml
 from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.ray_bias import RayBias
 from qgs_research.bench.run import in_turn, quartiles
+from size import ROOT
 
-ROOT = Path(__file__).parents[1]
 PHASES = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text("utf-8"))
 BUILD = "gsplat compiles"
 

@@ -14,8 +14,8 @@ from textwrap import shorten
 
 import networkx as nx
 from jinja2 import Template
+from size import ROOT
 
-ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs/images/rooms.svg"
 TEMPLATE = Path(__file__).with_name("rooms.svg.jinja")
 GAP = 14
