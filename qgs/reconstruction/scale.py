@@ -119,16 +119,17 @@ def find_scale(
     the best factor is there. The fine search tries thirds of a step around the best factor, then
     the vertex of a parabola through the three best scores in log scale.
 
-    If the scene has no further photos, but three or more inputs, the middle input is scored and not
-    given to the model.
+    Of three or more inputs, the middle one is not given to the model, but scored in place of a
+    further photo. This takes less time.
     model: must be in evaluation mode; the search runs on its device. compared: frames
         kept for the scores of the result, which the search does not render.
     """
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
-    if not further and len(given) > 2:
-        further = (given[len(given) // 2],)
-        given = tuple(frame for frame in given if frame not in further)
+    if len(given) > 2:
+        middle = given[len(given) // 2]
+        further = (middle, *further[: FURTHER - 1])
+        given = tuple(frame for frame in given if frame != middle)
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
     frames = given if len(given) > 1 else given + further
     sample = half(sample, model) or sample
