@@ -57,7 +57,7 @@ about 12 dB."""
 class FoundScale:
     """Result of the search: the best factor of camera positions, and its quality.
 
-    further: scored frames that are not inputs. names: file names of these frames.
+    further: scored frames that the search did not give to the model. names: their file names.
     psnr: mean PSNR in dB of inputs and further photos, where further photos have twice the weight.
     tried: pairs of a tried factor and its mean PSNR. depth: `seen_depth` of the inputs.
     """

@@ -236,7 +236,8 @@ def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path
     trained = resolve(qgs.load(MODEL).recipe).views.scale_factor
     assert found.factor == pytest.approx(trained / UNIT, rel=0.15)
     assert found.further
-    assert {*inputs, *compared}.isdisjoint(found.further)
+    # of three inputs, the middle one may be scored
+    assert {*inputs[::2], *compared}.isdisjoint(found.further)
     assert found.psnr == max(psnr for _, psnr in found.tried)
     assert not found.poor
 
