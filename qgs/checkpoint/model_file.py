@@ -185,7 +185,8 @@ def save(
     tensors = copied(weights or unique_tensors(model))
     # The step at which scheduled options have their present values, the same in all components.
     steps = {x.followed for x in model.modules() if isinstance(x, Component) and x.schedules}
-    followed = {"step": str(steps.pop())} if steps - {END} else {}
+    steps -= {END}
+    followed = {"step": str(steps.pop())} if steps else {}
     write_checkpoint(path, tensors, model.recipe, model.releases, followed | dict(extra or {}))
 
 
