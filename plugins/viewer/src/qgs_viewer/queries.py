@@ -207,8 +207,10 @@ def notable_queries(
     # those that are apart first, then any
     for least in (0.6 / count**0.5, 0.0):
         for n in order:
+            if len(chosen) == count:
+                break
             far = all((places_N2[n] - places_N2[other]).norm() >= least for other in chosen)
-            if far and n not in chosen and len(chosen) < count:
+            if far and n not in chosen:
                 chosen.append(n)
     return colored_queries(gaussians, len(weights_N), chosen)
 
