@@ -87,6 +87,4 @@ def poses(
     print_lines(console, map(str, report.findings))
     (scene,) = report.scenes
     distance = f"median distance of matches from epipolar lines, pixels: {scene.epipolar}"
-    # of two photos, none is left to compare with
-    following = "demo" if len(found.posed) > 2 else "view"
-    print_lines(console, [distance, f"wrote {folder}; next: qgs {following} {folder}"])
+    print_lines(console, [distance, f"wrote {folder}; next: qgs demo {folder}"])
