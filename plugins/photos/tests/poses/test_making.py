@@ -50,7 +50,7 @@ def test_photos_get_the_poses_they_were_taken_with(made, shots):
     assert formats_of(UPath(folder)) == ["colmap"]
     assert_close(folder, shots)
     counts, remark, *_, advice = poses.summary
-    assert counts == f"{PHOTOS} of {PHOTOS + 1} photos have poses"
+    assert counts == f"{PHOTOS} of {PHOTOS + 1} photos have poses, in an arbitrary unit"
     assert "a.DNG" in remark
     assert "other.png; to get more" in advice
     assert "3.tif" in record_in(folder)["source"]

@@ -81,7 +81,7 @@ class Poses:
     def summary(self) -> Iterator[str]:
         """Sentences for the user: how many photos have poses, and which have none."""
         total = len(self.posed) + len(self.without)
-        yield f"{len(self.posed)} of {counted(total, 'photo')} have poses"
+        yield f"{len(self.posed)} of {counted(total, 'photo')} have poses, in an arbitrary unit"
         yield from self.remarks
         if self.faulty:
             reasons = [f"{name} ({reason})" for name, reason in self.faulty.items()]
