@@ -4,14 +4,16 @@ import numpy as np
 import pycolmap
 import pytest
 from commands import run_qgs
+from qgs_photos.poses import making, worker
 from qgs_photos.poses.few import RefusedError, beginning
 from upath import UPath
-from walked import write_photos
+from walked import PHOTOS, QUIET, write_photos
 
 from qgs.data.photos import read_listing
 
 SIZE = (640, 480)
 FOCAL = 700.0
+MOTION = np.array([-1.2, 0.1, 0.3])
 
 
 def turned(degrees):
@@ -35,18 +37,20 @@ def seen_twice(degrees, translation, wrong=0.3, depths=(4, 9)):
 
 @pytest.fixture
 def found(tmp_path):
-    """What begins from pixels of two photos with equal descriptors."""
+    """What begins from pixels of two photos with equal descriptors; EXIF gives some focals."""
 
-    def found(pixels, known):
+    def found(pixels, *focals):
         rng = np.random.default_rng(1)
         descriptors = rng.integers(0, 256, (len(pixels[0]), 128), np.uint8)
         kind = pycolmap.FeatureExtractorType.SIFT
         with pycolmap.Database.open(tmp_path / "database.db") as database:
-            camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", FOCAL, *SIZE)
-            camera.has_prior_focal_length = known
-            database.write_camera(camera, True)
-            for place in (0, 1):
-                image = database.write_image(pycolmap.Image(name=f"{place}", camera_id=1))
+            for place, focal in enumerate(focals):
+                camera = pycolmap.Camera.create_from_model_name(
+                    1, "SIMPLE_PINHOLE", focal or 1, *SIZE
+                )
+                camera.has_prior_focal_length = bool(focal)
+                number = database.write_camera(camera)
+                image = database.write_image(pycolmap.Image(name=f"{place}", camera_id=number))
                 database.write_keypoints(image, pixels[place].astype(np.float32))
                 features = pycolmap.FeatureDescriptors(data=descriptors, type=kind)
                 database.write_descriptors(image, features)
@@ -64,18 +68,17 @@ def assert_within(degrees, pose, rotation, translation):
     assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < degrees
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_two_views_give_pose_focal_length_and_points(found, known):
-    translation = np.array([-1.2, 0.1, 0.3])
-    model, remarks = found(seen_twice(12, translation), known)
+@pytest.mark.parametrize("focals", [(FOCAL, FOCAL), (0, 0), (FOCAL, 0), (2 * FOCAL, 2 * FOCAL)])
+def test_two_views_give_pose_focal_length_and_points(found, focals):
+    model, remarks, _ = found(seen_twice(12, MOTION), *focals)
     one, other = (model.images[place].cam_from_world().matrix() for place in (1, 2))
     assert np.array_equal(one, np.eye(3, 4))
-    assert_within(1, other, turned(12), translation)
-    assert model.cameras[1].focal_length == pytest.approx(FOCAL, rel=0.04)
+    assert_within(1, other, turned(12), MOTION)
+    assert model.cameras[2].focal_length == pytest.approx(FOCAL, rel=0.04)
     points = np.array([point.xyz for point in model.points3D.values()])
     assert 260 <= len(points) <= 300
     assert np.median(points[:, 2]) == pytest.approx(1)
-    assert bool(remarks) != known
+    assert bool(remarks) != (focals == (FOCAL, FOCAL))
 
 
 @pytest.mark.parametrize(
@@ -85,12 +88,12 @@ def test_two_views_give_pose_focal_length_and_points(found, known):
         (seen_twice(0, np.zeros(3)), "turn on the spot"),
         (seen_twice(8, np.array([-1, 0, 0]), wrong=0.97), "enough matches"),
         (seen_twice(8, np.array([-1, 0, 0]), depths=(6, 6)), "one flat thing"),
+        (seen_twice(12, MOTION) * np.array([[[1]], [[0.6]]]), "different lenses"),
     ],
-    ids=["turned", "same", "wrong", "flat"],
 )
 def test_two_photos_without_a_pose_are_refused(found, pixels, reason):
     with pytest.raises(RefusedError, match=reason):
-        found(pixels, False)
+        found(pixels, 0, 0)
 
 
 def test_two_photos_get_poses_and_a_blank_one_none(images, shots, tmp_path):
@@ -102,3 +105,11 @@ def test_two_photos_get_poses_and_a_blank_one_none(images, shots, tmp_path):
     one, other = (frame.c2w for frame in read_listing(UPath(tmp_path / "two_poses")).frames)
     true = np.linalg.inv(shots[5].c2w) @ shots[3].c2w
     assert_within(2, np.linalg.inv(other) @ one, true[:3, :3], true[:3, 3])
+
+
+@pytest.mark.parametrize("least", ["few.LEAST_SCORE", "worker.FEW_MATCHES"])
+def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, least):
+    monkeypatch.setattr(f"qgs_photos.poses.{least}", np.inf)
+    monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())
+    made = making.make_poses(walk, tmp_path / "made", making.Options(side=240), QUIET)
+    assert len(made.posed) == PHOTOS

@@ -121,9 +121,12 @@ class TwoViews:
         return float(np.median(self.points[:, 2])) if len(self.points) else np.inf
 
 
-def two_views(one: View, other: View) -> TwoViews | None:
-    """Return the most likely pose and focal length; None if there are too few matches."""
-    matches = matched(one, other)
+def two_views(one: View, other: View, doubt: float = EXIF) -> TwoViews | None:
+    """Return the most likely pose and focal length; None if there are too few matches.
+
+    doubt: deviation of the logarithm of known focal lengths, whose proportion is kept.
+    """
+    matches = matched(one, other, doubt)
     found = [*_proposed(matches)]
     if not found:
         return None
@@ -133,7 +136,7 @@ def two_views(one: View, other: View) -> TwoViews | None:
     return _verdict(Poses(*(own[[best]] for own in poses)), matches)
 
 
-def matched(one: View, other: View) -> Matches:
+def matched(one: View, other: View, doubt: float) -> Matches:
     """Return mutual nearest features, at most MOST_MATCHES of the least ratios."""
     similar = one.descriptors @ other.descriptors.T
     best = similar.argmax(1)
@@ -149,7 +152,7 @@ def matched(one: View, other: View) -> Matches:
     indices = np.stack([rows, best], 1)[order]
     if one.focal and other.focal:
         scale = one.focal / other.focal
-        prior = np.log(one.focal), EXIF
+        prior = np.log(one.focal), doubt
     else:
         scale = one.side / other.side
         prior = np.log(USUAL[0] * one.side), USUAL[1]

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from qgs_photos.poses.few import FEW, NO_MATCHES, ONE_PLACE, RefusedError, beginning
+from qgs_photos.poses.few import NO_MATCHES, ONE_PLACE, SEARCHED, RefusedError, beginning
 from qgs_photos.poses.job import Job
 
 # Takes dictionaries for options, which its types do not say.
@@ -98,13 +98,21 @@ def mapped(job: Job) -> Mapping[str, Any]:
     _find_features(job)
     start = None
     remarks = list[str]()
-    if total <= FEW:
+    estimated = False
+    refused = RefusedError(ONE_PLACE)
+    if total <= SEARCHED:
         tell("pairs", 0, 1)
         with COLMAP.Database.open(job.database) as opened:
-            start, remarks = beginning(opened)
-    if total > 2:
-        _match(job)
-        start = _largest_model(job, start, bool(remarks))
+            try:
+                start, remarks, estimated = beginning(opened)
+            except RefusedError as reason:
+                refused = reason
+    # alone, COLMAP gives worse poses of so few
+    if total > (OWN_FIRST if start is None else 2):
+        _match(job, start)
+        start = _largest_model(job, start, estimated)
+    if start is None:
+        raise refused
     return {"posed": _written(start, job), "remarks": remarks}
 
 
@@ -135,7 +143,8 @@ def _find_features(job: Job) -> None:
         )
 
 
-def _match(job: Job) -> None:
+def _match(job: Job, start: Any) -> None:
+    """Match the photos. Raises RefusedError without matches, unless there is a model `start`."""
     total = len(job.sizes)
     tell("matching", 0, total)
     settings = {
@@ -154,7 +163,7 @@ def _match(job: Job) -> None:
         COLMAP.match_exhaustive(job.database, pairing_options={"block_size": 5}, **settings)
     with COLMAP.Database.open(job.database) as opened:
         _, counts = opened.read_two_view_geometry_num_inliers()
-    if not any(count >= FEW_MATCHES for count in counts):
+    if start is None and not any(count >= FEW_MATCHES for count in counts):
         raise RefusedError(NO_MATCHES)
 
 
@@ -205,7 +214,7 @@ def likely(features: Array) -> Array:
 
 
 def _largest_model(job: Job, start: Any, estimated: bool) -> Any:
-    """Return the model with most photos that COLMAP finds.
+    """Return the model with most photos that COLMAP finds; `start` if it finds none.
 
     start: model of two photos, to which COLMAP adds the others; None lets COLMAP choose them.
     estimated: True if focal lengths do not come from EXIF, and COLMAP shall refine them.
@@ -239,7 +248,9 @@ def _largest_model(job: Job, start: Any, estimated: bool) -> Any:
         start.write(begun)
         # few photos do not show the distortion of the lens
         refined = {"ba_refine_focal_length": estimated, "ba_refine_extra_params": False}
-        tries = [("", {}), (begun, {**refined, "mapper": OWN})][total <= OWN_FIRST :]
+        tries[1] = begun, {**refined, "mapper": OWN}
+    if total <= OWN_FIRST:
+        del tries[0]
     for begin, limits in tries:
         models = COLMAP.incremental_mapping(
             job.database,
@@ -254,8 +265,6 @@ def _largest_model(job: Job, start: Any, estimated: bool) -> Any:
         if solid:
             largest = max(solid, key=COLMAP.Reconstruction.num_reg_images)
             return _centred(largest, job.threads)
-    if start is None:
-        raise RefusedError(ONE_PLACE)
     return start
 
 
