@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pycolmap
 
-from qgs_photos.poses.two_views import FOCALS, USUAL, TwoViews, View, two_views
+from qgs_photos.poses.two_views import USUAL, TwoViews, View, two_views
 
 # Takes dictionaries for options, which its types do not say.
 COLMAP: Any = pycolmap
@@ -25,12 +25,15 @@ PARALLAX = 10
 """Least motion, in pixels, of a point at the median depth. Turns on the spot show up to 9."""
 FLAT = 0.97
 """Share of matches that a plane explains, from which on a pair does not give the focal length."""
+LENSES = (0.6, 3.7)
+"""Range of the focal lengths that a pair gives, in units of the longer side. Photos of two lenses
+seem to have one beyond; so do 5 % of real pairs, nearly all of a lens of 3.0."""
 LEAST_DOUBT = 0.1
 """Least deviation of the logarithm of a focal length that matches of a pair give."""
 BETTER = 50
-"""Gain in score by another focal length from which on those of EXIF are not used. If EXIF is right to 4 %,
-the gain reaches 40; with focal lengths twice or half as long, half of real pairs exceed 50, and the
-median error of their poses falls from 13 to 2 degrees."""
+"""Gain in score by another focal length from which on those of EXIF are not used. If EXIF is right
+to 4 %, the gain reaches 40; with focal lengths twice or half as long, half of real pairs exceed 50,
+and the median error of their poses falls from 13 to 2 degrees."""
 NO_MATCHES = (
     "no two photos have enough matches. Take photos a step apart, so that each shows half of what "
     "the photo before shows"
@@ -54,7 +57,8 @@ def beginning(database: Any) -> tuple[Any, list[str], bool]:
     """Return a model of the best two photos in an open database of COLMAP, remarks, and a switch.
 
     The switch is True if EXIF gives no focal length, or one that does not fit the photos. Focal
-    lengths that it does not give are set in the database. Raises RefusedError if no two photos give a pose.
+    lengths that it does not give are set in the database. Raises RefusedError if no two photos give
+    a pose.
     """
     cameras = database.read_all_cameras()
     estimated = not any(camera.has_prior_focal_length for camera in cameras)
@@ -111,8 +115,8 @@ def views(database: Any) -> Mapping[int, View]:
 def set_focals(database: Any) -> list[str]:
     """Set focal lengths that EXIF does not give, and return remarks.
 
-    Photos without one are taken to have the lens of those with one, or else what pairs give.
-    Raises RefusedError if no pair gives any.
+    Photos without one are taken to have the lens of those with one. Without any, the mean of those
+    that pairs give is taken. Raises RefusedError if no pair gives one.
     """
     cameras = database.read_all_cameras()
     unknown = [camera for camera in cameras if not camera.has_prior_focal_length]
@@ -123,7 +127,7 @@ def set_focals(database: Any) -> list[str]:
     if not told:
         for (one, _), pair in pairs(database).items():
             focal = pair.focals[0] / seen[one].side
-            if pair.flat < FLAT and FOCALS[0] < focal < FOCALS[-1]:
+            if pair.flat < FLAT and LENSES[0] < focal < LENSES[1]:
                 told.append((focal, np.hypot(pair.focal_doubt, LEAST_DOUBT)))
     if not told:
         raise RefusedError(NO_FOCAL)
