@@ -15,7 +15,7 @@ import yaml
 
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.models import about, checkpoint_path
-from qgs.contracts import Frames, Scene, ViewsConfig, Window
+from qgs.contracts import Frames, Scene, SceneSource, ViewsConfig, Window
 from qgs.data.inputs import Frusta, ranked_windows
 from qgs.data.recognition import is_training_data, open_for
 from qgs.data.view_samplers import Span
@@ -250,7 +250,7 @@ def open_models(
         for recipe in trained.values()
     )
     if size is None and not fixed:
-        first.size = _found_size(first, windows)
+        first.size = _found_size(first, windows, data)
     if first.size and first.size.halved:
         height, width = first.recipe.tree["data"]["image_size"]
         recipes = recipes_alike(trained, photos, (height // 2, width // 2), overrides)
@@ -260,9 +260,8 @@ def open_models(
     return models
 
 
-def _found_size(model: Model, windows: PhotoWindows) -> FoundSize | None:
-    """Return the better size of photos for `model` in a window; None without a choice."""
-    data = model.recipe.build_data()
+def _found_size(model: Model, windows: PhotoWindows, data: SceneSource) -> FoundSize | None:
+    """Return the better size of photos of `data` for `model`; None without a choice."""
     try:
         scene = data.scenes("test" if data.names("test") else "train")[0]
         window, *_ = windows.windows(scene, model.recipe.views)
