@@ -167,4 +167,4 @@ def test_killed_runs_go_on_from_whole_files(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     command = [sys.executable, tool, "kill-training", "--count=12"]
     told = subprocess.check_output(command, text=True)
-    assert re.match(r"12 kills, [1-9]\d* inside a save", told), told
+    assert re.match(r"12 kills, [1-9]\d* of them during a save", told), told
