@@ -63,11 +63,11 @@ def beginning(database: Any) -> tuple[Any, list[str], bool]:
     cameras = database.read_all_cameras()
     estimated = not any(camera.has_prior_focal_length for camera in cameras)
     remarks = set_focals(database)
-    found = pairs(database)
+    seen = views(database)
+    found = pairs(seen)
     (one, other), pair = max(
         found.items(), key=lambda item: (item[1].flat < FLAT, item[1].score / item[1].depth ** 0.5)
     )
-    seen = views(database)
     free = None if estimated else two_views(seen[one], seen[other], USUAL[1])
     if free and free.score > pair.score + BETTER:
         # what EXIF says is wrong: do without
@@ -78,12 +78,11 @@ def beginning(database: Any) -> tuple[Any, list[str], bool]:
     return model(database, (one, other), pair), remarks, estimated
 
 
-def pairs(database: Any) -> Pairs:
-    """Return pairs of photos far enough apart, by their numbers in an open database.
+def pairs(seen: Mapping[int, View]) -> Pairs:
+    """Return pairs of photos far enough apart, by their numbers; seen: features of all photos.
 
     Raises RefusedError if there are none.
     """
-    seen = views(database)
     found = {(a, b): two_views(seen[a], seen[b]) for a, b in combinations(seen, 2)}
     sure = {images: pair for images, pair in found.items() if pair and pair.score >= LEAST_SCORE}
     if not sure:
@@ -125,7 +124,7 @@ def set_focals(database: Any) -> list[str]:
     seen = views(database)
     told = [(view.focal / view.side, LEAST_DOUBT) for view in seen.values() if view.focal]
     if not told:
-        for (one, _), pair in pairs(database).items():
+        for (one, _), pair in pairs(seen).items():
             focal = pair.focals[0] / seen[one].side
             if pair.flat < FLAT and LENSES[0] < focal < LENSES[1]:
                 told.append((focal, np.hypot(pair.focal_doubt, LEAST_DOUBT)))
