@@ -117,7 +117,13 @@ class CheckpointFile(TensorFile):
         if key not in self.metadata:
             return Domain()
         with self.entry(key):
-            return Domain.read(self.mapping(key))
+            domain = Domain.read(self.mapping(key))
+        # Older files do not record the image sizes of their training.
+        data = self.recipe.data_config
+        if data and domain.values:
+            sizes = (data.image_size, *self.recipe.training.image_sizes)
+            domain.values.setdefault("side", [float(min(size)) for size in sizes])
+        return domain
 
     def untrained(self, device: str | torch.device | None = None) -> QueryGaussianModel:
         """Build the recipe's model without the saved weights. The device "meta" takes no memory.
@@ -142,11 +148,6 @@ class CheckpointFile(TensorFile):
         load_weights(model, self.tensors, self.path)
         follow(model.modules(), END if self.step is None else self.step)
         model.trained_on = self.domain
-        data = self.recipe.data_config
-        # Older files do not record the image sizes of their training.
-        if data and self.domain.values:
-            sizes = (data.image_size, *self.recipe.training.image_sizes)
-            self.domain.values.setdefault("side", [float(min(size)) for size in sizes])
         local = Path(self.name).expanduser().exists()
         model.loaded_from = str(self.path.resolve()) if local else self.name
         return (model if device is None else model.to(device)).eval()
@@ -184,9 +185,9 @@ def save(
     # Copied, since safetensors refuses tensors that share memory or are strided.
     tensors = copied(weights or unique_tensors(model))
     # The step at which scheduled options have their present values, the same in all components.
-    steps = {x.followed for x in model.modules() if isinstance(x, Component) and x.schedules}
-    steps -= {END}
-    followed = {"step": str(steps.pop())} if steps else {}
+    steps = (x.followed for x in model.modules() if isinstance(x, Component) and x.schedules)
+    step = next(steps, END)
+    followed = {} if step == END else {"step": str(step)}
     write_checkpoint(path, tensors, model.recipe, model.releases, followed | dict(extra or {}))
 
 
