@@ -18,7 +18,7 @@ from qgs.data.view_samplers import evenly
 from qgs.domain import Domain
 from qgs.geometry.poses import largest_distance, look_at_depth
 from qgs.geometry.rays import pixel_directions
-from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.geometry.transforms import depths_in_view, to_camera, to_pixels
 
 NOVEL = 6
 """Default limit on the number of photos that renderings are compared with."""
@@ -126,15 +126,10 @@ class Frusta:
         height, width = self.cameras.size
         own = self.cameras[frame]
         scale = own.intrinsics.new_tensor([_POINTS / width, _POINTS / height] * 2)
-        rays = pixel_directions(own.intrinsics * scale, (_POINTS, _POINTS)).reshape(1, -1, 3)
+        rays = pixel_directions(own.intrinsics * scale, (_POINTS, _POINTS)).reshape(-1, 3)
         points = rays @ own.c2w[:3, :3].T + own.c2w[:3, 3]
-        cameras = self.cameras[None, list(others)]
-        local = to_camera(points, cameras)[0]
-        # Comparisons with NaN are false, so the point counts as not seen.
-        local[local[..., 2] <= 1e-6] = torch.nan
-        pixels = to_pixels(local, cameras.intrinsics[0])
-        inside = (pixels >= 0) & (pixels <= pixels.new_tensor([width, height]))
-        return inside.all(-1).T.numpy()
+        depths = depths_in_view(points, self.cameras[None, list(others)])
+        return ~depths.isnan().T.numpy()
 
     def window(self, target: int, usable: Sequence[int], inputs: int) -> tuple[float, Frames]:
         """Choose `inputs` input frames among `usable` for a target; return (cost, frames).

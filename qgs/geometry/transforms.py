@@ -66,6 +66,15 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
     return torch.addcmul(principal, focal, camera_points[..., :2] / camera_points[..., 2:])
 
 
+def depths_in_view(points: Tensor, cameras: Cameras) -> Tensor:
+    """Return depths (V, P) of points (P, 3) from cameras (1, V); NaN for points out of view."""
+    local = to_camera(points[None], cameras)[0]
+    depths = local[..., 2]
+    pixels = to_pixels(local, cameras.intrinsics[0])
+    inside = (pixels >= 0) & (pixels <= pixels.new_tensor(cameras.size[::-1]))
+    return depths.where(inside.all(-1) & (depths > 0), torch.nan)
+
+
 @full_precision
 def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
     """Scale Gaussians by `factor` about the origin, then move them by the rigid `pose` (4, 4).

@@ -11,8 +11,9 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from qgs.drawing.images import rgb_picture
+from qgs.geometry.transforms import depths_in_view
 from qgs_viewer.look import INK, Color, enlarged
-from qgs_viewer.placement import Splats, corners, depths_in_view, on_photo
+from qgs_viewer.placement import Splats, corners, on_photo
 from qgs_viewer.query_scene import QueryScene
 
 Others = Literal["shown", "faint", "hidden"]

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.geometry.transforms import quat_to_matrix, to_camera, to_pixels
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians
 from qgs.wording import warn_once
@@ -122,15 +122,6 @@ def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
     weights = alphas[order] * left
     best = int(weights.argmax())
     return int(order[best]) if weights[best] >= LEAST_WEIGHT else None
-
-
-def depths_in_view(points: Tensor, cameras: Cameras) -> Tensor:
-    """Return depths (V, P) of points (P, 3) from cameras (1, V); NaN for points out of view."""
-    local = to_camera(points[None], cameras)[0]
-    depths = local[..., 2]
-    pixels = to_pixels(local, cameras.intrinsics[0])
-    inside = (pixels >= 0) & (pixels <= pixels.new_tensor(cameras.size[::-1]))
-    return depths.where(inside.all(-1) & (depths > 0), torch.nan)
 
 
 @full_precision

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from qgs.contracts import Column
 from qgs.data.samples import Sample
+from qgs.geometry.transforms import depths_in_view
 from qgs.metrics.baselines import nearest_input
 from qgs.types import Rendering
 from qgs.wording import listed
-from qgs_viewer.placement import depths_in_view, on_photo, patch_centers
+from qgs_viewer.placement import on_photo, patch_centers
 
 COVERAGE = Column("coverage", "higher", digits=0, unit="%")
 WHOLE = "whole"
