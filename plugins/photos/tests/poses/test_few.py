@@ -1,11 +1,16 @@
 """Poses of two photos: from features whose truth is known, and of a textured room."""
 
+from importlib.util import find_spec
+from itertools import combinations
+
 import numpy as np
 import pycolmap
 import pytest
 from commands import run_qgs
+from PIL import Image
 from qgs_photos.poses import making, worker
-from qgs_photos.poses.few import RefusedError, beginning
+from qgs_photos.poses.few import RefusedError, beginning, described
+from qgs_photos.poses.two_views import linked
 from upath import UPath
 from walked import PHOTOS, QUIET, write_photos
 
@@ -54,7 +59,7 @@ def found(tmp_path):
                 database.write_keypoints(image, pixels[place].astype(np.float32))
                 features = pycolmap.FeatureDescriptors(data=descriptors, type=kind)
                 database.write_descriptors(image, features)
-            return beginning(database)
+            return beginning(database, described(database))
 
     return found
 
@@ -107,9 +112,31 @@ def test_two_photos_get_poses_and_a_blank_one_none(images, shots, tmp_path):
     assert_within(2, np.linalg.inv(other) @ one, true[:3, :3], true[:3, 3])
 
 
-@pytest.mark.parametrize("least", ["few.LEAST_SCORE", "worker.FEW_MATCHES"])
+@pytest.mark.parametrize("least", ["two_views.LEAST_SCORE", "worker.FEW_MATCHES"])
 def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, least):
     monkeypatch.setattr(f"qgs_photos.poses.{least}", np.inf)
+    monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())
+    made = making.make_poses(walk, tmp_path / "made", making.Options(side=240), QUIET)
+    assert len(made.posed) == PHOTOS
+
+
+def by_sift(photos, weights, threads):
+    """What `features_and_links` returns."""
+    extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
+    points, descriptors = [], []
+    for photo in photos:
+        pixels = np.array(Image.open(photo).convert("L"))
+        found, own = extractor.extract_from_uint8_array(pixels)
+        points.append(np.array([(point.x, point.y) for point in found]))
+        data = own.data.astype(float)
+        descriptors.append(data / np.linalg.norm(data, axis=1, keepdims=True))
+    pairs = combinations(range(len(photos)), 2)
+    return points, {(a, b): linked(descriptors[a], descriptors[b]) for a, b in pairs}
+
+
+def test_few_photos_get_poses_by_learned_features(walk, tmp_path, monkeypatch):
+    monkeypatch.setattr(worker, "find_spec", lambda name: find_spec("qgs_photos"))
+    monkeypatch.setattr("qgs_photos.poses.learned.features_and_links", by_sift)
     monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())
     made = making.make_poses(walk, tmp_path / "made", making.Options(side=240), QUIET)
     assert len(made.posed) == PHOTOS

@@ -10,17 +10,16 @@ from typing import Any, TypeAlias
 import numpy as np
 import pycolmap
 
-from qgs_photos.poses.two_views import USUAL, TwoViews, View, two_views
+from qgs_photos.poses.two_views import USUAL, Links, TwoViews, View, linked, two_views
 
 # Takes dictionaries for options, which its types do not say.
 COLMAP: Any = pycolmap
+# By the numbers of two photos.
+Linked: TypeAlias = Mapping[tuple[int, int], Links]
 Pairs: TypeAlias = Mapping[tuple[int, int], TwoViews]
 
 SEARCHED = 8
 """Largest number of photos whose pairs are searched by this module."""
-LEAST_SCORE = 150
-"""Least score of a pair that counts, see `TwoViews`. Of 200 real pairs 90 % reach it; of these 0 %
-have errors above 20 degrees if the focal length is known, and 3 % if it is not."""
 PARALLAX = 10
 """Least motion, in pixels, of a point at the median depth. Turns on the spot show up to 9."""
 FLAT = 0.97
@@ -53,7 +52,7 @@ class RefusedError(Exception):
     """Error for photos that give no poses; its message says why."""
 
 
-def beginning(database: Any) -> tuple[Any, list[str], bool]:
+def beginning(database: Any, links: Linked) -> tuple[Any, list[str], bool]:
     """Return a model of the best two photos in an open database of COLMAP, remarks, and a switch.
 
     The switch is True if EXIF gives no focal length, or one that does not fit the photos. Focal
@@ -62,35 +61,47 @@ def beginning(database: Any) -> tuple[Any, list[str], bool]:
     """
     cameras = database.read_all_cameras()
     estimated = not any(camera.has_prior_focal_length for camera in cameras)
-    remarks = set_focals(database)
+    remarks = set_focals(database, links)
     seen = views(database)
-    found = pairs(seen)
+    found = pairs(seen, links)
     (one, other), pair = max(
         found.items(), key=lambda item: (item[1].flat < FLAT, item[1].score / item[1].depth ** 0.5)
     )
-    free = None if estimated else two_views(seen[one], seen[other], USUAL[1])
+    free = None if estimated else two_views(seen[one], seen[other], links[one, other], USUAL[1])
     if free and free.score > pair.score + BETTER:
         # what EXIF says is wrong: do without
         for camera in cameras:
             camera.has_prior_focal_length = False
             database.update_camera(camera)
-        return beginning(database)
+        return beginning(database, links)
     return model(database, (one, other), pair), remarks, estimated
 
 
-def pairs(seen: Mapping[int, View]) -> Pairs:
-    """Return pairs of photos far enough apart, by their numbers; seen: features of all photos.
+def pairs(seen: Mapping[int, View], links: Linked) -> Pairs:
+    """Return pairs of photos far enough apart. Raises RefusedError if there are none.
 
-    Raises RefusedError if there are none.
+    seen: features of all photos, by number.
     """
-    found = {(a, b): two_views(seen[a], seen[b]) for a, b in combinations(seen, 2)}
-    sure = {images: pair for images, pair in found.items() if pair and pair.score >= LEAST_SCORE}
+    found = {(a, b): two_views(seen[a], seen[b], own) for (a, b), own in links.items()}
+    sure = {
+        images: pair for images, pair in found.items() if pair and pair.score >= links[images].least
+    }
     if not sure:
         raise RefusedError(NO_MATCHES)
     apart = {images: one for images, one in sure.items() if one.focals[0] > PARALLAX * one.depth}
     if not apart:
         raise RefusedError(ONE_PLACE)
     return apart
+
+
+def described(database: Any) -> Linked:
+    """Return the matches of all pairs of photos by their descriptors."""
+    found = dict[int, Any]()
+    for image in database.read_all_images():
+        if database.num_keypoints_for_image(image.image_id):
+            own = database.read_descriptors(image.image_id).data.astype(np.float32)
+            found[image.image_id] = own / np.linalg.norm(own, axis=1, keepdims=True)
+    return {(a, b): linked(found[a], found[b]) for a, b in combinations(found, 2)}
 
 
 def views(database: Any) -> Mapping[int, View]:
@@ -101,17 +112,15 @@ def views(database: Any) -> Mapping[int, View]:
             continue
         camera = database.read_camera(image.camera_id)
         points = database.read_keypoints(image.image_id)[:, :2]
-        descriptors = database.read_descriptors(image.image_id).data.astype(np.float32)
         found[image.image_id] = View(
             points=points - [camera.principal_point_x, camera.principal_point_y],
-            descriptors=descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True),
             side=max(camera.width, camera.height),
             focal=camera.mean_focal_length() if camera.has_prior_focal_length else None,
         )
     return found
 
 
-def set_focals(database: Any) -> list[str]:
+def set_focals(database: Any, links: Linked) -> list[str]:
     """Set focal lengths that EXIF does not give, and return remarks.
 
     Photos without one are taken to have the lens of those with one. Without any, the mean of those
@@ -124,7 +133,7 @@ def set_focals(database: Any) -> list[str]:
     seen = views(database)
     told = [(view.focal / view.side, LEAST_DOUBT) for view in seen.values() if view.focal]
     if not told:
-        for (one, _), pair in pairs(seen).items():
+        for (one, _), pair in pairs(seen, links).items():
             focal = pair.focals[0] / seen[one].side
             if pair.flat < FLAT and LENSES[0] < focal < LENSES[1]:
                 told.append((focal, np.hypot(pair.focal_doubt, LEAST_DOUBT)))

