@@ -2,10 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
-from pydantic import Field
+from pydantic import PositiveInt
 from torch import Tensor
 from upath import UPath
 
@@ -19,7 +19,7 @@ Split = Literal["train", "test"]
 Frames: TypeAlias = tuple[int, ...]
 Window: TypeAlias = tuple[Frames, Frames]
 """Indices of the input frames, and of the target frames with which renderings are compared."""
-Side: TypeAlias = Annotated[int, Field(ge=1)]
+Side: TypeAlias = PositiveInt
 
 
 class Scene(ABC):

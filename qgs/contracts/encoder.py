@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import ClassVar
 
 import torch
-from pydantic import Field
+from pydantic import PositiveInt
 from torch import Tensor
 
 from qgs.contracts.component import (
@@ -82,7 +82,7 @@ class PatchEncoder(Encoder):
     """An encoder that cuts every photo into square patches and makes one token of each patch."""
 
     class Config(ComponentConfig):
-        patch_size: int = Field(default=8, ge=1)
+        patch_size: PositiveInt = 8
         """Side of a patch in pixels. It must divide both sides of the image."""
 
     config: Config

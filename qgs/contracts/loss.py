@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
-from pydantic import Field
+from pydantic import NonNegativeFloat
 from torch import Tensor
 
 from qgs.contracts.component import Component, ComponentConfig
@@ -37,7 +37,7 @@ class Loss(Component, torch.nn.Module):
     reads_depths: ClassVar[bool] = False
 
     class Config(ComponentConfig):
-        weight: float = Field(default=1.0, ge=0)
+        weight: NonNegativeFloat = 1.0
         """Factor of this loss in the objective. A loss with weight 0 is not computed."""
 
     config: Config

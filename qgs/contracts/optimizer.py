@@ -2,10 +2,10 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypedDict
+from typing import Any, ClassVar, TypedDict
 
 import torch
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat
 from torch import nn
 
 from qgs.contracts.component import Component, ComponentConfig
@@ -15,10 +15,10 @@ from qgs.contracts.settings import TrainingConfig
 class OptimizerConfig(ComponentConfig):
     """Options of every optimiser."""
 
-    learning_rate: float = Field(default=4e-4, ge=0)
+    learning_rate: NonNegativeFloat = 4e-4
     """The learning rate: a number, or a schedule such as `{schedule: linear, values: [0, 4.0e-4],
     at: [0, 500]}`."""
-    parts: dict[str, Annotated[float, Field(ge=0)]] = Field(default={}, max_length=1000)
+    parts: dict[str, NonNegativeFloat] = Field(default={}, max_length=1000)
     """Factors of the learning rate for parts of the model, such as `{encoder: 0.1}`. 0 freezes a
     part. A part is the path of a component in the recipe's `model`, or the name of a module or
     parameter. `*`, `?` and `[...]` match within one segment of a path. A part includes everything

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from typing import Annotated, ClassVar, TypeAlias
 
 import torch
-from pydantic import Field, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from qgs.containers import check_shapes
@@ -24,7 +24,7 @@ class RendererConfig(ComponentConfig):
     """Nearest camera-frame z, in world units, at which Gaussians are rendered."""
     far: Far = 125.0
     """Farthest camera-frame z, in world units, at which Gaussians are rendered."""
-    dilation: float = Field(default=0.3, ge=0)
+    dilation: NonNegativeFloat = 0.3
     """Variance in pixel^2 added to the diagonal of each Gaussian's projected covariance. 0 adds
     nothing."""
     alpha_min: float = Field(default=1 / 255, gt=0, lt=1)

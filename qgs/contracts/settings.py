@@ -2,7 +2,14 @@
 
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, ValidationInfo
+from pydantic import (
+    AfterValidator,
+    Field,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    ValidationInfo,
+)
 
 from qgs.contracts.component import ComponentConfig, OptionError
 from qgs.precision import Precision
@@ -62,9 +69,9 @@ class ViewsConfig(ComponentConfig):
     The defaults are those of the TokenGS release.
     """
 
-    inputs: int = Field(default=4, ge=1)
+    inputs: PositiveInt = 4
     """Number of input views per sample."""
-    targets: int = Field(default=4, ge=1)
+    targets: PositiveInt = 4
     """Number of target views per sample, chosen at random between the first and the last input
     view."""
     gap: Annotated[tuple[int, int], AfterValidator(ascending)] = (10, 40)
@@ -96,22 +103,22 @@ class ViewsConfig(ComponentConfig):
 class TrainingConfig(ComponentConfig):
     """Settings of training except for the optimiser (defaults: LocusGS release, base stage)."""
 
-    steps: int = Field(default=150_000, ge=1)
+    steps: PositiveInt = 150_000
     """Number of optimiser steps."""
-    seconds: float | None = Field(default=None, gt=0)
+    seconds: PositiveFloat | None = None
     """Time budget in seconds. Training ends when these seconds or `steps` are used up. null: no
     limit on time."""
-    batch_size: int = Field(default=16, ge=1)
+    batch_size: PositiveInt = 16
     """Number of scenes per optimiser step, summed over all processes. It must be a multiple of the
     number of processes times `accumulate`."""
-    accumulate: int = Field(default=1, ge=1)
+    accumulate: PositiveInt = 1
     """Number of batches into which each process splits its scenes of an optimiser step. The batches
     are computed one after the other, so a larger number needs less memory."""
-    clip: float = Field(default=1.0, gt=0)
+    clip: PositiveFloat = 1.0
     """Largest norm of the gradient. A gradient with a larger norm is scaled down to this norm."""
     precision: Precision = "bf16"
     """Precision of the model's computations. bf16 uses torch's autocast; weights stay float32."""
-    save_every: int = Field(default=1000, ge=0)
+    save_every: NonNegativeInt = 1000
     """Steps between checkpoints. 0: checkpoints only at the end and before evaluations."""
     collapse_window: int = Field(default=50, ge=10, le=100)
     """Stop training after this many steps in a row in which renderings are empty or the gradient
@@ -119,9 +126,9 @@ class TrainingConfig(ComponentConfig):
     image_sizes: tuple[tuple[PositiveInt, PositiveInt], ...] = ()
     """Sizes [H, W] of training images. Each step takes one at random. []: `data.image_size`, which
     is always the size in evaluation."""
-    workers: int = Field(default=0, ge=0)
+    workers: NonNegativeInt = 0
     """Number of processes that load data. 0: a thread of the training process loads data."""
-    render_views: int = Field(default=0, ge=0)
+    render_views: NonNegativeInt = 0
     """Number of target views rendered at a time. Smaller numbers need less memory; gradients stay
     the same. 0: all views at once."""
     judge_inputs: bool = False
@@ -135,7 +142,7 @@ class TrainingConfig(ComponentConfig):
     on_bad_sample: Literal["stop", "skip"] = "stop"
     """Stop training, or skip the sample, when a sample fails to load, for example because of a
     damaged image. "skip" uses a sample of one of the next scenes and logs a warning."""
-    evaluate_every: int = Field(default=0, ge=0)
+    evaluate_every: NonNegativeInt = 0
     """Number of steps between evaluations during training. An evaluation saves pictures, too. 0: no
     evaluations."""
     trackers: tuple[str, ...] = ()
@@ -164,14 +171,14 @@ class TrainingConfig(ComponentConfig):
 class EvaluationConfig(ComponentConfig):
     """Settings of `qgs eval` except for the metrics: the views to score, and test-time tuning."""
 
-    scenes: int = Field(default=32, ge=1)
+    scenes: PositiveInt = 32
     """Largest number of test scenes to score. For scenes with held-out frames, it is also the
     largest number of windows (input and target views) per scene. It has no effect if `index` is
     set."""
-    samples: int = Field(default=1, ge=1)
+    samples: PositiveInt = 1
     """Number of samples scored per scene, each with randomly chosen views. It has no effect if
     `index` is set, or for scenes with held-out frames."""
-    seed: int = Field(default=0, ge=0)
+    seed: NonNegativeInt = 0
     """Seed of the noise that `views.pose_noise` adds to input poses, and of the random choice of
     views. Views are chosen at random unless `index` is set or the scene has held-out frames."""
     index: str | None = None
@@ -186,10 +193,10 @@ class EvaluationConfig(ComponentConfig):
     """Part of the model's state that test-time tuning fits to a scene's input views: "queries", or
     the features of the image memory ("latents"). "latents" needs an encoder that can recompute keys
     and values from features."""
-    tuning_steps: int = Field(default=0, ge=0)
+    tuning_steps: NonNegativeInt = 0
     """Number of test-time tuning steps on a scene's input views before the scene is scored. They
     minimise the recipe's photometric loss. 0: no tuning (TokenGS uses 50)."""
-    tuning_rate: float | None = Field(default=None, gt=0)
+    tuning_rate: PositiveFloat | None = None
     """Learning rate of test-time tuning with Adam. null: as in TokenGS, 1e-4 for queries, 1e-2 for
     latents."""
 

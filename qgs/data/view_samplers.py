@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import NonNegativeInt, PositiveInt
 
 from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig, Window
 from qgs.contracts.component import ComponentConfig
@@ -135,12 +135,12 @@ class Span(ViewSampler):
     scheduled = frozenset({"min_gap", "max_gap"})
 
     class Config(ComponentConfig):
-        min_gap: int | None = Field(default=None, ge=1)
+        min_gap: PositiveInt | None = None
         """Least distance in frames from the first to the last input view. null uses `views.gap`."""
-        max_gap: int | None = Field(default=None, ge=1)
+        max_gap: PositiveInt | None = None
         """Largest distance in frames from the first to the last input view. null uses `views.gap`.
         With a schedule, it can grow during training."""
-        extra_inputs: int = Field(default=0, ge=0)
+        extra_inputs: NonNegativeInt = 0
         """Largest number of inputs in training beyond `views.inputs`. The first step uses
         `views.inputs`, each further step one more, up to this largest number, and then it starts
         again. Evaluation always uses `views.inputs`."""

@@ -2,7 +2,7 @@
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from qgs.contracts import Loss
@@ -27,9 +27,9 @@ class DepthSurface(Loss):
     reads_depths = True
 
     class Config(Loss.Config):
-        beta: float = Field(default=0.05, gt=0)
+        beta: PositiveFloat = 0.05
         """Error in world units at which the loss changes from quadratic to linear."""
-        near: float = Field(default=0.025, gt=0)
+        near: PositiveFloat = 0.025
         """Camera-frame z, in world units, at or below which a view ignores Gaussians."""
         inputs: bool = True
         """Use the depth maps of input views, in addition to those of target views."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 
 import torch.nn.functional as F
-from pydantic import Field
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext
@@ -23,12 +23,12 @@ class Photometric(Loss):
     renderings = "each"
 
     class Config(Loss.Config):
-        mse_weight: float = Field(default=1.0, ge=0)
+        mse_weight: NonNegativeFloat = 1.0
         """Factor of the mean squared error. With 0, this term is not computed."""
-        l1_weight: float = Field(default=0.0, ge=0)
+        l1_weight: NonNegativeFloat = 0.0
         """Factor of the mean absolute error (TokenGS 2026.6: 0.8, without MSE). With 0, this term
         is not computed."""
-        ssim_weight: float = Field(default=0.2, ge=0)
+        ssim_weight: NonNegativeFloat = 0.2
         """Factor of (1 - SSIM) / 2. With 0, this term is not computed."""
         padding: Padding = "same"
         """Rule for image borders in SSIM. "same" pads images with zeros, as the TokenGS and LocusGS
@@ -67,9 +67,9 @@ class Opacity(Loss):
     renderings = "none"
 
     class Config(Loss.Config):
-        weight: float = Field(default=0.1, ge=0)
+        weight: NonNegativeFloat = 0.1
         """Factor of this loss in the objective. With 0, the loss is not computed."""
-        eps: float = Field(default=1e-6, gt=0)
+        eps: PositiveFloat = 1e-6
         """Number added to the opacity, so that the logarithm stays finite (TokenGS release)."""
 
     config: Config
@@ -92,7 +92,7 @@ class Mask(Loss):
     renderings = "each"
 
     class Config(Loss.Config):
-        weight: float = Field(default=0.5, ge=0)
+        weight: NonNegativeFloat = 0.5
         """Factor of this loss in the objective. With 0, the loss is not computed."""
 
     config: Config

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from typing import Literal
 
 import torch
-from pydantic import Field
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext, without_effect
@@ -27,10 +27,10 @@ class VisibilityOptions(Loss.Config):
     every point whose loss is clamped. Views that have the point in front of them still move it.
     """
 
-    clamp: float | None = Field(default=1.0, gt=0)
+    clamp: PositiveFloat | None = 1.0
     """Upper bound of a point's loss. The unit is half an image side (TokenGS and LocusGS releases:
     1). null: no bound."""
-    near: float = Field(default=0.025, gt=0)
+    near: PositiveFloat = 0.025
     """Camera-frame z, in world units, at or below which a point counts as behind the camera."""
     behind_camera: Literal["published", "invisible"] = "published"
     """Rule for points behind a camera. "published" projects them like other points, mirrored, so
@@ -65,7 +65,7 @@ class Visibility(Loss):
     renderings = "none"
 
     class Config(VisibilityOptions):
-        infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
+        infinite_pixel: PositiveFloat = INFINITE_PIXEL
         """Pixel coordinate u of a point at depth 0 with camera-frame x > 0. With x < 0, u has the
         opposite sign. The same rule gives v from y. No effect if `clamp` is set."""
 

@@ -5,7 +5,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import Field, WithJsonSchema, create_model
+from pydantic import Field, PositiveFloat, WithJsonSchema, create_model
 
 from qgs.contracts import (
     LAYER_SLOTS,
@@ -40,7 +40,7 @@ class DecoderSettings(ComponentConfig):
 
     depth: int = Field(default=12, ge=0, le=256)
     """Number of layers (L in the papers). With 0, the head decodes the initial queries."""
-    layer_scale: float = Field(default=5e-5, gt=0)
+    layer_scale: PositiveFloat = 5e-5
     """Initial value of LayerScale, the learned factor on each sublayer's output. The default is
     from the TokenGS release."""
 

@@ -6,7 +6,7 @@ Axes: B scenes, T tokens, N queries, M image tokens, Q chosen queries, D width, 
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field
+from pydantic import PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import AttentionWeights, ComponentConfig
@@ -18,7 +18,7 @@ NORM_EPS = 1e-5
 class NormConfig(ComponentConfig):
     """Options of a component with LayerNorms."""
 
-    norm_eps: float = Field(default=NORM_EPS, gt=0)
+    norm_eps: PositiveFloat = NORM_EPS
     """Number that every LayerNorm adds to the variance."""
 
 

@@ -1,7 +1,7 @@
 """The default queries and decoder layer (TokenGS): attention without positions, and an MLP."""
 
 import torch
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -28,9 +28,9 @@ class LatentQueries(LearnedQueries):
     name = "latent"
 
     class Config(ComponentConfig):
-        count: int = Field(default=4096, ge=1)
+        count: PositiveInt = 4096
         """Number N of queries."""
-        std: float = Field(default=0.01, ge=0)
+        std: NonNegativeFloat = 0.01
         """Standard deviation of the initial features. 0 makes all queries equal."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from einops import rearrange, repeat
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 from torch import Tensor, nn
 
 from qgs.contracts import ModelDims, PatchEncoder
@@ -62,7 +62,7 @@ class PatchViT(PatchEncoder):
         """Number of ViT blocks. With 0, the tokens are the patch embeddings."""
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width of the MLPs as a multiple of the model's width, rounded down."""
-        layer_scale: float = Field(default=0.01, gt=0)
+        layer_scale: PositiveFloat = 0.01
         """Initial value of all LayerScale factors in the encoder."""
 
     config: Config

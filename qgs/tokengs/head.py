@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field
+from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -38,25 +38,25 @@ class GaussianHead(Head):
     class Config(NormConfig):
         """Options; the defaults are those of the LocusGS release."""
 
-        gaussians_per_query: int = Field(default=64, ge=1)
+        gaussians_per_query: PositiveInt = 64
         """Number K of Gaussians per query."""
-        init_std: float = Field(default=0.002, gt=0)
+        init_std: PositiveFloat = 0.002
         """Standard deviation of the initial weights (truncated normal)."""
-        position_std: float | None = Field(default=None, gt=0)
+        position_std: PositiveFloat | None = None
         """Standard deviation of the initial weights for positions; null means `init_std`."""
         z_init: float = 0.0
         """Initial bias of the raw z of positions (default 0; TokenGS release 2026.6: log 1.1)."""
         norm: bool = False
         """Use a LayerNorm before the linear layer. TokenGS and LocusGS have none; a LayerNorm helps
         small models."""
-        scale_cap: float = Field(default=0.075, gt=0)
+        scale_cap: PositiveFloat = 0.075
         """Largest scale in world units. A raw scale of 0 gives 1/e of this limit."""
-        scale_input_limit: float | None = Field(default=10.0, gt=0)
+        scale_input_limit: PositiveFloat | None = 10.0
         """Limit of the absolute value of raw scales before the exponential. null means no limit, as
         in TokenGS."""
         opacity_bias: float = -2.0
         """Number added to the raw opacity before the sigmoid."""
-        quat_eps: float = Field(default=1e-4, gt=0)
+        quat_eps: PositiveFloat = 1e-4
         """Smallest divisor when raw quaternions are normalised (TokenGS: 1e-12)."""
 
     config: Config
@@ -138,10 +138,10 @@ class FreeCenters(Centers):
     class Config(ComponentConfig):
         z_offset: float = 1.0
         """Number added to z, in world units (1 in TokenGS, 0 in LocusGS's free-centre ablation)."""
-        input_limit: float | None = Field(default=100.0, gt=0)
+        input_limit: PositiveFloat | None = 100.0
         """Limit of the absolute value of raw offsets. null means no limit. LocusGS has 100, TokenGS
         null."""
-        output_limit: float | None = Field(default=1000.0, gt=0)
+        output_limit: PositiveFloat | None = 1000.0
         """Limit of the absolute value of posact(offset), in world units. null means no limit.
         LocusGS has 1000, TokenGS null."""
 

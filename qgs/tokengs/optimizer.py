@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch.optim import AdamW
 
 from qgs.contracts import Optimizer, OptimizerConfig, ParameterGroup, TrainingConfig
@@ -31,21 +31,21 @@ class OneCycleAdamW(Optimizer):
     class Config(OptimizerConfig):
         """Options of the learning rate's cycle and of AdamW."""
 
-        learning_rate: float = Field(default=4e-4, ge=0)
+        learning_rate: NonNegativeFloat = 4e-4
         """Peak learning rate, at the end of the warm-up. A schedule given here replaces the whole
         cycle of warm-up and fall."""
-        warmup: int = Field(default=2000, ge=0)
+        warmup: NonNegativeInt = 2000
         """Optimiser steps until the learning rate reaches its peak. 0 starts at the peak."""
         warmup_shape: Literal["cosine", "linear"] = "cosine"
         """Shape of the learning rate's rise to its peak."""
         initial_divisor: float = Field(default=25.0, ge=1)
         """Peak learning rate divided by the first learning rate."""
-        final_divisor: float = Field(default=1000.0, gt=0)
+        final_divisor: PositiveFloat = 1000.0
         """First learning rate divided by the last one, as in torch's OneCycleLR. A value below 1
         makes the last one larger."""
         betas: tuple[Decay, Decay] = (0.9, 0.95)
         """AdamW's decay rates for the averages of gradients and of their squares."""
-        weight_decay: float = Field(default=0.05, ge=0)
+        weight_decay: NonNegativeFloat = 0.05
         """AdamW's weight decay. It applies to parameters for which `ModelComponent.decays` is true.
         0 means no decay."""
 

@@ -3,14 +3,14 @@
 import math
 from bisect import bisect_right
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal, Self, TypeAlias
+from typing import ClassVar, Literal, Self, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from qgs.contracts.component import OptionError
 from qgs.contracts.schedule import Schedule
 
-Step: TypeAlias = Annotated[int, Field(ge=0)]
+Step: TypeAlias = NonNegativeInt
 
 
 class Constant(Schedule):
@@ -61,7 +61,7 @@ class Steps(_Listed):
     """Step function: one constant number for each range of training steps."""
     values: tuple[float, ...]
     """The numbers in order, one more than there are steps in `at`."""
-    at: tuple[Annotated[int, Field(ge=1)], ...] = Field(min_length=1)
+    at: tuple[PositiveInt, ...] = Field(min_length=1)
     """Ascending training steps. At each of these steps the next value starts."""
 
     def number(self, step: int) -> float:

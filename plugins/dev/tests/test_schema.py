@@ -64,7 +64,7 @@ def test_nulls_and_schedules_are_valid_and_mistakes_are_not(schema):
 
 LISTED = """
 queries; model.queries: qgs/latent, query-gaussians 0; locus/anchored
-qgs/latent; count | integer >= 1 | 4096 | Number N of queries.
+qgs/latent; count | integer > 0 | 4096 | Number N of queries.
 locus/anchored; center_init.std; provides: anchor.center (3 float32, world frame)
 qgs/photos; path | text | required |
 model.decoder; layer_scale | number > 0 | 5.0e-05

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from PIL import Image
-from pydantic import Field, field_validator
+from pydantic import NonNegativeInt, PositiveFloat, field_validator
 from torch import Tensor
 from upath import UPath
 
@@ -61,15 +61,15 @@ class PhotosConfig(SceneSource.Config):
     outside: bool = False
     """Allow listings to name files outside of the folder, by absolute paths or `..`. Links are
     always followed."""
-    holdout: int = Field(default=8, ge=0)
+    holdout: NonNegativeInt = 8
     """Number n: every nth frame, starting at frame n // 2, is held out for evaluation. In scenes
     of fewer than n frames it is the middle frame. 0: none is held out. Splits in the listing take
     precedence."""
-    max_frames: int = Field(default=0, ge=0)
+    max_frames: NonNegativeInt = 0
     """Number of frames to read from the start of a listing. 0 reads all frames."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB colour in [0, 1] behind transparent pixels."""
-    depth_unit: float = Field(default=1e-3, gt=0)
+    depth_unit: PositiveFloat = 1e-3
     """Depth in world units that the value 1 in a depth map means. The default is for millimetres,
     as nerfstudio writes them."""
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field, NonNegativeInt
+from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
@@ -24,9 +24,9 @@ ImageCache = dict[tuple[str, int], np.ndarray]
 class DrawnConfig(SceneSource.Config):
     """Options that all sources of procedural scenes have."""
 
-    scenes: int = Field(default=2000, ge=1)
+    scenes: PositiveInt = 2000
     """Number of scenes in the training split."""
-    test_scenes: int = Field(default=32, ge=1)
+    test_scenes: PositiveInt = 32
     """Number of scenes in the test split. Test scenes differ from training scenes."""
     views_per_scene: int = Field(default=8, ge=2)
     """Number of cameras in each scene."""

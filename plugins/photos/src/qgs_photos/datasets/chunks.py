@@ -9,7 +9,7 @@ from typing import ClassVar, get_args
 import numpy as np
 import torch
 from PIL import Image
-from pydantic import Field
+from pydantic import NonNegativeInt
 from torch import Tensor
 from upath import UPath
 
@@ -39,7 +39,7 @@ _OPEN = 4
 class ManyScenesConfig(SceneSource.Config):
     """Options of data sets with many scenes."""
 
-    max_scenes: int = Field(default=0, ge=0)
+    max_scenes: NonNegativeInt = 0
     """Use only the first scenes of each split, at most this number. 0 uses all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1] behind transparent pixels."""
@@ -52,11 +52,11 @@ class ChunksConfig(ManyScenesConfig):
     """Folder or fsspec URL that holds train/ and test/. A relative path starts at the working
     directory. From a URL, every process and every data-loader worker reads whole chunks: copy the
     data set to a local disk for training."""
-    holdout: int = Field(default=0, ge=0)
+    holdout: NonNegativeInt = 0
     """A number N above 0 holds out every Nth frame of a scene for evaluation, from frame N // 2
     on. 0 holds out the frames that the chunk lists as held out. Only chunks of `qgs data pack`
     can have such a list; without it, 0 holds out none."""
-    min_frames: int = Field(default=0, ge=0)
+    min_frames: NonNegativeInt = 0
     """Leave out scenes with fewer frames than this number. To count frames, every chunk is opened
     at the start. 0 keeps all scenes and opens none."""
 

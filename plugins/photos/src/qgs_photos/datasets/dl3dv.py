@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any, ClassVar
 
-from pydantic import Field
+from pydantic import NonNegativeInt
 from upath import UPath
 
 from qgs.data.photos import formats_of
@@ -37,7 +37,7 @@ class Dl3dvConfig(ManyScenesConfig):
     """File that names the test scenes: an evaluation index, a JSON list, or text with a name on
     each line. Training uses all other scenes. null names no test scenes: training uses all
     scenes."""
-    holdout: int = Field(default=0, ge=0)
+    holdout: NonNegativeInt = 0
     """A number N above 0 holds out every Nth frame of a scene for evaluation, from frame N // 2
     on. 0 holds out none."""
 

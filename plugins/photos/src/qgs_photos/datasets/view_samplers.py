@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from qgs.contracts import (
@@ -50,20 +50,20 @@ class Bounded(ViewSampler):
     scheduled = frozenset({"min_gap", "max_gap", "margin"})
 
     class Config(ComponentConfig):
-        min_gap: int = Field(default=45, ge=1)
+        min_gap: PositiveInt = 45
         """Least number of frames from the first input to the last, after the warm-up."""
-        max_gap: int = Field(default=192, ge=1)
+        max_gap: PositiveInt = 192
         """Largest number of frames from the first input to the last, after the warm-up. In shorter
         scenes the number of frames is the limit."""
-        margin: int = Field(default=0, ge=0)
+        margin: NonNegativeInt = 0
         """Least distance in frames of a target from the first and the last input. 0: an input may
         be a target."""
-        warm_up_steps: int = Field(default=150_000, ge=0)
+        warm_up_steps: NonNegativeInt = 150_000
         """Optimiser steps in which the bounds of the gap go from their initial to their final
         values. 0: no warm-up."""
-        initial_min_gap: int = Field(default=25, ge=1)
+        initial_min_gap: PositiveInt = 25
         """Least number of frames from the first input to the last, in the first step."""
-        initial_max_gap: int = Field(default=45, ge=1)
+        initial_max_gap: PositiveInt = 45
         """Largest number of frames from the first input to the last, in the first step."""
 
     config: Config

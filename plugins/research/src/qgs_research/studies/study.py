@@ -10,7 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from qgs.contracts import ComponentConfig, OptionError
 from qgs.evaluate.evaluation import SECTIONS
@@ -67,9 +75,9 @@ Section: TypeAlias = Annotated[str, AfterValidator(_evaluation_section)]
 class Budget(ComponentConfig):
     """Length of each training: a number of steps or a time in seconds."""
 
-    steps: int | None = Field(default=None, ge=1)
+    steps: PositiveInt | None = None
     """Number of optimiser steps. Null means that `seconds` limits the training."""
-    seconds: float | None = Field(default=None, gt=0)
+    seconds: PositiveFloat | None = None
     """Training time in seconds. Null means that `steps` limits the training."""
 
     @model_validator(mode="after")

@@ -9,7 +9,7 @@ from random import Random
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PositiveInt
 
 from qgs.contracts import Ascending, Split
 from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
@@ -25,7 +25,7 @@ Variety: TypeAlias = Literal["plain", "varied"]
 class WorldsConfig(DrawnConfig):
     """Options of `worlds/procedural`."""
 
-    scenes: int = Field(default=100_000, ge=1)
+    scenes: PositiveInt = 100_000
     """Number of scenes in the training split."""
     complexity: int = Field(default=32, ge=4)
     """Largest number of objects near the cameras. A scene has a random number, log-uniform from 4
