@@ -14,17 +14,24 @@ _TWO = np.float32(2)
 
 
 @kernel
+def _moment(x, y, z, t, j):
+    """Return e = mu x d - m, the moment of ray j around the point mu = (x, y, z).
+
+    t: columns of all tokens: moment m and direction d of a ray.
+    """
+    return (
+        y * t[5, j] - z * t[4, j] - t[0, j],
+        z * t[3, j] - x * t[5, j] - t[1, j],
+        x * t[4, j] - y * t[3, j] - t[2, j],
+    )
+
+
+@kernel
 def write(queries, tokens, out):
     """Write the bias max(-factor D^2, lower) of each query and token to `out`, (n, M).
 
     D = |mu x d - m| is the distance of the anchor's centre mu from the ray (moment m, direction d).
     """
-    m0 = tokens[0]
-    m1 = tokens[1]
-    m2 = tokens[2]
-    d0 = tokens[3]
-    d1 = tokens[4]
-    d2 = tokens[5]
     for n in range(queries.shape[0]):
         x = queries[n, 0]
         y = queries[n, 1]
@@ -33,9 +40,7 @@ def write(queries, tokens, out):
         lower = queries[n, 4]
         row = out[n]
         for j in range(row.shape[0]):
-            e0 = y * d2[j] - z * d1[j] - m0[j]
-            e1 = z * d0[j] - x * d2[j] - m1[j]
-            e2 = x * d1[j] - y * d0[j] - m2[j]
+            e0, e1, e2 = _moment(x, y, z, tokens, j)
             bias = -factor * (e0 * e0 + e1 * e1 + e2 * e2)
             # Not max(): a NaN must stay, so that training sees it.
             row[j] = lower if bias <= lower else bias
@@ -48,12 +53,6 @@ def gradients(queries, tokens, gradient, out):
     gradient: gradient of the loss with respect to the bias (n, M). The bias depends on |e|^2 with
     e = mu x d - m. The gradient of |e|^2 with respect to the anchor's centre mu is 2 d x e.
     """
-    m0 = tokens[0]
-    m1 = tokens[1]
-    m2 = tokens[2]
-    d0 = tokens[3]
-    d1 = tokens[4]
-    d2 = tokens[5]
     for n in range(queries.shape[0]):
         x = queries[n, 0]
         y = queries[n, 1]
@@ -63,15 +62,13 @@ def gradients(queries, tokens, gradient, out):
         row = gradient[n]
         of_x = of_y = of_z = of_factor = of_lower = _ZERO
         for j in range(row.shape[0]):
-            e0 = y * d2[j] - z * d1[j] - m0[j]
-            e1 = z * d0[j] - x * d2[j] - m1[j]
-            e2 = x * d1[j] - y * d0[j] - m2[j]
+            e0, e1, e2 = _moment(x, y, z, tokens, j)
             distance_sq = e0 * e0 + e1 * e1 + e2 * e2
             # At the clamp the gradient goes to the bound, which contains gamma.
             inside = _ZERO if -factor * distance_sq <= lower else row[j]
-            of_x += inside * (d1[j] * e2 - d2[j] * e1)
-            of_y += inside * (d2[j] * e0 - d0[j] * e2)
-            of_z += inside * (d0[j] * e1 - d1[j] * e0)
+            of_x += inside * (tokens[4, j] * e2 - tokens[5, j] * e1)
+            of_y += inside * (tokens[5, j] * e0 - tokens[3, j] * e2)
+            of_z += inside * (tokens[3, j] * e1 - tokens[4, j] * e0)
             of_factor += inside * distance_sq
             of_lower += row[j] - inside
         out[n, 0] = -_TWO * factor * of_x
