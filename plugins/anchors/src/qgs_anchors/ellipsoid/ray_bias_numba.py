@@ -15,13 +15,13 @@ _TWO = np.float32(2)
 
 
 @kernel
-def _times(a, x, y, z):
-    """Return the product of the 3 x 3 matrix `a` and the vector (x, y, z)."""
-    return (
-        a[0] * x + a[1] * y + a[2] * z,
-        a[3] * x + a[4] * y + a[5] * z,
-        a[6] * x + a[7] * y + a[8] * z,
-    )
+def _times(a, v):
+    """Return the product of the 3 x 3 matrix `a` and the vector `v`, and its squared length."""
+    x, y, z = v
+    p = a[0] * x + a[1] * y + a[2] * z
+    q = a[3] * x + a[4] * y + a[5] * z
+    r = a[6] * x + a[7] * y + a[8] * z
+    return (p, q, r), p * p + q * q + r * r
 
 
 @kernel
@@ -30,6 +30,13 @@ def _nine(row, first):
         row[first], row[first + 1], row[first + 2], row[first + 3], row[first + 4],
         row[first + 5], row[first + 6], row[first + 7], row[first + 8],
     )  # fmt: skip
+
+
+@kernel
+def _query(row):
+    """Return mu, cof(W), W, factor and lower of a query."""
+    mu = (row[0], row[1], row[2])
+    return mu, _nine(row, 3), _nine(row, 12), row[21], row[22]
 
 
 @kernel
@@ -53,19 +60,11 @@ def write(queries, tokens, out):
     ray (moment m, direction d, u = d / |d|). W maps an ellipsoid around mu to a unit ball.
     """
     for n in range(queries.shape[0]):
-        q = queries[n]
         row = out[n]
-        mu = (q[0], q[1], q[2])
-        c = _nine(q, 3)
-        w = _nine(q, 12)
-        factor = q[21]
-        lower = q[22]
+        mu, c, w, factor, lower = _query(queries[n])
         for j in range(row.shape[0]):
-            e = _moment(mu, tokens, j)
-            a = _times(c, e[0], e[1], e[2])
-            b = _times(w, tokens[6, j], tokens[7, j], tokens[8, j])
-            above = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
-            below = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+            _, above = _times(c, _moment(mu, tokens, j))
+            _, below = _times(w, (tokens[6, j], tokens[7, j], tokens[8, j]))
             bias = -factor * above / below
             # Not max(): NaN must stay NaN.
             row[j] = lower if bias <= lower else bias
@@ -81,13 +80,9 @@ def _store(out, values):
 def gradients(queries, tokens, gradient, out):
     """Compute gradients (N, 23) of the queries in `out` from gradients (N, M) of the bias."""
     for n in range(queries.shape[0]):
-        q = queries[n]
         row = gradient[n]
         of = out[n]
-        mu = (q[0], q[1], q[2])
-        c = _nine(q, 3)
-        w = _nine(q, 12)
-        factor, lower = q[21], q[22]
+        mu, c, w, factor, lower = _query(queries[n])
         of_x = of_y = of_z = of_factor = of_lower = _ZERO
         # Eighteen scalars, which the compiler keeps in registers, unlike an array.
         c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = _ZERO
@@ -95,10 +90,8 @@ def gradients(queries, tokens, gradient, out):
         for j in range(row.shape[0]):
             e = _moment(mu, tokens, j)
             u, v, t = tokens[6, j], tokens[7, j], tokens[8, j]
-            a = _times(c, e[0], e[1], e[2])
-            b = _times(w, u, v, t)
-            above = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
-            below = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+            a, above = _times(c, e)
+            b, below = _times(w, (u, v, t))
             ratio = above / below
             # At the clamp the gradient goes to the bound.
             inside = _ZERO if -factor * ratio <= lower else row[j]
