@@ -10,52 +10,27 @@ import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from random import Random
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from qgs_worlds.caster import shapes
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.shapes import Point
+from qgs_worlds.caster.shapes import Point, Primitive, Shape, about_z
 from qgs_worlds.rooms.materials import Materials, between
 
 # Surfaces of a room: -x, +x, -y, +y, floor and ceiling.
 WALLS = 6
 
 
-class Shape(NamedTuple):
-    """Shape of furniture, turned by `turn` radians about z.
+def _shape(kind: int, center: Point, half: Point, texture: int) -> Shape:
+    """Return a shape that is not turned. texture: index of a material."""
+    return Shape(Primitive(kind, center, half), texture=texture + WALLS)
 
-    kind: BLOCK, BALL or CYLINDER. half: half sizes on each axis in metres; for round shapes, the
-    radii. texture: index of a material.
-    """
 
-    kind: int
-    center: Point
-    half: Point
-    turn: float
-    texture: int
-
-    def moved(self, x: float, y: float, turn: float) -> "Shape":
-        """Return the shape, turned by `turn` radians about the z axis, then moved by (x, y)."""
-        cos = math.cos(turn)
-        sin = math.sin(turn)
-        cx, cy, cz = self.center
-        center = (x + cos * cx - sin * cy, y + sin * cx + cos * cy, cz)
-        return Shape(self.kind, center, self.half, self.turn + turn, self.texture)
-
-    def bounds(self) -> tuple[float, ...]:
-        """Return the bounding box of the shape: lowest x, y, z, then highest x, y, z, in metres."""
-        x, y, z = self.center
-        a, b, c = self.half
-        # most shapes are not turned, and bounds are asked for often
-        if self.turn:
-            cos = abs(math.cos(self.turn))
-            sin = abs(math.sin(self.turn))
-            turned = cos * a + sin * b
-            b = sin * a + cos * b
-            a = turned
-        return x - a, y - b, z - c, x + a, y + b, z + c
+def _turned(shape: Shape, angle: float) -> Shape:
+    """Return a shape turned by `angle` radians about its own z axis, in place of its own turn."""
+    return shape._replace(body=shape.body._replace(turn=about_z(angle)))
 
 
 def box(x: float, y: float, z: float, w: float, d: float, h: float, texture: int) -> Shape:
@@ -63,7 +38,7 @@ def box(x: float, y: float, z: float, w: float, d: float, h: float, texture: int
 
     (x, y, z) is the centre of its bottom face. texture: index of a material.
     """
-    return Shape(s.BLOCK, (x, y, z + h / 2), (w / 2, d / 2, h / 2), 0.0, texture)
+    return _shape(s.BLOCK, (x, y, z + h / 2), (w / 2, d / 2, h / 2), texture)
 
 
 def cylinder(x: float, y: float, z: float, radius: float, height: float, texture: int) -> Shape:
@@ -72,12 +47,12 @@ def cylinder(x: float, y: float, z: float, radius: float, height: float, texture
     (x, y, z) is the centre of its bottom face. texture: index of a material.
     """
     half = (radius, radius, height / 2)
-    return Shape(s.CYLINDER, (x, y, z + height / 2), half, 0.0, texture)
+    return _shape(s.CYLINDER, (x, y, z + height / 2), half, texture)
 
 
 def sphere(x: float, y: float, z: float, radius: float, texture: int) -> Shape:
     """Return a sphere whose lowest point is (x, y, z). texture: index of a material."""
-    return Shape(s.BALL, (x, y, z + radius), (radius, radius, radius), 0.0, texture)
+    return _shape(s.BALL, (x, y, z + radius), (radius, radius, radius), texture)
 
 
 def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
@@ -86,16 +61,8 @@ def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
     size: x, y, z extent of the room in metres. Textures 0 to 5 are those of walls, floor and
     ceiling; textures of the other shapes follow from 6 on.
     """
-    walls = Shape(s.INTERIOR, (0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2]), 0.0, -WALLS)
-    return shapes.packed(
-        [
-            shapes.Shape(
-                shapes.Primitive(shape.kind, shape.center, shape.half, shapes.about_z(shape.turn)),
-                texture=shape.texture + WALLS,
-            )
-            for shape in (walls, *inside)
-        ]
-    )
+    walls = _shape(s.INTERIOR, (0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2]), -WALLS)
+    return shapes.packed([walls, *inside])
 
 
 Piece = list[Shape]
@@ -151,7 +118,7 @@ def _part(row: list[Any], sizes: Sizes) -> Shape:
     """
     make, lengths, material, *turn = row
     part = make(*_lengths(lengths, sizes), sizes[material])
-    return part._replace(turn=sizes[turn[0]]) if turn else part
+    return _turned(part, sizes[turn[0]]) if turn else part
 
 
 class Furniture:
@@ -217,7 +184,9 @@ def _around_table(make: Furniture, sizes: Sizes) -> Piece:
         for x in (-w / 4, w / 4):
             if rng.random() < 0.75:
                 away = sign * (d / 2 + rng.uniform(0.0, 0.2))
-                piece += [part.moved(sign * x, away, turn) for part in make.piece("chair", **alike)]
+                at = (sign * x, away, 0.0)
+                chair = make.piece("chair", **alike)
+                piece += [part.moved(at, about_z(turn)) for part in chair]
     return piece
 
 
@@ -225,7 +194,7 @@ def _cushions(make: Furniture, sizes: Sizes) -> Piece:
     piece = []
     for x in make.spots(0.32):
         (cushion,) = make.piece("cushion", x=x * sizes["w"])
-        piece.append(cushion._replace(turn=make.rng.gauss(0, 0.15)))
+        piece.append(_turned(cushion, make.rng.gauss(0, 0.15)))
     return piece
 
 

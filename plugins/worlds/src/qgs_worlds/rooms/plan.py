@@ -6,6 +6,7 @@ from random import Random
 import numpy as np
 
 from qgs_worlds.caster.interiors import floor_shadows
+from qgs_worlds.caster.shapes import about_z
 from qgs_worlds.caster.tables import LIGHT, Room
 from qgs_worlds.rooms.furniture import (
     AGAINST_WALLS,
@@ -81,7 +82,7 @@ class Furnisher:
         if not self.free(low, high):
             return False
         self._taken.append((low[0], low[1], high[0], high[1]))
-        self.shapes += [shape.moved(x, y, turn) for shape in piece]
+        self.shapes += [shape.moved((x, y, 0.0), about_z(turn)) for shape in piece]
         return True
 
     def free(self, low: Point, high: Point) -> bool:
@@ -107,8 +108,11 @@ class Furnisher:
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
     """Return the lowest and the highest corner of the box around all of `shapes`."""
-    x0, y0, z0, x1, y1, z1 = zip(*[shape.bounds() for shape in shapes], strict=True)
-    return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
+    center, half, turn = map(np.array, zip(*[shape.body[1:4] for shape in shapes], strict=True))
+    reach = (abs(turn.reshape(-1, 3, 3)) @ half[..., None])[..., 0]
+    x0, y0, z0 = (center - reach).min(0).tolist()
+    x1, y1, z1 = (center + reach).max(0).tolist()
+    return (x0, y0, z0), (x1, y1, z1)
 
 
 def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
@@ -191,7 +195,7 @@ def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
             hung = {place: make.piece("picture") for place in places}
         for place, item in hung.items():
             x, y = _from_wall(side, across / 2, place)
-            shapes += [shape.moved(x, y, turn) for shape in item]
+            shapes += [shape.moved((x, y, 0.0), about_z(turn)) for shape in item]
     return shapes
 
 
@@ -208,7 +212,7 @@ def _fixed(make: Furniture, size: Size) -> list[Shape]:
         deep = rng.uniform(0.35, 0.6) * d
         rug = box(0, 0, 0, wide, deep, 0.012, make.material("rug"))
         x, y = [rng.uniform(-0.3, 0.3) for _ in range(2)]
-        shapes.append(rug.moved(x, y, rng.gauss(0, 0.1)))
+        shapes.append(rug.moved((x, y, 0.0), about_z(rng.gauss(0, 0.1))))
     return shapes
 
 
