@@ -17,7 +17,7 @@ from qgs.drawing.images import rgb_picture
 from qgs.extensions import INSTALL_ALL
 from qgs.files import replacing_entries, write_text
 from qgs.geometry.harmonics import seen_colors
-from qgs.geometry.transforms import moved, to_camera, to_pixels
+from qgs.geometry.transforms import depths_in_view, moved
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.reconstruction.scene_formats import load_ply, save_ply, save_splat
@@ -191,14 +191,11 @@ def plain(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
     total = torch.zeros_like(gaussians.colors)
     mean_of_all = torch.zeros_like(total)
     count = torch.zeros_like(gaussians.opacities)[..., None]
-    size = gaussians.means.new_tensor(cameras.size[::-1])
     # all views at once would take gigabytes
     for view in range(views):
         camera = cameras[:, [view]]
-        points = to_camera(gaussians.means, camera)
-        pixels = to_pixels(points, camera.intrinsics)
-        inside = (points[..., 2] > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
-        seen = inside[:, 0, :, None].float()
+        depths = depths_in_view(gaussians.means[0], camera)
+        seen = depths.isfinite()[..., None].float()
         colors = seen_colors(gaussians, camera)[:, 0]
         total += seen * colors
         count += seen
