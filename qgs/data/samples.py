@@ -241,12 +241,23 @@ def mirrored_views(views: Views) -> Views:
     return replace(views, images=images, cameras=flipped, masks=masks, depths=depths)
 
 
-def halved(views: Views) -> Views:
-    """Return views (1, V) without depth maps, with images of half the height and width."""
+def shrunk(views: Views, part: int) -> Views:
+    """Return views (1, V) without depth maps, with height and width divided by `part`.
+
+    Pixels are averaged over areas.
+    """
+    if part == 1:
+        return views
     height, width = views.cameras.size
-    intrinsics = views.cameras.intrinsics / 2
-    cameras = views.cameras.replace(intrinsics=intrinsics, size=(height // 2, width // 2))
-    images, masks = map_tensors(lambda x: F.avg_pool2d(x[0], 2)[None], (views.images, views.masks))
+    size = (height // part, width // part)
+
+    def smaller(images: Tensor) -> Tensor:
+        return F.interpolate(images[0], size=size, mode="area")[None]
+
+    images, masks = map_tensors(smaller, (views.images, views.masks))
+    factors = [size[1] / width, size[0] / height]
+    intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
+    cameras = views.cameras.replace(intrinsics=intrinsics, size=size)
     return replace(views, images=images, cameras=cameras, masks=masks)
 
 

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.inputs import seen_depth
-from qgs.data.samples import Sample, halved, make_sample
+from qgs.data.samples import Sample, make_sample, shrunk
 from qgs.domain import Domain
 from qgs.geometry.poses import scaled
 from qgs.metrics.baselines import pose_distance
@@ -327,4 +327,4 @@ def half(sample: Sample, model: QueryGaussianModel) -> Sample | None:
     size = sample.inputs.cameras.size
     if multiple is None or min(size) <= LEAST or any(side % (2 * multiple) for side in size):
         return None
-    return replace(sample, inputs=halved(sample.inputs), targets=halved(sample.targets))
+    return replace(sample, inputs=shrunk(sample.inputs, 2), targets=shrunk(sample.targets, 2))

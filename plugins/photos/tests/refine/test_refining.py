@@ -11,7 +11,7 @@ import pytest
 import torch
 from qgs_photos.refine import refine
 from qgs_photos.refine.growth import FreeGaussians
-from qgs_photos.refine.refining import Extras, resized
+from qgs_photos.refine.refining import Extras
 from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
 from qgs_photos.refine.surroundings import edge_color, surrounded
@@ -21,6 +21,7 @@ from textured_room import INTRINSICS, photos_of, walk
 from walk import arc, cloud, pinhole
 
 from qgs.containers import map_tensors
+from qgs.data.samples import shrunk
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
@@ -127,7 +128,7 @@ def test_a_coarser_level_shows_the_same_scene():
     fine = photos(3, 64, 20)
     masks = fine.images[:, :, :1]
     given = replace(fine, masks=masks, times=torch.rand(1, 3), target_time=torch.rand(1, 1))
-    coarse = resized(given, 2)
+    coarse = shrunk(given, 2)
     assert coarse.images.shape[-2:] == (32, 32)
     assert_equal(coarse.masks, coarse.images[:, :, :1])
     assert coarse.times is given.times

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 
 import torch
-import torch.nn.functional as F
 from rich.console import Console
 from torch import Tensor, nn
 
 from qgs.containers import concatenated, map_tensors, named_tensors
+from qgs.data.samples import shrunk
 from qgs.losses.photometric import mean_squared_error
 from qgs.renderers import AutoRenderer
 from qgs.similarity import mean_ssim
@@ -176,7 +176,7 @@ class _Run:
         self.generator = torch.Generator().manual_seed(0)
         side = min(views.cameras.size)
         self.levels = [
-            (resized(views, part), end)
+            (shrunk(views, part), end)
             for part, end in _LEVELS
             if part == 1 or side // part >= _LEAST_SIDE
         ]
@@ -288,23 +288,6 @@ def distance(gaussians: Gaussians, views: Views) -> float:
     """Return the median distance of Gaussians (1, G) from the nearest camera, at least 1e-6."""
     distances = torch.cdist(gaussians.means[0], views.cameras.c2w[0, :, :3, 3])
     return float(distances.amin(1).median().clamp_min(1e-6))
-
-
-def resized(views: Views, part: int) -> Views:
-    """Return the views with height and width divided by `part`; pixels are averaged over areas."""
-    if part == 1:
-        return views
-    height, width = views.cameras.size
-    size = (height // part, width // part)
-
-    def smaller(images: Tensor) -> Tensor:
-        return F.interpolate(images[0], size=size, mode="area")[None]
-
-    images, masks = map_tensors(smaller, (views.images, views.masks))
-    factors = [size[1] / width, size[0] / height]
-    intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
-    cameras = views.cameras.replace(intrinsics=intrinsics, size=size)
-    return replace(views, images=images, cameras=cameras, masks=masks)
 
 
 def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: int) -> None:
