@@ -1,5 +1,6 @@
 """ViT encoders over the patches of all views, such as `qgs/multiview_vit` (TokenGS release)."""
 
+from abc import abstractmethod
 from collections.abc import Mapping
 
 from einops import rearrange, repeat
@@ -53,9 +54,12 @@ class EncoderBlock(nn.Module):
 class PatchViT(PatchEncoder):
     """Base class of ViTs over the patches of all views.
 
-    A token is the sum of an RGB and a Plücker embedding. Subclasses run the blocks and build the
-    image memory.
+    A token is the sum of an RGB and a Plücker embedding. Subclasses run the blocks, and make the
+    layers that project the resulting features to keys and values.
     """
+
+    kv_proj: nn.Linear
+    k_norm: nn.LayerNorm
 
     class Config(NormConfig, PatchEncoder.Config):
         depth: int = Field(default=3, ge=0, le=256)
@@ -99,6 +103,19 @@ class PatchViT(PatchEncoder):
         x_XPD = x_XPD + self.ray_embedding(plucker.flatten(0, 1))
         return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=len(views.images))
 
+    @abstractmethod
+    def features(self, views: Views, plucker: Tensor) -> Tensor:
+        """Run the blocks on views (B, V) and their Plücker maps; return features (B, M, C)."""
+
+    def forward(self, views: Views) -> ImageMemory:
+        grid = self.grid(views)
+        plucker_BV6HW = plucker_rays(views.cameras)
+        x_BMC = self.features(views, plucker_BV6HW)
+        # Here and not in the decoder, whose layers all read the same keys and values.
+        keys, values = keys_and_values(x_BMC, self.kv_proj, self.k_norm)
+        rays = patch_rays(plucker_BV6HW, self.config.patch_size)
+        return ImageMemory(features=x_BMC, keys=keys, values=values, patch_rays=rays, grid=grid)
+
 
 class MultiViewViT(PatchViT):
     """ViT over the patches of all views, with one projection to keys and values at the end.
@@ -114,17 +131,11 @@ class MultiViewViT(PatchViT):
         self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
         self.k_norm = nn.LayerNorm(dims.width // dims.heads, config.norm_eps)
 
-    def forward(self, views: Views) -> ImageMemory:
-        grid = self.grid(views)
-        plucker_BV6HW = plucker_rays(views.cameras)
-        x_BMD = self.embed(views, plucker_BV6HW)
+    def features(self, views: Views, plucker: Tensor) -> Tensor:
+        x_BMD = self.embed(views, plucker)
         for block in self.blocks:
             x_BMD = block(x_BMD)
-        x_BMD = self.norm(x_BMD)
-        # Here and not in the decoder, whose layers all read the same keys and values.
-        keys, values = keys_and_values(x_BMD, self.kv_proj, self.k_norm)
-        rays = patch_rays(plucker_BV6HW, self.config.patch_size)
-        return ImageMemory(features=x_BMD, keys=keys, values=values, patch_rays=rays, grid=grid)
+        return self.norm(x_BMD)
 
 
 def keys_and_values(

@@ -25,7 +25,7 @@ from qgs.contracts import (
     RecipeContext,
     memory_fields,
 )
-from qgs.geometry.rays import patch_rays, plucker_rays
+from qgs.geometry.rays import plucker_rays
 from qgs.precision import full_precision
 from qgs.tokengs.blocks import CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
 from qgs.tokengs.encoder import PatchViT, keys_and_values
@@ -170,18 +170,6 @@ class MultiscaleViT(MultiscaleReadout):
         scales = len(config.blocks)
         wide = FieldSpec(("D" if scales == 1 else f"{scales}*D",))
         return {**MEMORY_FIELDS, "memory.features": wide}
-
-    def forward(self, views: Views) -> ImageMemory:
-        """Return the memory of the photos, with features (B, M, S D) of S blocks.
-
-        Raises ValueError if the patch size does not divide the sides of the images.
-        """
-        grid = self.grid(views)
-        plucker_BV6HW = plucker_rays(views.cameras)
-        x_BMC = self.features(views, plucker_BV6HW)
-        keys, values = keys_and_values(x_BMC, self.kv_proj, self.k_norm)
-        rays = patch_rays(plucker_BV6HW, self.config.patch_size)
-        return ImageMemory(features=x_BMC, keys=keys, values=values, patch_rays=rays, grid=grid)
 
 
 class LatentBlock(nn.Module):
