@@ -7,10 +7,18 @@ import torch
 import torch.nn.functional as F
 import yaml
 from odd_views import odd_views
-from qgs_anchors.ellipsoid.anchors import EllipsoidQueries, from_locus
-from qgs_anchors.ellipsoid.cross_attention import EllipsoidCrossAttention
-from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation, turned
-from qgs_anchors.ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
+from qgs_anchors.ellipsoid.components import (
+    RAW_RADII,
+    ROTATION,
+    AxisScaledCenters,
+    EllipsoidCrossAttention,
+    EllipsoidHead,
+    EllipsoidQueries,
+    anchor_rotation,
+    from_locus,
+    radii_along,
+    turned,
+)
 from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS

@@ -6,7 +6,7 @@ Anchors have one radius, as LocusGS's, or three.
 import pytest
 import torch
 import torch.nn.functional as F
-from qgs_anchors.ellipsoid.fields import anchor_rotation
+from qgs_anchors.ellipsoid.components import anchor_rotation
 from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_locus import ray_bias as locus
 from tables import assert_equal

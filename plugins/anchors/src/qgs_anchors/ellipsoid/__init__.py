@@ -1,10 +1,13 @@
 """Ellipsoidal anchors for qgs: LocusGS with a rotation and three radii instead of one radius."""
 
 from qgs.contracts import Plugin
-from qgs_anchors.ellipsoid.anchors import EllipsoidQueries
-from qgs_anchors.ellipsoid.cross_attention import EllipsoidCrossAttention
-from qgs_anchors.ellipsoid.head import AxisScaledCenters, EllipsoidHead
-from qgs_anchors.ellipsoid.refinement import EllipsoidRefinement
+from qgs_anchors.ellipsoid.components import (
+    AxisScaledCenters,
+    EllipsoidCrossAttention,
+    EllipsoidHead,
+    EllipsoidQueries,
+    EllipsoidRefinement,
+)
 
 plugin = Plugin(
     name="ellipsoid",
