@@ -14,8 +14,7 @@ from qgs_zoo.mvsplat.adapter import (
     coefficients,
     turn_of_harmonics,
 )
-from qgs_zoo.mvsplat.head import mapped_opacity
-from qgs_zoo.mvsplat.pixels import PIXEL, degree_of, ray_directions
+from qgs_zoo.mvsplat.pixels import PIXEL, degree_of, mapped_opacity, ray_directions
 from qgs_zoo.mvsplat.sweep import feature_lenses, warp_grid, warped
 from qgs_zoo.mvsplat.windows import out_of_windows
 from torch import Tensor, nn
