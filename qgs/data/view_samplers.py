@@ -12,8 +12,16 @@ import numpy as np
 import torch
 from pydantic import NonNegativeInt, PositiveInt
 
-from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig, Window
-from qgs.contracts.component import ComponentConfig
+from qgs.contracts import (
+    ComponentConfig,
+    Frames,
+    Problem,
+    RecipeContext,
+    Scene,
+    ViewSampler,
+    ViewsConfig,
+    Window,
+)
 from qgs.contracts.schedule import END
 from qgs.machine import refuse_more_than_memory
 from qgs.wording import warn_once

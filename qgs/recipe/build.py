@@ -15,12 +15,12 @@ from qgs.contracts import (
     SUBLAYER_SLOTS,
     Component,
     LayerParts,
+    MissingExtraError,
     ModelComponent,
     Optimizer,
     Refinement,
     SceneSource,
 )
-from qgs.contracts.component import MissingExtraError
 from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.decode import Chosen, report_failure

@@ -12,13 +12,16 @@ from typing import Any
 from qgs.contracts import (
     LAYER_SLOTS,
     SUBLAYER_SLOTS,
+    Component,
+    ComponentConfig,
+    Fields,
+    FieldSpec,
     Problem,
     RecipeContext,
     Refinement,
     SceneSourceConfig,
     Supervision,
 )
-from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec
 from qgs.recipe.decode import Chosen, Parts, report_failure
 from qgs.recipe.errors import Problems
 from qgs.recipe.places import DECODER, layer_place

@@ -12,8 +12,8 @@ import qgs.metrics
 import qgs.renderers
 import qgs.tokengs
 from qgs import extensions
-from qgs.contracts import Component, ComponentConfig, OptionError
-from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
+from qgs.contracts import CONTRACT_VERSION, Component, ComponentConfig, OptionError, Plugin
+from qgs.contracts.plugin import ENTRY_POINT_GROUP
 from qgs.recipe.errors import Problems
 from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import MapNode, items_of

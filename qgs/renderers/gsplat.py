@@ -8,8 +8,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import (
+    ComponentConfig,
+    MissingExtraError,
+    Problem,
+    RecipeContext,
+    Renderer,
+    RendererConfig,
+)
 from qgs.contracts.renderer import channels_of, prepared
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering

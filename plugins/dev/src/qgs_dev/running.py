@@ -9,8 +9,7 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
-from qgs.contracts import Component, ComponentConfig, ModelComponent, ModelDims
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import Component, ComponentConfig, MissingExtraError, ModelComponent, ModelDims
 from qgs.recipe.registry import InstalledPlugin, PluginError, default_config, load_plugin
 from qgs.recipe.slots import SLOTS
 from qgs.wording import did_you_mean

@@ -16,8 +16,7 @@ from qgs.contracts import (
     Fields,
     Plugin,
 )
-from qgs.recipe import RecipeError
-from qgs.recipe.recipe import Recipe, resolve
+from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.recipe.slots import SECTIONS
 from qgs.recipe.yaml_text import inline
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from qgs.contracts import (
     Ascending,
+    ComponentConfig,
     Frames,
     Problem,
     RecipeContext,
@@ -17,7 +18,6 @@ from qgs.contracts import (
     ViewsConfig,
     Window,
 )
-from qgs.contracts.component import ComponentConfig
 from qgs.contracts.schedule import END
 from qgs.data.inputs import Frusta, scene_depth, trained_ratios
 from qgs.data.view_samplers import (

@@ -17,9 +17,7 @@ from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, ModelDims
 from qgs.contracts.settings import Heads
-from qgs.tokengs import NORM_EPS
-from qgs.tokengs.blocks import LayerScale, Mlp
-from qgs.tokengs.encoder import MultiViewViT
+from qgs.tokengs import NORM_EPS, LayerScale, Mlp, MultiViewViT
 from qgs_zoo.parts import load_weights, self_attention
 
 PATCH = 14
