@@ -13,8 +13,7 @@ import pytest
 import yaml
 from published.files import read_golden
 from published.models import recipe_of
-from qgs_research.studies.plan import composed, planned
-from qgs_research.studies.runs import differences
+from qgs_research.studies.plan import composed, differences, planned
 from qgs_research.studies.study import read_study
 from size import ROOT
 from tables import read_json

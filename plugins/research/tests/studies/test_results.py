@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from qgs_research.studies.plan import Plan, run_of
 from qgs_research.studies.results import Results, answer, notes, record, study_summary, write_files
-from qgs_research.studies.runs import Plan, run_of
 from qgs_research.studies.scores import interval
 from qgs_research.studies.study import read_study
 from tables import read_json, write_json

@@ -12,9 +12,8 @@ from commands import done
 from fuzzing import kill
 from photo_formats import put
 from qgs_research.studies import running
-from qgs_research.studies.plan import planned
+from qgs_research.studies.plan import planned, run_of
 from qgs_research.studies.results import Results
-from qgs_research.studies.runs import run_of
 from qgs_research.studies.study import read_study
 from tables import must_refuse, text_console
 

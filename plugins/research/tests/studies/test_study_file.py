@@ -8,8 +8,7 @@ import textwrap
 import pytest
 from commands import done
 from fuzzing.cases import RECIPES
-from qgs_research.studies.plan import composed, planned
-from qgs_research.studies.runs import recipe_file, run_of, write_plan
+from qgs_research.studies.plan import composed, planned, recipe_file, run_of, write_plan
 from qgs_research.studies.study import parsed, read_study
 from tables import must_refuse, read_json, write_json
 

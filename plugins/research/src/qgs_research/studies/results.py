@@ -10,7 +10,7 @@ from scipy.stats import spearmanr
 from qgs.evaluate.results import as_json
 from qgs.files import read_records, write_text
 from qgs.wording import listed
-from qgs_research.studies.runs import Plan
+from qgs_research.studies.plan import Plan
 from qgs_research.studies.scores import CONFIDENCE, Estimate, Scores, interval_shown, shown
 from qgs_research.studies.stored import read_results
 from qgs_research.studies.study import MAIN, Hypothesis, parsed

@@ -24,9 +24,8 @@ from qgs.terminal import print_lines
 from qgs.train.distributed import stop_requests
 from qgs.train.training import train
 from qgs.wording import counted
-from qgs_research.studies.plan import planned
+from qgs_research.studies.plan import Plan, Run, planned, recipe_file, run_of, write_plan
 from qgs_research.studies.results import Results, study_summary, write_files
-from qgs_research.studies.runs import Plan, Run, recipe_file, run_of, write_plan
 from qgs_research.studies.study import MAIN, read_study
 
 WORK = (sys.executable, "-m", "qgs_research.studies.running")
