@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from qgs_photos.datatools.candidates import sources
 from qgs_photos.datatools.check import Options, check
 from qgs_photos.datatools.packing import chosen_splits, pack
-from qgs_photos.datatools.sources import sources
 from upath import UPath
 
 from fuzzing.cases import JUNK, FaultError, Use, other_bytes, other_leaf, refused

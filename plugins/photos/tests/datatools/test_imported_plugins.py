@@ -4,7 +4,7 @@ import re
 import sys
 
 from commands import typed
-from qgs_photos.datatools import sources
+from qgs_photos.datatools.candidates import sources
 
 ALL = {
     "list": "list",
@@ -36,11 +36,11 @@ def test_commands_import_the_plugins_that_are_asked_for(install, here):
     (here / "photos/transforms.json").write_text("{}")
     imported = []
     for words in (*ALL, *SOME):
-        sources.sources.cache_clear()
+        sources.cache_clear()
         typed(words)
         if sys.modules.pop("_test_marked", None):
             imported.append(words)
-    sources.sources.cache_clear()
+    sources.cache_clear()
     assert imported == [*ALL]
     for command in ALL.values():
         words = re.findall(r"\w+", typed(f"{command} --help").output)

@@ -8,18 +8,18 @@ import pytest
 import tape_source
 from commands import typed
 from qgs_photos.datasets.chunks import ChunksSource
-from qgs_photos.datatools import sources
+from qgs_photos.datatools.candidates import sources
 from tape_source import Tape
 
 
 @pytest.fixture
 def tapes(tmp_path, install):
     install(*tape_source.INSTALLED)
-    sources.sources.cache_clear()
+    sources.cache_clear()
     for name in "ab":
         tape_source.write_tape(tmp_path / f"tapes/{name}.tape")
     yield tmp_path / "tapes"
-    sources.sources.cache_clear()
+    sources.cache_clear()
 
 
 def test_check(tapes):

@@ -148,8 +148,8 @@ def pack(
     from qgs.paths import opened_path
     from qgs_photos.datasets.dl3dv import read_scene_list
     from qgs_photos.datatools import packing
+    from qgs_photos.datatools.candidates import opened_source
     from qgs_photos.datatools.entries import Encoding
-    from qgs_photos.datatools.sources import opened_source
 
     console = Console()
     if test_scenes is not None and test_every is not None:

@@ -13,14 +13,19 @@ from qgs.data.photos import read_listing, readers
 from qgs.data.recognition import recognised
 from qgs.geometry.poses import look_at_depth
 from qgs.wording import listed
-from qgs_photos.datatools.chunks import chunk_scenes
+from qgs_photos.datatools.candidates import (
+    OF_FILES,
+    chunk_scenes,
+    dl3dv_scenes,
+    photo_folders,
+    source_scenes,
+    sources,
+)
 from qgs_photos.datatools.faults import photo_findings, pose_findings, sharing_findings
 from qgs_photos.datatools.findings import CheckReport, Finding, SceneReport, errors_of, merged
-from qgs_photos.datatools.folders import dl3dv_scenes, photo_folders
 from qgs_photos.datatools.geometry import TOO_FEW, geometry_findings, judge_scene
 from qgs_photos.datatools.indices import found_indices, index_findings
 from qgs_photos.datatools.photos import Candidate, DecodedScene, Photo, decode, error_text
-from qgs_photos.datatools.sources import OF_FILES, source_scenes, sources
 
 PHOTOS = 400
 """Number of photos to match in a data set, divided among the scenes whose poses are checked.
