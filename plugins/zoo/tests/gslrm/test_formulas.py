@@ -15,7 +15,6 @@ from qgs_zoo.gslrm.pixels import (
     patch_rays_at,
 )
 from qgs_zoo.parts import pixel_rays
-from refusals import refused
 from small_parts import attended, made
 from torch.testing import assert_close
 
@@ -67,11 +66,6 @@ def test_means_lie_on_the_rays_of_their_pixels():
             assert_close(placed, origins + along * directions)
     state[PATCH].sum().backward()
     assert c2w.grad[..., :3, :].any(-1).all()
-
-
-def test_the_end_is_beyond_the_beginning():
-    override = "model.centers={type: gslrm/along_rays, near: 4, far: 4}"
-    assert refused("tiny/gslrm.yaml", [override]).option == "model.centers.far"
 
 
 def test_the_transformer_sees_nine_channels_of_every_pixel():
