@@ -62,13 +62,6 @@ def test_limits_of_losses_are_published_by_default_and_matter():
 
 
 def test_the_recipes_have_the_limits_of_their_releases():
-    for recipe, *published in (
-        ("tokengs/dl3dv.yaml", None, 1e-12, None, None),
-        ("locus/dl3dv.yaml", 10.0, 1e-4, 100.0, 1000.0),
-    ):
-        model = resolve(recipe).tree["model"]
-        head = model["head"]
-        centers = model["centers"]
-        found = [head["scale_input_limit"], head["quat_eps"]]
-        found += [centers["input_limit"], centers["output_limit"]]
-        assert found == published, recipe
+    for recipe, limits in TABLE["recipes"].items():
+        options = flat(resolve(recipe).tree)
+        assert {path: options[path] for path in limits} == limits, recipe
