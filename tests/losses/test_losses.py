@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 import torch
-import yaml
 from losses.judging import CAMERAS, GOLDEN, PREDICTED, TRUTH, judged
 from tables import must_refuse
 from torch.testing import assert_close
 from training_runs import run, tiny
 from walk import pinhole
 
-from qgs.contracts import ModelDims, RecipeContext, ViewsConfig
+from qgs.contracts import ViewsConfig
 from qgs.data.samples import make_sample, stack_views
 from qgs.losses import Mask, Photometric, Visibility, view_visibility
 from qgs.losses.depth import DepthSurface
@@ -65,22 +64,6 @@ def test_points_behind_a_camera_are_invisible_on_demand():
     assert (published[[0, 5]] == 0).all()
     assert (corrected[[0, 5]] == 1).all()
     assert_close(corrected[in_front], published[in_front])
-
-
-OPTIONS = """
-- [{near: 0.1}, [near]]
-- [{infinite_pixel: 10.0}, [infinite_pixel]]
-- [{behind_camera: invisible, clamp: null}, [clamp]]
-- [{behind_camera: invisible, near: 0.1}, []]
-"""
-"""Options of visibility, and those that are refused."""
-
-
-def test_options_of_visibility_that_cannot_work_are_refused():
-    context = RecipeContext(ModelDims(width=8, heads=1, depth=1))
-    for options, expected in yaml.safe_load(OPTIONS):
-        problems = Visibility.problems(Visibility.Config(**options), context)
-        assert [problem.option for problem in problems] == expected
 
 
 ROOMS = tiny("tokengs", "losses.depth={type: qgs/depth_surface, weight: 1.0}")

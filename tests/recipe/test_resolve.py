@@ -94,11 +94,3 @@ def test_mappings_and_files_that_hold_no_recipe(tmp_path):
     for path in (tmp_path, binary):
         assert refused(path).file == str(path)
     must_refuse("this recipe has no data", resolve(SMALL).build_data)
-
-
-def test_tabs_and_what_is_nested_deeper_than_pythons_stack(write):
-    tab = refused(write("recipe: 1\nmodel:\n\twidth: 64\n"))
-    deep = refused(write(f"recipe: 1\nseed: {'[' * 700}"))
-    assert (tab.line, deep.line) == (3, 1)
-    assert "tabs" in tab.fix
-    assert "recursion" in deep.reason

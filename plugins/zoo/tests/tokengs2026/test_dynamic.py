@@ -5,7 +5,6 @@ import torch
 from odd_views import odd_views
 from qgs_zoo.tokengs2026.dynamic import MOVES, DynamicQueries
 from qgs_zoo.tokengs2026.multiscale import MultiscaleViT, TimeEmbedding, time_features
-from refusals import problems_of
 from small_parts import made
 from tables import must_refuse
 from torch.testing import assert_close
@@ -77,16 +76,6 @@ def test_views_without_times_are_refused(model):
         r"reads the times of photos, .*time_channels to 0", model, views(target=torch.zeros(2, 1))
     )
     must_refuse(r"requested time: .* target_time \(B, 1\)", model, views(torch.zeros(2, 2)))
-
-
-def test_what_reads_times_is_refused_beside_data_that_tell_none():
-    assert small("data={type: qgs/photos, path: x}")
-    found = problems_of(PUBLISHED, [*SMALL, "data={type: rooms/procedural}"])
-    reason = "the data of this recipe have no times: `time_channels: {}` reads them"
-    assert {problem.option: problem.reason for problem in found} == {
-        "model.encoder.time_channels": reason.format(4),
-        "model.queries.time_channels": reason.format(2),
-    }
 
 
 def test_the_objective_judges_dynamic_gaussians_again(model):
