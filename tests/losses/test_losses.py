@@ -11,7 +11,7 @@ from walk import pinhole
 
 from qgs.contracts import ViewsConfig
 from qgs.data.samples import make_sample, stack_views
-from qgs.losses import Mask, Photometric, Visibility, view_visibility
+from qgs.losses import Mask, Photometric, view_visibility
 from qgs.losses.depth import DepthSurface
 from qgs.metrics.images import ssim
 from qgs.types import Cameras, Views
