@@ -2,7 +2,6 @@
 
 import torch
 import torch.nn.functional as F
-import yaml
 from qgs_locus.anchors import AnchoredQueries, FrustumCenters, NormalCenters
 from qgs_locus.decoding import RadiusScaledCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, raw_radius_of, support_radius
@@ -10,7 +9,6 @@ from small_parts import made
 from torch.testing import assert_close
 
 from qgs import QueryState
-from qgs.recipe import resolve
 
 
 def test_a_radius_is_read_in_two_ways_and_made_raw():
@@ -45,20 +43,3 @@ def test_linear_offsets_count_in_radii():
     means = made(RadiusScaledCenters, offset="linear")(offsets, state)
     radius = F.softplus(state[RAW_RADIUS])[:, :, None]
     assert_close(means, state[CENTER][:, :, None] + radius * offsets)
-
-
-RECIPE = yaml.safe_load("""
-recipe: 1
-plugins: [locus]
-model: {queries: {type: locus/anchored}}
-""")
-
-
-def test_idle_options_at_their_defaults_compose_again():
-    idle = (
-        "queries.radius=false",
-        "centers={type: locus/anchor_offset, offset: linear}",
-        "decoder.cross_attention={type: locus/ray_biased, bandwidth: fixed}",
-    )
-    recipe = resolve(RECIPE, [f"model.{override}" for override in idle])
-    assert resolve(recipe.tree).tree == recipe.tree
