@@ -8,13 +8,11 @@ from qgs_dev import CHECKS, cases_of, run_check
 from qgs_dev.inputs import inputs_of
 from qgs_research.published.mvsplat import DEPTHSPLAT, MVSPLAT
 from qgs_research.published.weight_layout import LayoutError
-from qgs_zoo.mvsplat import DecayedSupervision, DepthError, DepthSplatEncoder, Exchange
-from small_parts import made
+from qgs_zoo.mvsplat import DecayedSupervision, DepthError, DepthSplatEncoder
 
-from qgs.contracts import LayerParts, MetricInput, ModelDims
+from qgs.contracts import MetricInput
 from qgs.recipe import resolve
 from qgs.recipe.registry import load_plugin
-from qgs.types import QueryState
 
 PUBLISHED = {
     "mvsplat/re10k": """
@@ -143,14 +141,6 @@ def test_the_first_sweep_learns_from_its_own_depth_alone():
     for channel, learns in ((-1, [True, False]), (0, [False, True])):
         found = torch.autograd.grad(numbers[..., channel].sum(), heads, retain_graph=True)
         assert [bool(x.any()) for x in found] == learns
-
-
-def test_layers_exchange_the_depths():
-    features = torch.arange(8.0).view(1, 2, 4)
-    layer = made(Exchange, LayerParts(ModelDims(4, 1, 2), {}, 1.0))
-    once = layer(QueryState(features), None)[0]
-    assert once.features[0].tolist() == [[3, 1, 2, 0], [7, 5, 6, 4]]
-    assert torch.equal(layer(once, None)[0].features, features)
 
 
 def test_later_depths_weigh_more():
