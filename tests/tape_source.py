@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from walk import along_x
+from walk import along_x, pinhole
 
 from qgs.contracts import Plugin, Scene, SceneSource
-from qgs.types import Cameras
 
 
 class Tape(Scene):
@@ -23,8 +22,8 @@ class Tape(Scene):
     @property
     def cameras(self):
         height, width = self._images.shape[1:3]
-        intrinsics = torch.tensor([width, width, width / 2, height / 2]).expand(len(self._c2w), 4)
-        return Cameras(torch.from_numpy(self._c2w), intrinsics.double(), (height, width))
+        lens = width, width, width / 2, height / 2
+        return pinhole(torch.from_numpy(self._c2w), lens, (height, width))
 
     def images(self, frames):
         return torch.from_numpy(self._images[list(frames)]).permute(0, 3, 1, 2).float() / 255

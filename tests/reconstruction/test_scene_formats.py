@@ -13,22 +13,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyData, PlyElement
 from tables import must_not_find, must_refuse
 from torch.testing import assert_close
+from walk import cloud
 
 import qgs
-from qgs.containers import named_tensors
+from qgs.containers import concatenated, named_tensors
 from qgs.extensions import ExtensionError
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.reconstruction.scene_formats import PROPERTIES, load_ply, save_gaussians, save_ply
-from qgs.types import Gaussians
 
 
-def random_gaussians(*batch, harmonics=0):
-    def draw(*trailing):
-        return torch.rand(*batch, *trailing)
-
-    quats = torch.nn.functional.normalize(draw(4) - 0.5, dim=-1)
-    parts = (draw(3) * 10 - 5, draw(3) * 0.5 + 1e-3, quats, draw() * 0.98 + 0.01, draw(3))
-    return Gaussians(*parts, sh=torch.randn(*batch, harmonics, 3) if harmonics else None)
+def harmonic(number, harmonics):
+    return replace(cloud(number), sh=torch.randn(1, number, harmonics, 3))
 
 
 def saved(path, gaussians):
@@ -52,7 +47,7 @@ def test_the_file_is_that_of_the_3dgs_release(tmp_path):
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{index}" for index in range(45)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    given = random_gaussians(50, harmonics=8)
+    given = harmonic(50, 8)[0]
     for gaussians in (given, replace(given, sh=None)):
         rest = torch.zeros(50, 3, 15)
         if gaussians.sh is not None:
@@ -75,8 +70,7 @@ def test_the_file_is_that_of_the_3dgs_release(tmp_path):
 
 def test_the_round_trip(tmp_path):
     """Of opacities and scales too whose logits and logarithms are infinite."""
-    for harmonics in (0, 3, 8, 15):
-        given = random_gaussians(1, 200, harmonics=harmonics)
+    for given in (cloud(200), *(harmonic(200, count) for count in (3, 8, 15))):
         given.opacities[0, :2] = torch.tensor([0.0, 1.0])
         given.scales[0, 0] = 0
         path = saved(tmp_path / "scene.ply", given)
@@ -86,14 +80,14 @@ def test_the_round_trip(tmp_path):
 
 
 def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path):
-    broken = random_gaussians(4)
-    harmonic = random_gaussians(4, harmonics=3)
-    broken.means[2, 0] = torch.nan
-    harmonic.sh[1:3, 2, 0] = torch.inf
+    broken = cloud(4)
+    more = harmonic(4, 3)
+    broken.means[0, 2, 0] = torch.nan
+    more.sh[0, 1:3, 2, 0] = torch.inf
     for gaussians, words in (
-        (random_gaussians(2, 5), "one scene"),
+        (concatenated([cloud(5)] * 2, 0), "one scene"),
         (broken, "1 of 4"),
-        (harmonic, "2 of 4"),
+        (more, "2 of 4"),
     ):
         must_refuse(words, save_ply, gaussians, tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
@@ -104,7 +98,7 @@ def test_files_of_others_are_understood(tmp_path, caplog):
 
     Numbers that are not finite, filters of Mip-Splatting, coordinates of maps.
     """
-    given = random_gaussians(9)
+    given = cloud(9)[0]
     path = saved(tmp_path / "a.ply", given)
     few = [name for name in PROPERTIES if not name.startswith(("f_rest", "n"))]
     vertices = np.zeros(9, [(name, ">f8") for name in ("filter_3D", *reversed(few))])
@@ -155,7 +149,7 @@ def test_packed_files_of_other_programs_are_read():
 
 
 def test_files_of_fewer_degrees_are_read(tmp_path):
-    given = random_gaussians(1, 4, harmonics=3)
+    given = harmonic(4, 3)
     vertices = vertices_of(saved(tmp_path / "scene.ply", given))
     kept = [name for name in PROPERTIES if not name.startswith("f_rest_")]
 
@@ -177,7 +171,7 @@ def test_files_of_fewer_degrees_are_read(tmp_path):
 def test_other_files_are_refused_by_name(tmp_path):
     points = np.zeros(3, [(name, "<f4") for name in "xyz"])
     chunks = np.zeros(1, [("min_x", "<f4")])
-    some = random_gaussians(3)
+    some = cloud(3)
     whole = saved(tmp_path / "whole.ply", some).read_bytes()
     still = saved(tmp_path / "still.ply", replace(some, quats=some.quats * 0)).read_bytes()
     faces = b"element face 100000000\nproperty list uint float v\nend_header"
@@ -189,7 +183,7 @@ def test_other_files_are_refused_by_name(tmp_path):
         "long.ply": whole.replace(b"element", b"comment x\n" * 10_000 + b"element"),
         "faces.ply": whole.replace(b"end_header", faces),
         "without rotation.ply": still,
-        "without any.ply": saved(tmp_path / "none.ply", random_gaussians(0)).read_bytes(),
+        "without any.ply": saved(tmp_path / "none.ply", cloud(0)).read_bytes(),
         "4.spz": b"NGSP\4\0\0\0\5\0\0\0",
     }.items():
         path = tmp_path / name
@@ -201,7 +195,7 @@ def test_other_files_are_refused_by_name(tmp_path):
 
 
 def test_convert_keeps_the_most_opaque(tmp_path):
-    given = random_gaussians(1, 50, harmonics=8)
+    given = harmonic(50, 8)
     qgs.save_ply(given, tmp_path / "all.ply")
     told = done("convert", tmp_path / "all.ply", tmp_path / "few.ply", "--count", 7).output
     assert "7 of 50 Gaussians" in told
@@ -215,7 +209,7 @@ def test_convert_keeps_the_most_opaque(tmp_path):
 
 
 def test_other_suffixes_and_files_that_exist_are_refused(tmp_path):
-    before = saved(tmp_path / "a.ply", random_gaussians(2)).read_bytes()
+    before = saved(tmp_path / "a.ply", cloud(2)).read_bytes()
     for name, error, word in (
         ("a.spz", ValueError, r"\.splat"),
         ("a.ply", FileExistsError, r"a\.ply"),
@@ -230,9 +224,9 @@ def test_an_installed_distribution_adds_a_format(install, tmp_path):
             path.write_text(str(gaussians.count))
         """
     install("qgs-xyz", "xyz", source, group="qgs.scene_writers")
-    save_gaussians(random_gaussians(5), tmp_path / "a.XYZ")
+    save_gaussians(cloud(5), tmp_path / "a.XYZ")
     assert (tmp_path / "a.XYZ").read_text() == "5"
-    must_refuse(r"\.xyz", save_gaussians, random_gaussians(5), tmp_path / "a.abc")
+    must_refuse(r"\.xyz", save_gaussians, cloud(5), tmp_path / "a.abc")
 
 
 def test_a_format_that_cannot_be_imported_is_refused_before_the_work(install, tmp_path):
@@ -243,7 +237,7 @@ def test_a_format_that_cannot_be_imported_is_refused_before_the_work(install, tm
 
 
 def test_the_bytes_of_a_splat_file(tmp_path):
-    given = random_gaussians(1, 300)
+    given = cloud(300)
     qgs.save_ply(given, tmp_path / "scene.ply")
     done("convert", tmp_path / "scene.ply", tmp_path / "scene.splat")
     read = np.frombuffer((tmp_path / "scene.splat").read_bytes(), "3f4,3f4,4u1,4u1")

@@ -13,7 +13,7 @@ from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, see
 from qgs_photos.poses.paths import path_of, read_path, walk
 from tables import must_refuse, write_json
 from training_runs import tiny
-from walk import along_x, pinhole
+from walk import along_x, cloud, pinhole
 from walked import frames
 
 import qgs
@@ -22,7 +22,7 @@ from qgs.geometry.transforms import moved
 from qgs.reconstruction.reconstruct import reconstruct
 from qgs.reconstruction.scene_formats import save_ply
 from qgs.renderers import AutoRenderer, TorchRenderer
-from qgs.types import Cameras, Gaussians
+from qgs.types import Cameras
 
 SIZE = (36, 54)
 
@@ -34,11 +34,9 @@ def cameras():
 
 def wall(depth):
     """Coloured Gaussians (1, 400) on a plane z = depth."""
-    means = torch.rand(1, 400, 3) * 4 - 2
-    means[..., 2] = depth
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 400, 4)
-    opacities = torch.full((1, 400), 0.9)
-    return Gaussians(means, 0 * means + 0.15, quats, opacities, torch.rand(1, 400, 3))
+    gaussians = cloud(400)
+    flat = gaussians.means * torch.tensor([4, 4, 0]) + torch.tensor([0, 0, depth])
+    return gaussians.replace(means=flat)
 
 
 def test_paths_are_rigid_and_take_small_steps():
