@@ -28,22 +28,42 @@ class PhotoSet:
     size: tuple[int, int]
 
 
+def write_photos(folder, images, name="{}.png"):
+    """Save images (H, W, 3) under their numbers; their folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, image in enumerate(images):
+        Image.fromarray(image).save(folder / name.format(number))
+    return folder
+
+
+def photo_set(folder, images, c2w, intrinsics, name="{}.png"):
+    """Photos that are written there."""
+    write_photos(folder, images, name)
+    files = tuple(folder / name.format(number) for number in range(len(images)))
+    return PhotoSet(files, c2w, intrinsics, images[0].shape[:2])
+
+
 def synthetic(folder, count=6, size=(30, 40), seed=0, suffix="png"):
     """Photos of noise at random poses."""
     rng = np.random.default_rng(seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    files = tuple(folder / f"view_{i:03d}.{suffix}" for i in range(count))
-    for file in files:
-        Image.fromarray(rng.integers(0, 256, (*size, 3), dtype=np.uint8)).save(file)
+    images = rng.integers(0, 256, (count, *size, 3), dtype=np.uint8)
     c2w = np.tile(np.eye(4), (count, 1, 1))
     c2w[:, :3, :3] = Rotation.random(count, rng).as_matrix()
     c2w[:, :3, 3] = rng.normal(size=(count, 3)) * 5
-    return PhotoSet(files, c2w, (50.0, 52.0, 19.0, 16.0), size)
+    return photo_set(folder, images, c2w, (50.0, 52.0, 19.0, 16.0), f"view_{{:03d}}.{suffix}")
 
 
 def opened(path, size=(30, 40), source=PhotosSource, **options):
     """The data at `path`, opened by a class of sources."""
     return source(source.Config(path=str(path), image_size=size, **options))
+
+
+LENS = ("fl_x", "fl_y", "cx", "cy", "h", "w")
+
+
+def listed_lens(*numbers):
+    """What a listing says of a camera."""
+    return dict(zip(LENS, numbers, strict=True))
 
 
 def encoded(image, kind="PNG", **options):
@@ -129,13 +149,11 @@ def opengl(c2w):
 
 def write_nerfstudio(folder, photos, **top):
     names = copied(photos, folder / "images")
-    fx, fy, cx, cy = photos.intrinsics
-    height, width = photos.size
     frames = [
         {"file_path": f"images/{name}", "transform_matrix": opengl(pose)}
         for name, pose in zip(names, photos.c2w, strict=True)
     ]
-    camera = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height}
+    camera = listed_lens(*photos.intrinsics, *photos.size)
     content = {"camera_model": "OPENCV", **camera, **top, "frames": frames}
     write_json(folder / "transforms.json", content)
     return folder
@@ -212,7 +230,7 @@ def world_to_camera(c2w):
 
 def numbered_photos(path, count=10, size=(64, 48), cameras=(), **top):
     """A row of photos whose red channel is 10 times their number."""
-    given = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
+    given = listed_lens(100.0, 110.0, 31.0, 25.0, 48, 64)
     images = [Image.new("RGB", size, (10 * i, 50, 200)) for i in range(count)]
     return write_row(path, images, cameras=cameras, **given | top)
 
@@ -220,5 +238,4 @@ def numbered_photos(path, count=10, size=(64, 48), cameras=(), **top):
 def noisy_photos(folder, count=7, step=0.1):
     """Nerfstudio photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
     images = np.random.default_rng(0).integers(0, 256, (count, 20, 24, 3), dtype=np.uint8)
-    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
-    return write_row(folder, images, step, **camera)
+    return write_row(folder, images, step, **listed_lens(20, 20, 12, 10, 20, 24))

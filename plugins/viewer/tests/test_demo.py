@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 from commands import done, record_of
-from photo_formats import PhotoSet, noisy_photos, write_nerfstudio
+from photo_formats import noisy_photos, photo_set, write_nerfstudio
 from qgs_viewer import report
 from qgs_viewer.commands import new_folder
 from qgs_viewer.compare import RECIPES
@@ -22,7 +22,7 @@ from small import RECIPE, stand_in
 from tables import must_refuse
 
 import qgs
-from qgs.drawing.images import rgb_picture, write_png
+from qgs.drawing.images import rgb_picture
 from qgs.recipe import resolve
 
 
@@ -210,12 +210,11 @@ def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("room")
     recipe = resolve(qgs.load(MODEL).recipe, ["data.views_per_scene=12"])
     scene = recipe.build_data().scenes("test")[0]
-    files = [folder / f"{number:02d}.png" for number in range(12)]
-    for file, image in zip(files, scene.images(range(12)), strict=True):
-        write_png(rgb_picture(image), file)
+    images = [*map(rgb_picture, scene.images(range(12)))]
     c2w = scene.cameras.c2w.double().numpy()
     c2w[:, :3, 3] *= UNIT
-    photos = PhotoSet(files, c2w, scene.cameras.intrinsics[0].tolist(), scene.cameras.size)
+    lens = scene.cameras.intrinsics[0].tolist()
+    photos = photo_set(folder, images, c2w, lens, "{:02d}.png")
     return write_nerfstudio(folder / "photos", photos)
 
 

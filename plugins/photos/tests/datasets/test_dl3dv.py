@@ -7,7 +7,7 @@ import numpy as np
 import photo_formats
 import pytest
 import torch
-from photo_formats import assert_travels, put, row_of_frames
+from photo_formats import assert_travels, listed_lens, put, row_of_frames
 from qgs_photos.datasets.dl3dv import Dl3dvSource, read_scene_list
 from tables import assert_equal, must_not_find, must_refuse, rows
 from upath import UPath
@@ -22,7 +22,7 @@ def photo(number, size=(32, 18)):
 
 
 def listing(**top):
-    given = {"w": 128, "h": 72, "fl_x": 100.0, "fl_y": 101.0, "cx": 60.0, "cy": 37.0}
+    given = listed_lens(100.0, 101.0, 60.0, 37.0, 72, 128)
     return json.dumps(row_of_frames(4, **given | top)).encode()
 
 

@@ -5,14 +5,13 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 import torch
-from photo_formats import encoded, opengl, put
+from photo_formats import encoded, listed_lens, opengl, put
 from qgs_photos.datatools.check import Options, check
 from textured_room import INTRINSICS, SIZE
 from upath import UPath
 
 HASH = "0123456789abcdef" * 4
 ALL = "frames 0-5 (images/0.jpg to images/5.jpg): "
-CAMERA = ("fl_x", "fl_y", "cx", "cy", "h", "w")
 
 
 class Room:
@@ -22,7 +21,7 @@ class Room:
         self.files = {f"images/{n}.jpg": shot.encoded() for n, shot in enumerate(shots)}
         self.frames = [{"file_path": name} for name in self.files]
         self.poses = np.stack([shot.c2w for shot in shots])
-        self.camera = dict(zip(CAMERA, INTRINSICS + SIZE, strict=True))
+        self.camera = listed_lens(*INTRINSICS, *SIZE)
 
     def mask(self, masks):
         for number, mask in enumerate(masks):

@@ -8,7 +8,7 @@ import photo_formats
 import pytest
 import torch
 from commands import done
-from photo_formats import put, row_of_frames
+from photo_formats import listed_lens, put, row_of_frames
 from PIL import Image
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools import packing
@@ -19,7 +19,7 @@ from upath import UPath
 from qgs.recipe import resolve
 
 SIZE = (24, 32)
-GIVEN = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.0, "cy": 25.0}
+GIVEN = listed_lens(60.0, 61.0, 31.0, 25.0, 48, 64)
 KEPT = {
     "png": {},
     "jpg": {"suffix": "jpg"},

@@ -4,20 +4,13 @@ from fractions import Fraction
 
 import av
 import numpy as np
-from PIL import Image
+from photo_formats import write_photos as write_photos
 from rich.console import Console
 
 QUIET = Console(quiet=True)
 SCALE = 2
 PHOTOS = 6
 """Size of the photos over that of `textured_room`, and how many there are."""
-
-
-def write_photos(folder, images, name="{}.png"):
-    folder.mkdir(parents=True, exist_ok=True)
-    for number, image in enumerate(images):
-        Image.fromarray(image).save(folder / name.format(number))
-    return folder
 
 
 def write_video(path, images, rate=10, codec="libx264", times=None, **options):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from commands import done, run_qgs
-from photo_formats import PhotoSet, synthetic, write_colmap, write_nerfstudio
+from photo_formats import photo_set, synthetic, write_colmap, write_nerfstudio
 from PIL import Image
 from plyfile import PlyData
 from qgs_photos.refine import scene
@@ -42,13 +42,11 @@ from qgs.geometry.transforms import moved
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory):
     """Nine photos of a textured box, 48 wide and 32 high."""
-    folder = tmp_path_factory.mktemp("files")
     shots = walk(9)
-    files = [folder / f"{number}.png" for number in range(9)]
-    for file, shot in zip(files, shots, strict=True):
-        Image.fromarray(shot.image).resize((48, 32)).save(file)
+    images = [np.array(Image.fromarray(shot.image).resize((48, 32))) for shot in shots]
     lens = [number / 3.75 for number in INTRINSICS]
-    return PhotoSet(files, np.stack([shot.c2w for shot in shots]), lens, (32, 48))
+    c2w = np.stack([shot.c2w for shot in shots])
+    return photo_set(tmp_path_factory.mktemp("files"), images, c2w, lens)
 
 
 @pytest.fixture(scope="module")
