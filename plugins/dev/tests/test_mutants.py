@@ -47,6 +47,7 @@ def test_a_sound_component_passes(component: type[Component]) -> None:
 
 GRID = ("tokens_are_those_of_the_grid",)
 GRADIENTS = ("render_gradients_match_differences", "camera_gradients_match_differences")
+RENDERED = [("dilation", 0.1), ("dilation", 1.0), ("alpha_min", 1 / 128), ("background", (0, 0, 0))]
 
 
 @pytest.mark.parametrize(
@@ -59,10 +60,7 @@ GRADIENTS = ("render_gradients_match_differences", "camera_gradients_match_diffe
             for patch, size in [(4, None), (16, None), (8, (64, 64)), (8, (16, 24))]
         ],
         (["construction"], Case(ContentCrossAttention.Config(), ModelDims(48, 3, 1))),
-        (GRADIENTS, Case(TorchRenderer.Config(dilation=0.1))),
-        (GRADIENTS, Case(TorchRenderer.Config(dilation=1.0))),
-        (GRADIENTS, Case(TorchRenderer.Config(alpha_min=1 / 128))),
-        (GRADIENTS, Case(TorchRenderer.Config(background=(0, 0, 0)))),
+        *[(GRADIENTS, Case(TorchRenderer.Config(**{option: value}))) for option, value in RENDERED],
         (GRADIENTS, Case(TorchRenderer.Config(), image_size=(17, 23))),
     ],
 )
