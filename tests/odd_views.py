@@ -1,4 +1,4 @@
-"""Views whose cameras confuse nothing with anything."""
+"""Views whose cameras confuse nothing with anything, and tiles of their pixels."""
 
 import torch
 
@@ -15,3 +15,10 @@ def odd_views(count=2, height=16, width=16, scenes=2, seed=0):
     lens = torch.tensor([0.9 * width, width, width / 2 - 0.5, height / 2 + 0.5])
     images = torch.rand(scenes, count, 3, height, width, generator=generator)
     return Views(images, Cameras(c2w, lens.expand(scenes, count, 4), (height, width)))
+
+
+def in_tiles(maps_BVHWC, rows, columns, in_turn=False):
+    """(B, N, K, C): tiles of so many rows and columns of all photos, in turn or one by one."""
+    parts = maps_BVHWC.unflatten(3, (-1, columns)).unflatten(2, (-1, rows))
+    found = parts.transpose(3, 4).flatten(4, 5).flatten(2, 3)
+    return (found.transpose(1, 2) if in_turn else found).flatten(1, 2)

@@ -4,6 +4,7 @@ import math
 
 import torch
 import torch.nn.functional as F
+from odd_views import in_tiles
 from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters, FramedRefinement
 from qgs_anchors.landmark.neighbours import NeighbourAttention
 from qgs_anchors.landmark.observed import ObservedQueries
@@ -81,13 +82,6 @@ def test_anchors_of_all_tokens_stand_on_the_rays_of_their_patches():
         assert_close((z, places, radii), wanted)
 
 
-def in_tiles(maps_BVHWC, rows, columns, in_turn=True):
-    """(B, N, K, C): tiles of so many rows and columns of all photos, in turn or one by one."""
-    parts = maps_BVHWC.unflatten(3, (-1, columns)).unflatten(2, (-1, rows))
-    found = parts.transpose(3, 4).flatten(4, 5).flatten(2, 3)
-    return (found.transpose(1, 2) if in_turn else found).flatten(1, 2)
-
-
 def test_tokens_of_a_footprint_make_a_query():
     """Two side by side in each of 4 x 3 tiles: their features, and the mean of their depths."""
     queries, state = started(count=24, tokens=2, cells=8)
@@ -96,11 +90,11 @@ def test_tokens_of_a_footprint_make_a_query():
     alone.load_state_dict(weights)
     of_tokens = alone(MEMORY, VIEWS)
 
-    left, right = in_tiles(of_tokens.features.unflatten(1, GRID), 1, 2).unbind(2)
+    left, right = in_tiles(of_tokens.features.unflatten(1, GRID), 1, 2, True).unbind(2)
     expected = (left + right) / 2 + queries.apart_proj((right - left) / 2)
     assert_close(state.features, expected, rtol=1e-5, atol=1e-6)
     depths, _ = in_photos(of_tokens, BY_PHOTO)
-    left, right = in_tiles(depths.unflatten(1, GRID), 1, 2).unbind(2)
+    left, right = in_tiles(depths.unflatten(1, GRID), 1, 2, True).unbind(2)
     z, _ = in_photos(state, torch.arange(24) % 2)
     assert_close(z, (left * right).sqrt())
 
@@ -114,7 +108,7 @@ def test_gaussians_start_as_the_photo_that_they_stand_for():
         attributes = head(state)
         means = made(FootprintCenters)(attributes.offsets, state)
         maps = (HALVED.images.movedim(2, -1), *camera_rays(HALVED.cameras))
-        colors, origins, rays = (in_tiles(x, rows, columns, in_turn=bool(count)) for x in maps)
+        colors, origins, rays = (in_tiles(x, rows, columns, bool(count)) for x in maps)
         assert_close(attributes.colors, colors.clamp(0.02, 0.98), rtol=0, atol=1e-6)
         assert_close(F.normalize(means - origins, dim=-1), rays)
         radii = support_radius(state[RAW_RADIUS], queries.config)[..., None]

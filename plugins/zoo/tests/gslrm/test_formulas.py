@@ -1,11 +1,12 @@
 """Every formula: encoder, rays, centres and head against what is written out by hand."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
 import torch.nn.functional as F
-from odd_views import odd_views
+from odd_views import in_tiles, odd_views
 from qgs_zoo.gslrm.pixels import (
     PATCH,
     AlongRays,
@@ -24,15 +25,11 @@ from qgs.types import Cameras, ImageMemory, QueryState
 
 P = 4
 """Pixels along a patch."""
-COUNT, ROWS, COLUMNS = GRID = (3, 2, 3)
+_, ROWS, COLUMNS = GRID = (3, 2, 3)
 """Views, and their patches."""
 
 
-def in_patches(maps):
-    """(B, V, H, W, C) -> (B, N, K, C), one patch after the other, pixels row by row."""
-    height, width = maps.shape[2:4]
-    parts = (2, COUNT, ROWS, height // ROWS, COLUMNS, width // COLUMNS, -1)
-    return maps.reshape(parts).transpose(3, 4).flatten(4, 5).flatten(1, 3)
+in_patches = partial(in_tiles, rows=P, columns=P)
 
 
 def test_rays_of_a_patch_are_spread_evenly():
@@ -42,7 +39,7 @@ def test_rays_of_a_patch_are_spread_evenly():
         seen = patch_rays_at(pixel_rays(given, ROWS, COLUMNS), count)[1]
         factor = torch.tensor([columns / P, rows / P] * 2)
         fine = Cameras(given.c2w, given.intrinsics * factor, (rows * ROWS, columns * COLUMNS))
-        assert_close(F.normalize(seen, dim=-1), in_patches(camera_rays(fine)[1]))
+        assert_close(F.normalize(seen, dim=-1), in_tiles(camera_rays(fine)[1], rows, columns))
 
 
 def test_means_lie_on_the_rays_of_their_pixels():
