@@ -9,12 +9,12 @@ compared. The exit code is 1 if a tensor differs by more than rtol 1e-4 + atol 5
 computed.
 """
 
-import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+import typer
 from published.files import GoldenFile, read_golden
 from published.losses import loss_tensors
 from published.models import golden_tensors
@@ -83,17 +83,14 @@ def report(path: Path) -> bool:
     return not failed
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=f"Compare with published numbers, rtol {RTOL:g} and atol {ATOL:g}."
-    )
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
+def main(files: list[Path]) -> None:
+    """Compare golden FILES with published numbers, rtol 1e-4 and atol 5e-5."""
     # The order of sums, and with it their rounding, follows the number of threads.
     torch.set_num_threads(1)
-    passed = [report(path) for path in parser.parse_args().files]
+    passed = [report(path) for path in files]
     print(f"{sum(passed)} of {len(passed)} files pass")
-    return 0 if all(passed) else 1
+    sys.exit(not all(passed))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    typer.run(main)

@@ -83,7 +83,7 @@ def sources() -> dict[str, str]:
 
 
 def sizes() -> dict[str, dict[str, float]]:
-    """Return tokens, lines, files, parallel and why of each group, and of the group `all`."""
+    """Return what `measure` counts, parallel and why of each group, and of the group `all`."""
     groups: dict[str, Counter[str]] = defaultdict(Counter)
     for name, text in sources().items():
         counts = measure(text)
@@ -91,9 +91,7 @@ def sizes() -> dict[str, dict[str, float]]:
         groups["all"] += counts
     return {
         group: {
-            "tokens": counts["tokens"],
-            "lines": counts["lines"],
-            "files": counts["files"],
+            **counts,
             "parallel": 1000 * counts["parallel"] / max(counts["plain_lines"], 1),
             "why": 100 * counts["comments"] / counts["lines"],
         }
