@@ -8,6 +8,9 @@ from typing import Any
 from safetensors import safe_open
 from torch import Tensor
 
+Tensors = dict[str, Tensor]
+"""Tensors by name."""
+
 WEIGHTS = "weights."
 EXPECTED = "expected."
 LOADER = ("crop.", "patch.")
@@ -25,7 +28,7 @@ class GoldenFile:
     inputs, so they are not compared.
     """
 
-    tensors: dict[str, Tensor]
+    tensors: Tensors
     config: dict[str, Any]
     read: set[str] = field(default_factory=set)
 
@@ -40,12 +43,12 @@ class GoldenFile:
         tensor = self.tensors[name]
         return tensor.float() if tensor.is_floating_point() else tensor
 
-    def weights(self) -> dict[str, Tensor]:
+    def weights(self) -> Tensors:
         """Return the published state dict in the file."""
         names = [name for name in self.tensors if name.startswith(WEIGHTS)]
         return {name.removeprefix(WEIGHTS): self.input(name) for name in names}
 
-    def expected(self) -> dict[str, Tensor]:
+    def expected(self) -> Tensors:
         """Return the tensors to compare: all except inputs and weights."""
         return {name: value for name, value in self.tensors.items() if name not in self.read}
 

@@ -3,8 +3,7 @@
 `refssim` in a name means SSIM with zero padding ("same"), as qgs uses in training.
 """
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import torch
 from qgs_dev.vocabulary import scene
@@ -12,7 +11,8 @@ from qgs_locus.fields import CENTER
 from qgs_locus.visibility import AnchorVisibility
 from torch import Tensor
 
-from published.files import EXPECTED, GoldenFile
+from published.files import EXPECTED, GoldenFile, Tensors
+from published.recipes import Options
 from qgs.contracts import Loss
 from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
@@ -52,7 +52,7 @@ def value(loss: Loss, given: Given) -> Tensor:
     return term
 
 
-def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
+def loss_tensors(golden: GoldenFile) -> Tensors:
     """Compute all tensors that a golden file of losses may hold, by name."""
     given = read_inputs(golden)
     prediction, _, target = given
@@ -76,7 +76,7 @@ def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     return {"cam_view": seen, **{f"{EXPECTED}{name}": x for name, x in found.items()}}
 
 
-def visibility(points: Tensor, cameras: Cameras, clamp: float | None) -> dict[str, Tensor]:
+def visibility(points: Tensor, cameras: Cameras, clamp: float | None) -> Tensors:
     """Return visibility losses by name: for each point, for each scene and in total.
 
     Each is computed for all views, and for the first view only.
@@ -96,8 +96,8 @@ def visibility(points: Tensor, cameras: Cameras, clamp: float | None) -> dict[st
 
 
 def whole_loss(
-    given: Given, has_mask: Tensor, release: str, options: Mapping[str, Any], ssim: float
-) -> dict[str, Tensor]:
+    given: Given, has_mask: Tensor, release: str, options: Options, ssim: float
+) -> Tensors:
     """Return the unweighted terms and the weighted sum of a published loss, by name.
 
     Both are given for each scene and in total. has_mask: (B,), True for scenes whose mask is
@@ -120,9 +120,7 @@ def whole_loss(
     return found
 
 
-def terms_of(
-    release: str, options: Mapping[str, Any], ssim: float
-) -> Iterator[tuple[str, float, Loss]]:
+def terms_of(release: str, options: Options, ssim: float) -> Iterator[tuple[str, float, Loss]]:
     """Yield name, published weight and unweighted loss component of each term."""
     yield RGB_TERM[release], 1.0, Photometric(Photometric.Config(ssim_weight=0.0))
     yield "loss_mask", options["lambda_mask"], Mask(Mask.Config(weight=1.0))

@@ -17,8 +17,8 @@ from qgs_research.published.weight_layout import real_ratio
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck, time_features
 from torch import Tensor
 
-from published.files import GoldenFile
-from published.recipes import locusgs_recipe, tokengs_recipe
+from published.files import GoldenFile, Tensors
+from published.recipes import Options, Tree, locusgs_recipe, tokengs_recipe
 from published.splats import Recorder, cases_tensors
 from published.sweeps import sweep_tensors
 from qgs.geometry.rays import camera_rays, plucker_rays
@@ -28,12 +28,12 @@ from qgs.tokengs import CrossSelfMlp
 from qgs.tokengs.encoder import PatchViT, imagenet_normalised
 from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
 
-RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+RECIPES: Mapping[str, Callable[[Options], Tree]] = {
     "tokengs": tokengs_recipe,
     "locusgs": locusgs_recipe,
 }
 
-COMPUTED: Mapping[str, Callable[[GoldenFile], dict[str, Tensor]]] = {
+COMPUTED: Mapping[str, Callable[[GoldenFile], Tensors]] = {
     "mvsplat": sweep_tensors,
     "mvsplat_cases": cases_tensors,
     "depthsplat": sweep_tensors,
@@ -49,7 +49,7 @@ DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
 
 
 @torch.no_grad()
-def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
+def golden_tensors(golden: GoldenFile) -> Tensors:
     """Compute all tensors that a golden file may hold, by its model on its photos and cameras.
 
     Raises ValueError for options that no recipe can express.
@@ -91,7 +91,7 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     return found
 
 
-def recipe_of(golden: GoldenFile) -> dict[str, Any]:
+def recipe_of(golden: GoldenFile) -> Tree:
     """Return the recipe of a golden file's model. Raises the errors of `golden_tensors`."""
     constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
     recipe = RECIPES[golden.config["kind"]](golden.config["options"] | constants)
@@ -125,7 +125,7 @@ def watch(kept: Recorder, model: QueryGaussianModel) -> None:
             kept.output(f"anchor_pe.{index}", layer.self_attention.position_mlp)
 
 
-def of_views(views: Views, model: QueryGaussianModel) -> dict[str, Tensor]:
+def of_views(views: Views, model: QueryGaussianModel) -> Tensors:
     """Return the inputs of the encoder's network by name: photos, rays and times."""
     origins, directions = camera_rays(views.cameras)
     found = {
@@ -143,7 +143,7 @@ def of_views(views: Views, model: QueryGaussianModel) -> dict[str, Tensor]:
 
 def of_state(
     model: QueryGaussianModel, memory: ImageMemory, state: QueryState, number: int
-) -> dict[str, Tensor]:
+) -> Tensors:
     """Return the state after `number` layers, and the attention bias of the next layer."""
     found = {f"tokens.{number}": state.features}
     queries = model.queries

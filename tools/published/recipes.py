@@ -54,14 +54,16 @@ CENTERS = {
 }
 
 Options = Mapping[str, Any]
+Tree = dict[str, Any]
+"""Recipe, or a section of one, as nested mappings."""
 
 
-def model_of(options: Options, *tables: str) -> dict[str, Any]:
+def model_of(options: Options, *tables: str) -> Tree:
     """Translate published options into the section `model` of a recipe, by `tables`.
 
     tables: texts whose lines are a published option and its path in `model`.
     """
-    model: dict[str, Any] = {}
+    model: Tree = {}
     for line in "".join(tables).split("\n"):
         if line:
             option, path = line.split()
@@ -73,7 +75,7 @@ def model_of(options: Options, *tables: str) -> dict[str, Any]:
     return model
 
 
-def tokengs_recipe(options: Options) -> dict[str, Any]:
+def tokengs_recipe(options: Options) -> Tree:
     """Return the recipe of the model that TokenGS builds from `options`."""
     multiscale, latent = (options.get(name) for name in OF_2026_6)
     moving, timed = (options.get(name, 0) for name in OF_MOTION)
@@ -110,7 +112,7 @@ def tokengs_recipe(options: Options) -> dict[str, Any]:
     return {"recipe": 1, "plugins": ["tokengs2026"], "model": model, "views": views}
 
 
-def locusgs_recipe(options: Options) -> dict[str, Any]:
+def locusgs_recipe(options: Options) -> Tree:
     """Return the recipe of the model that LocusGS builds from `options`.
 
     `geo_sigma`, a constant in the published code, may be given as an option.

@@ -20,7 +20,7 @@ from qgs_zoo.mvsplat.windows import out_of_windows
 from torch import Tensor, nn
 
 import qgs
-from published.files import GoldenFile
+from published.files import GoldenFile, Tensors
 from published.seeded_weights import seeded_weight
 from qgs.checkpoint.tensors import shapes_of
 from qgs.geometry.harmonics import SH_C0
@@ -40,7 +40,7 @@ class Recorder:
 
     def __init__(self, shaped: Change = Tensor.detach) -> None:
         self.shaped = shaped
-        self.found: dict[str, Tensor] = {}
+        self.found: Tensors = {}
 
     def output(self, name: str, module: nn.Module, shaped: Change | None = None) -> None:
         """Record the outputs of a module as `name`."""
@@ -80,7 +80,7 @@ def lens_of(k: Tensor, size: tuple[int, int] = (1, 1)) -> Tensor:
     return lens * lens.new_tensor([size[1], size[0], size[1], size[0]])
 
 
-def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
+def weights_of(golden: GoldenFile) -> Tensors:
     """Return the weights of a golden file by their published names."""
     rule = golden.config["weights"]
     # Sums of the weights, with which whoever recorded the file checked the rule.
@@ -153,7 +153,7 @@ def predicted(model: QueryGaussianModel, views: Views, numbers: Tensor) -> Predi
     return model.predict(views, memory, model.queries(memory, views), range(1, model.depth + 1))
 
 
-def gaussians(views: Views, numbers: Tensor, prediction: Prediction) -> dict[str, Tensor]:
+def gaussians(views: Views, numbers: Tensor, prediction: Prediction) -> Tensors:
     """Return the Gaussians of a prediction by the names of golden files.
 
     numbers: output of the networks for each pixel, (B, V, H, W, C).
@@ -178,7 +178,7 @@ def gaussians(views: Views, numbers: Tensor, prediction: Prediction) -> dict[str
     }
 
 
-def cases_tensors(golden: GoldenFile) -> dict[str, Tensor]:
+def cases_tensors(golden: GoldenFile) -> Tensors:
     """Compute every output of a file of single cases: a warp, opacities, single Gaussians."""
     lens = lens_of(golden.input("warp.intrinsics"))
     grid = warp_grid(golden.input("warp.depth"), lens, golden.input("warp.pose"))
@@ -193,7 +193,7 @@ def cases_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     return found | {f"adapter.{name}": x for name, x in single_gaussians(golden).items()}
 
 
-def single_gaussians(golden: GoldenFile) -> dict[str, Tensor]:
+def single_gaussians(golden: GoldenFile) -> Tensors:
     """Decode Gaussians that have one camera each; some have extreme rotations and values."""
     names = ("depths", "opacities", "raw", "extrinsics", "coordinates")
     depth, opacity, raw, c2w, place = (golden.input(f"adapter.{name}") for name in names)

@@ -16,7 +16,7 @@ from qgs_zoo.mvsplat.sweep import (
 from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
-from published.files import GoldenFile
+from published.files import GoldenFile, Tensors
 from published.splats import (
     Recorder,
     gaussians,
@@ -66,7 +66,7 @@ features_mono.1   mono_pyramid.stages.1
 """
 
 
-def sweep_tensors(golden: GoldenFile) -> dict[str, Tensor]:
+def sweep_tensors(golden: GoldenFile) -> Tensors:
     """Compute every output that a golden file has, by name."""
     model = model_of(golden)
     encoder = model.encoder
@@ -103,9 +103,7 @@ def sweep_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     return found
 
 
-def of_mvsplat(
-    found: dict[str, Tensor], encoder: MVSplatEncoder, sweep: Sweep, numbers: Tensor
-) -> None:
+def of_mvsplat(found: Tensors, encoder: MVSplatEncoder, sweep: Sweep, numbers: Tensor) -> None:
     """Add to `found` the tensors of MVSplat that no module outputs.
 
     numbers: output of the networks for each pixel, (B, V, H, W, C).
@@ -175,7 +173,7 @@ def watch_depthsplat(kept: Recorder, encoder: DepthSplatEncoder, low: tuple[int,
     kept.input("match_probability_max", network.gaussian_regressor, slice(4, 5))
 
 
-def of_depthsplat(found: dict[str, Tensor], predictor: DepthPredictor, sweep: Sweep) -> None:
+def of_depthsplat(found: Tensors, predictor: DepthPredictor, sweep: Sweep) -> None:
     """Add to `found` the tensors of DepthSplat that no module outputs."""
     shape = sweep.near.shape
     height, width = sweep.cameras.size
