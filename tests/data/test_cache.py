@@ -1,7 +1,3 @@
-from multiprocessing.reduction import ForkingPickler
-
-import numpy as np
-
 from qgs.data.scenes import BoundedCache
 
 
@@ -23,11 +19,3 @@ def test_what_was_used_last_is_kept():
     assert made[-1] == "longer than all"
     get("aaa")
     assert made[-1] == "aaa"
-
-
-def test_copies_start_empty():
-    cache = BoundedCache(10**6, len)
-    cache.get("a", lambda: np.zeros(10**5))
-    content = ForkingPickler.dumps(cache)
-    assert len(content) < 1000
-    assert ForkingPickler.loads(content).get("a", lambda: "made again") == "made again"
