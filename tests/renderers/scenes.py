@@ -3,10 +3,9 @@
 from functools import partial
 
 import torch
-from torch.nn.functional import normalize
+from odd_views import odd_views
 
 from qgs.containers import named_tensors
-from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras, Gaussians
 
 
@@ -39,13 +38,7 @@ def make_scene(
         sh=0.1 * randn(batch, count, harmonics, 3) if harmonics else None,
         features=randn(batch, count, features) if features else None,
     )
-    turn = torch.cat([torch.ones(batch, views, 1), 0.03 * randn(batch, views, 3)], -1)
-    c2w = torch.eye(4).repeat(batch, views, 1, 1)
-    c2w[..., :3, :3] = quat_to_matrix(normalize(turn, dim=-1))
-    c2w[..., :3, 3] = 0.1 * randn(batch, views, 3)
-    focal = max(size) * (0.9 + 0.2 * rand(batch, views, 2))
-    centre = torch.tensor([size[1] / 2, size[0] / 2]) + 0.5 * randn(batch, views, 2)
-    return gaussians.to(dtype), Cameras(c2w, torch.cat([focal, centre], -1), size).to(dtype)
+    return gaussians.to(dtype), odd_views(views, *size, batch).cameras.to(dtype)
 
 
 def differentiate(renderer, gaussians, cameras):
