@@ -31,7 +31,7 @@ from qgs.domain import KEY, Domain
 from qgs.files import AnyPath
 from qgs.machine import TooLargeError
 from qgs.model import QueryGaussianModel
-from qgs.recipe import Recipe, RecipeError
+from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.version import __version__
 from qgs.wording import listed
 
@@ -53,13 +53,15 @@ class CheckpointFile(TensorFile):
 
     name: path of a file or run folder, PLUGIN/NAME of a model that a plugin ships, or a URL; see
     `checkpoint_path`. Recipe and weights are read at first use. extra: the metadata that `save` was
-    given. Raises FileNotFoundError, and CheckpointError for a file that is not a checkpoint of this
-    format version.
+    given. gaussians: about how many Gaussians the recipe's model makes; None keeps the recipe.
+    Raises FileNotFoundError, and CheckpointError for a file that is not a checkpoint of this format
+    version.
     """
 
-    def __init__(self, name: AnyPath) -> None:
+    def __init__(self, name: AnyPath, gaussians: int | None = None) -> None:
         super().__init__(checkpoint_path(name))
         self.name = os.fspath(name)
+        self.gaussians = gaussians
         if RECIPE not in self.metadata:
             raise CheckpointError(
                 f"{self.path} is a safetensors file without a qgs recipe; only files written by "
@@ -82,10 +84,12 @@ class CheckpointFile(TensorFile):
         """Recipe of the model.
 
         Raises CheckpointError if components of the recipe are not installed or have changed. The
-        message names the releases of the packages that wrote the file.
+        message names the releases of the packages that wrote the file. Raises ValueError if the
+        number of Gaussians cannot be chosen.
         """
         try:
-            return self.stored_recipe()
+            recipe = self.stored_recipe()
+            return recipe if self.gaussians is None else self._resized(recipe, self.gaussians)
         except RecipeError as error:
             names = self.mapping(_DISTRIBUTIONS)
             versions = self.mapping(_PLUGINS).items()
@@ -96,6 +100,21 @@ class CheckpointFile(TensorFile):
                 f"{self.path} was written with {releases}; install these releases, because the "
                 f"installed ones do not fit its recipe:\n{error}"
             ) from error
+
+    def _resized(self, recipe: Recipe, gaussians: int) -> Recipe:
+        """Return `recipe` with the number of queries that makes about this many Gaussians."""
+        each = recipe.build_model("meta", pretrained=False).head.gaussians_per_query
+        count = max(1, round(gaussians / each))
+        try:
+            resized = resolve(recipe.tree, [f"model.queries.count={count}"])
+            model = resized.build_model("meta", pretrained=False)
+            refuse_misfit(model, self.tensors, self.path)
+        except (RecipeError, CheckpointError) as error:
+            raise ValueError(
+                f"{self.path} makes a number of Gaussians that its training or its photos fix: "
+                "leave out the number"
+            ) from error
+        return resized
 
     @cached_property
     def tensors(self) -> dict[str, Tensor]:
@@ -153,15 +172,21 @@ class CheckpointFile(TensorFile):
         return (model if device is None else model.to(device)).eval()
 
 
-def load(name: AnyPath, device: str | torch.device | None = None) -> QueryGaussianModel:
+def load(
+    name: AnyPath,
+    device: str | torch.device | None = None,
+    *,
+    gaussians: int | None = None,
+) -> QueryGaussianModel:
     """Load the model of a checkpoint in evaluation mode.
 
     name: path of a checkpoint file or of a run folder, PLUGIN/NAME of a model that an installed
-    plugin ships, or a URL. device: None means the CPU. Raises FileNotFoundError, CheckpointError
+    plugin ships, or a URL. device: None means the CPU. gaussians: about how many Gaussians the
+    model makes of a scene; None means as in its recipe. Raises FileNotFoundError, CheckpointError
     for a file that is not a checkpoint or does not fit the installed components, and ValueError for
-    NaN or infinite weights.
+    NaN or infinite weights, or if the number of Gaussians cannot be chosen.
     """
-    with CheckpointFile(name) as file:
+    with CheckpointFile(name, gaussians) as file:
         return file.model(device)
 
 

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from qgs.cli import options
-from qgs.cli.options import Checkpoint, Device, Overrides, Threads, Tune
+from qgs.cli.options import Checkpoint, Device, Gaussians, Overrides, Threads, Tune
 
 if TYPE_CHECKING:
     from qgs.evaluate.results import Evaluation
@@ -34,6 +34,7 @@ def evaluate(
             "RUN/evaluation-N; ./evaluation_NAME for the model of a plug-in or a URL."
         ),
     ] = None,
+    gaussians: Gaussians = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit with code 1 if a scene has no score.")
     ] = False,
@@ -59,7 +60,7 @@ def evaluate(
         if option not in free and option.split(".")[0] not in free:
             allowed = ", ".join(free)
             raise ValueError(f"{setting} would change the trained model; change only {allowed}")
-    with CheckpointFile(run) as file:
+    with CheckpointFile(run, gaussians) as file:
         checkpoint = file.path
         recipe = file.recipe
         step = file.step
@@ -70,7 +71,7 @@ def evaluate(
         model.feedback.rounds = recipe.build_model("meta", pretrained=False).feedback.rounds
     # Results are written beside a checkpoint of the user's own, not into a cache.
     own = Path(run).expanduser().exists()
-    folder = out or evaluation_folder(checkpoint, bool(settings), own)
+    folder = out or evaluation_folder(checkpoint, bool(settings or gaussians), own)
     evaluation = evaluate_into(model, recipe, step, folder)
     # Scripts need this: a mean over fewer scenes is not comparable.
     if strict and evaluation.missing:

@@ -43,6 +43,14 @@ Inputs: TypeAlias = Annotated[
         help="Number of input views. Default: as in the recipe, and one more if it is between two.",
     ),
 ]
+Gaussians: TypeAlias = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="About how many Gaussians the model makes, if its queries start at photos, such as "
+        "those of Landmark. Default: as in the recipe.",
+    ),
+]
 Frames: TypeAlias = Annotated[
     str | None,
     typer.Option(help="Numbers or file names of input photos: 0,8,x.jpg. Default: qgs chooses."),

@@ -10,6 +10,7 @@ from qgs.cli.options import (
     Checkpoint,
     Device,
     Frames,
+    Gaussians,
     Inputs,
     Scale,
     SceneName,
@@ -50,6 +51,7 @@ def reconstruct(
         typer.Option("--overwrite", help="Write into a non-empty folder, or over a file."),
     ] = False,
     size: Size = None,
+    gaussians: Gaussians = None,
     scene_name: SceneName = None,
     threads: options.Threads = None,
     device: Device = "auto",
@@ -72,7 +74,7 @@ def reconstruct(
     options.use_threads(threads)
     console = Console()
     result = run(
-        load(checkpoint, choose_device(device)),
+        load(checkpoint, choose_device(device), gaussians=gaussians),
         photos,
         inputs=inputs,
         frames=frames,

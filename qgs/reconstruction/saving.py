@@ -125,14 +125,17 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
         }
         for score, camera in zip(result.scores, cameras, strict=True)
     ]
+    model = result.model
+    count = model.queries.count
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": result.sample.scene,
-        "model": result.model.loaded_from,
+        "model": model.loaded_from,
+        "gaussians": count and count * model.head.gaussians_per_query,
         "tuning": result.tuning,
         "remarks": list(result.remarks),
         "refinement": result.refinement,
-        "background": result.model.renderer.config.background,
+        "background": model.renderer.config.background,
         "to_photos": {
             "rule": "point p of this world is reference_c2w applied to p / scale in photos' world",
             "reference_c2w": reference.tolist(),

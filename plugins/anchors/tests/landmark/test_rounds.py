@@ -134,9 +134,17 @@ def test_rounds_are_traced_as_layers_are():
 
 
 @torch.no_grad()
-def test_a_number_of_anchors_is_that_for_any_number_of_photos():
-    model = built("model.queries.count=20")
+def test_a_number_of_anchors_is_that_for_any_number_of_photos(tmp_path):
+    """A trained model may have another; training draws it."""
+    file = tmp_path / "model.safetensors"
+    qgs.save(built("model.queries.count=20", "model.queries.least=5"), file)
+    model = qgs.load(file)
     assert [model(views(count)).gaussians.count for count in (2, 5)] == [80, 80]
+    assert qgs.load(file, gaussians=121)(views()).gaussians.count == 120
+    torch.manual_seed(0)
+    drawn = {model.train()(views()).gaussians.count for _ in range(20)}
+    assert min(drawn) < 30
+    assert 60 < max(drawn) <= 80
 
 
 def started(learned, file, *overrides):

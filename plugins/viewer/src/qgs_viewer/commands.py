@@ -14,6 +14,7 @@ from rich.console import Console
 from qgs.cli.options import (
     Device,
     Frames,
+    Gaussians,
     Inputs,
     Scale,
     SceneName,
@@ -159,6 +160,7 @@ def view(
     frames: Frames = None,
     size: Size = None,
     scale: Scale = None,
+    gaussians: Gaussians = None,
     overrides: ViewsSettings = None,
     query: Query = None,
     html: Page = None,
@@ -195,6 +197,7 @@ def view(
         frames=frames,
         inputs=inputs,
         size=pixels,
+        gaussians=gaussians,
         overrides=[*(overrides or ()), *scale_settings(scale)],
     )
     console = Console()
@@ -215,6 +218,7 @@ def demo(
     out: NewFolder = None,
     size: Size = None,
     scale: Scale = None,
+    gaussians: Gaussians = None,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
@@ -249,7 +253,8 @@ def demo(
     if train:
         compare_trainings(given or RECIPES, seconds or 120, seed or 0, target, device)
     else:
-        compare_models(models, given[0] if given else None, target, device, size, scale)
+        photos = given[0] if given else None
+        compare_models(models, photos, target, device, size, scale, gaussians)
 
 
 @report_app.command()

@@ -31,12 +31,13 @@ def compare_models(
     device: str,
     size: str | None,
     scale: float | None,
+    gaussians: int | None = None,
 ) -> None:
     """Evaluate `models` (default: some that come with qgs), and write a report into `target`.
 
     photos: folder or video; None evaluates on unseen scenes of the models' data. size: size
     of the photos, as text of the option --size; None lets the models determine it. scale: factor by
-    which camera positions are multiplied; None searches for a factor.
+    which camera positions are multiplied; None searches for a factor. gaussians: as for `qgs.load`.
     """
     pixels = parse_size(size)
     names = models or (MODELS if photos is None else [photo_model(pixels)])
@@ -44,7 +45,9 @@ def compare_models(
     scenes = "Unseen scenes" if photos is None else "Your photos"
     # warnings about photos concern whoever reads the page, not only the terminal
     with kept_warnings() as warnings:
-        opened = open_models(names, photos, choose_device(device), pixels, scale_settings(scale))
+        opened = open_models(
+            names, photos, choose_device(device), pixels, scale_settings(scale), gaussians
+        )
         for model in opened:
             if model.size:
                 console.print(f"{model.size.text}; --size HxW sets another", style="dim")
@@ -53,6 +56,7 @@ def compare_models(
             model.evaluation.write(target / model.name)
         options = ["--size", size] if size else []
         options += ["--scale", f"{scale:g}"] if scale else []
+        options += ["--gaussians", f"{gaussians}"] if gaussians else []
         commands = next_commands(names, opened, target, photos, options)
     trained = "; ".join(f"{model.name}: {model.step or 'not known'}" for model in opened)
     facts = {"Steps of the last training run": trained}

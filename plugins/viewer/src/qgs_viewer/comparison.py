@@ -221,16 +221,18 @@ def open_models(
     device: str,
     size: Size | None = None,
     overrides: Sequence[str] = (),
+    gaussians: int | None = None,
 ) -> list[Model]:
     """Load models for a comparison on unseen scenes of their data, or on held-out `photos`.
 
     names: run folders, checkpoints, URLs or shipped models. photos, size, overrides: passed on to
-    `recipes_alike`. Without `size`, the first model decides on the size of photos by `find_size`.
+    `recipes_alike`. gaussians: as for `CheckpointFile`. Without `size`, the first model decides on
+    the size of photos by `find_size`.
     Raises ValueError if models cannot be compared under one protocol.
     """
     with ExitStack() as opened:
         paths = map(checkpoint_path, names)
-        files = [opened.enter_context(CheckpointFile(path)) for path in paths]
+        files = [opened.enter_context(CheckpointFile(path, gaussians)) for path in paths]
         trained = {n: file.recipe for n, file in zip(numbered_names(names), files, strict=True)}
         recipes = recipes_alike(trained, photos, size, overrides)
         models = [

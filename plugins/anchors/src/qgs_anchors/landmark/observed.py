@@ -95,7 +95,12 @@ class ObservedQueries(Queries):
         """N, the number of queries, spread evenly over the input photos. The footprint of
         a query is the part of a photo that the query represents. If photos divide into N equal
         tiles with nearly square cells, each footprint is a tile; otherwise it is a square around
-        the query's point. Null puts `per_token` queries at the centre of each token's patch."""
+        the query's point. Null puts `per_token` queries at the centre of each token's patch. A
+        trained model may have another number."""
+        least: PositiveInt | None = None
+        """Smallest number of queries in a training step. Each step takes a random number from
+        `least` to `count`, with an even distribution of its logarithm. Null always takes
+        `count`."""
         tokens: PositiveInt = 1
         """S, the number of points in the footprint of a query at which the query samples tokens
         and depths. It has an effect only if `count` is a number."""
@@ -149,11 +154,14 @@ class ObservedQueries(Queries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report options without effect: `tokens` if `count` is null, otherwise `per_token`."""
+        """Report options without effect, and a `least` that is more than `count`."""
         if config.count is None:
-            yield from without_effect(config, ("tokens",), "`count` is null")
-        else:
-            yield from without_effect(config, ("per_token",), "`count` is a number")
+            yield from without_effect(config, ("tokens", "least"), "`count` is null")
+            return
+        yield from without_effect(config, ("per_token",), "`count` is a number")
+        if config.least and config.least > config.count:
+            reason = f"`least` is {config.least}, more than `count`, which is {config.count}"
+            yield Problem("least", reason, f"write at most {config.count}, or raise `count`")
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Return initial queries: features (B, N, D), and the fields in `fields_written`."""
@@ -169,7 +177,7 @@ class ObservedQueries(Queries):
         else:
             photos = memory.grid[0]
             aspect = aspect_of(config.cells or 1)
-            view_N, place_N2, share_2 = spread(config.count, photos, size, aspect, device)
+            view_N, place_N2, share_2 = spread(self._drawn(), photos, size, aspect, device)
             # Several tokens of a tile start one query, so that it knows more than the centre.
             middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
             view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
@@ -177,6 +185,15 @@ class ObservedQueries(Queries):
             x_BXD = sampled(memory.features, memory.grid, view_X, place_BX2) + self.slots
             x_BND, nearness_BN1 = self._joined(*self._swept(x_BXD, views, view_X, place_X2))
         return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_N2, share_2))
+
+    def _drawn(self) -> int:
+        """Return the number of queries for one pass. It is random in training with `least`."""
+        count = self.config.count
+        assert count is not None
+        if not self.training or self.config.least is None:
+            return count
+        share = torch.rand(()).item()
+        return round(self.config.least ** (1 - share) * count**share)
 
     def _swept(
         self, x_BND: Tensor, views: Views, view_N: Tensor, place_N2: Tensor
