@@ -11,7 +11,7 @@ import textured_room
 from photo_formats import opened
 from PIL import Image
 from qgs_photos.poses import door, making
-from qgs_photos.poses.making import Options, make_poses
+from qgs_photos.poses.making import Options, Poses, make_poses
 from qgs_photos.poses.photos import PosesError
 from qgs_photos.poses.worker import likely
 from tables import must_not_find, must_refuse, names_in, read_json
@@ -41,10 +41,15 @@ def record_in(folder):
     return read_json(folder / "poses.json")
 
 
+def test_photos_with_few_points_are_named():
+    *_, unsure = Poses({"a.jpg": 12, "b.jpg": 300}, (), {}, ()).summary
+    assert unsure.endswith("may be wrong: a.jpg (12)")
+
+
 def test_photos_get_the_poses_they_were_taken_with(made, shots):
     folder, poses = made
     names = ["0 Fo’to #{} %20 'ä'.JPG", "1.jpg", "2.png", "3.tif.png", "4.avif.png", "5.png"]
-    assert poses.posed == names
+    assert sorted(poses.posed) == names
     assert poses.without == ["other.png"]
     assert poses.faulty.keys() == {"broken.png", "empty.jpg"}
     assert formats_of(UPath(folder)) == ["colmap"]

@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -18,8 +18,8 @@ _LINES = 30
 _STEP = re.compile(r"Process(?:ed file|ing image|ing block) \[(\d+)/(\d+)")
 
 
-def run(job: Job, show: Show) -> tuple[Sequence[str], Sequence[str]]:
-    """Run `job` in a separate process; return the names of the photos with poses, and remarks.
+def run(job: Job, show: Show) -> tuple[Mapping[str, int], Sequence[str]]:
+    """Run `job` in a separate process; return the points of each photo with a pose, and remarks.
 
     show: called with the stage, the number of steps done and the number of all steps. Raises
     PosesError if COLMAP finds no model or its process crashes.

@@ -101,8 +101,9 @@ def tell(stage: str, done: int, total: int) -> None:
 def mapped(job: Job) -> Mapping[str, Any]:
     """Find features, matches and poses; write the models that COLMAP finds into `job.models`.
 
-    The largest model is in its subfolder `best`. Returns {"posed": names of the photos in this
-    model, "remarks": sentences for the user}. Raises RefusedError if the photos give no model.
+    The largest model is in its subfolder `best`. Returns {"posed": numbers of points of the photos
+    in this model, by name, "remarks": sentences for the user}. Raises RefusedError if the photos
+    give no model.
     """
     COLMAP.set_random_seed(job.seed)
     total = len(job.sizes)
@@ -318,12 +319,12 @@ def _largest_model(job: Job, start: Any, estimated: bool) -> Any:
     return start
 
 
-def _written(model: Any, job: Job) -> list[str]:
-    """Write `model` for photos of their original sizes; return the names of its photos."""
+def _written(model: Any, job: Job) -> Mapping[str, int]:
+    """Write `model` for photos of their original sizes; return the points of each photo."""
     best = Path(job.models, "best")
     best.mkdir()
     _scaled(model, job.sizes).write(best)
-    return sorted(image.name for image in model.images.values())
+    return {image.name: image.num_points3D for image in model.images.values()}
 
 
 def _centred(model: Any, threads: int) -> Any:
