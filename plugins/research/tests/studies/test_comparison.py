@@ -6,9 +6,9 @@ from itertools import product
 import numpy as np
 import pytest
 from commands import done
-from qgs_research.studies.comparison import compare, summary
 from qgs_research.studies.scores import crossed_error, interval
 from qgs_research.studies.stored import StoredResults
+from qgs_research.studies.tables import compare, summary
 from scipy import stats
 from tables import must_refuse, read_json
 

@@ -42,9 +42,9 @@ def compare(
     """
     from qgs.evaluate.results import as_json
     from qgs.files import write_text
-    from qgs_research.studies.comparison import compare as compared
-    from qgs_research.studies.comparison import record, summary
     from qgs_research.studies.stored import read_results
+    from qgs_research.studies.tables import compare as compared
+    from qgs_research.studies.tables import record, summary
 
     console = Console()
     scores = compared([read_results(run) for run in runs], across_protocols)
