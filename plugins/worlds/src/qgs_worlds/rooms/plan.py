@@ -6,7 +6,7 @@ from random import Random
 import numpy as np
 
 from qgs_worlds.caster.interiors import floor_shadows
-from qgs_worlds.caster.shapes import about_z
+from qgs_worlds.caster.shapes import Shape, about_z
 from qgs_worlds.caster.tables import LIGHT, Room
 from qgs_worlds.rooms.furniture import (
     AGAINST_WALLS,
@@ -14,7 +14,6 @@ from qgs_worlds.rooms.furniture import (
     LOOSE,
     Furniture,
     Piece,
-    Shape,
     box,
     cylinder,
     packed,
