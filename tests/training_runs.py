@@ -89,15 +89,14 @@ def stream_of(recipe, seed=0, **options):
     return SampleStream(recipe.build_data(), recipe.views, seed, sampler=sampler, **options)
 
 
-def batches(recipe, count, size, skips=False, **options):
-    """The first training batches."""
-    samples = stream_of(recipe, skips=skips)
+def batches(samples, count, size, **options):
+    """The first training batches of a stream."""
     with closing(training_batches(samples, size, **options)) as stream:
         return list(islice(stream, count))
 
 
 def first_batch(recipe):
-    return batches(recipe, 1, 2)[0]
+    return batches(stream_of(recipe), 1, 2)[0]
 
 
 def losses(run):

@@ -2,8 +2,6 @@
 
 import multiprocessing
 import threading
-from contextlib import closing
-from itertools import islice
 
 import pytest
 import torch
@@ -20,6 +18,7 @@ from qgs.recipe import resolve
 ROOMS = resolve(
     "tiny/tokengs.yaml", ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"]
 )
+SAMPLES = stream_of(ROOMS)
 
 
 def photos(folder):
@@ -43,7 +42,7 @@ def test_running_out_of_memory_is_no_bad_sample(tmp_path, monkeypatch):
 
     monkeypatch.setattr("qgs.data.images.eight_bits", full)
     with pytest.raises(MemoryError):
-        batches(photos(tmp_path / "shelf"), 1, 2, True)
+        batches(stream_of(photos(tmp_path / "shelf"), skips=True), 1, 2)
 
 
 def test_worker_processes_change_nothing_and_end_with_an_error_that_names_the_file(tmp_path):
@@ -75,31 +74,31 @@ def test_reading_ahead_leaves_the_autocast_of_training_alone():
     x = torch.ones(1, 4)
     with torch.autocast("cpu", torch.bfloat16):
         first = torch.nn.functional.linear(x, weight).grad_fn
-        batches(ROOMS, 2, 1)
+        batches(SAMPLES, 2, 1)
         second = torch.nn.functional.linear(x, weight).grad_fn
     one, other = (node.next_functions[-1][0].next_functions[0][0] for node in (first, second))
     assert one is other
 
 
 def test_closing_ends_the_thread():
-    batches(ROOMS, 1, 1)
+    batches(SAMPLES, 1, 1)
     assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]
 
 
 def test_processes_share_what_one_would_see():
     processes = 3
-    alone = batches(ROOMS, 3, 2 * processes)
+    alone = batches(SAMPLES, 3, 2 * processes)
     assert len({*alone[0].scenes[:5]}) == 5, "an epoch visits every scene once"
     assert alone[0].inputs.images.is_contiguous()
     for rank in range(processes):
         own = {"rank": rank, "processes": processes}
-        part = batches(ROOMS, 3, 2, **own)
+        part = batches(SAMPLES, 3, 2, **own)
         place = slice(2 * rank, 2 * rank + 2)
         for whole, ours in zip(alone, part, strict=True):
             assert ours.scenes == whole.scenes[place]
             assert_equal(ours.inputs.images, whole.inputs.images[place])
             assert_equal(ours.targets.cameras.c2w, whole.targets.cameras.c2w[place])
-        assert_same(batches(ROOMS, 1, 2, **own, start=2), part[2:])
+        assert_same(batches(SAMPLES, 1, 2, **own, start=2), part[2:])
 
 
 def test_samples_of_a_step_have_one_image_size_and_one_number_of_inputs():
@@ -109,11 +108,7 @@ def test_samples_of_a_step_have_one_image_size_and_one_number_of_inputs():
     )
     samples = stream_of(recipe, per_step=2, sizes=sizes)
 
-    def found(start, workers=0):
-        with closing(training_batches(samples, 1, start, workers=workers)) as stream:
-            return [*islice(stream, 12 - start)]
-
-    seen = found(0)
+    seen = batches(samples, 12, 1)
     shapes = [batch.inputs.images.shape for batch in seen]
     assert shapes[::2] == shapes[1::2]
     assert [shape[1] for shape in shapes[::2]] == [2, 3, 4, 2, 3, 4]
@@ -121,7 +116,7 @@ def test_samples_of_a_step_have_one_image_size_and_one_number_of_inputs():
     assert all(
         batch.inputs.cameras.size == shape[3:] for batch, shape in zip(seen, shapes, strict=True)
     )
-    assert_same(seen[5:], found(5, workers=1))
+    assert_same(seen[5:], batches(samples, 7, 1, start=5, workers=1))
 
 
 class Grouped(Lines):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from training_runs import batches, tiny
+from training_runs import batches, stream_of, tiny
 
 from qgs.train.distributed import make_accelerator
 from qgs.train.guard import first_bad_tensor, not_finite
@@ -21,7 +21,7 @@ INF = float("inf")
 def step():
     """One step of a small model, of two batches, that can be broken in many places."""
     recipe = tiny("tokengs", "training.render_views=1")
-    drawn = batches(recipe, 2, 2)
+    drawn = batches(stream_of(recipe), 2, 2)
     objective = TrainingPass(recipe, recipe.build_model().train())
     accelerator = make_accelerator("cpu", unread=False)
     gradients = partial(compute_gradients, accelerator, objective, recipe.training, drawn)

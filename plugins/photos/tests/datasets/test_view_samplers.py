@@ -1,19 +1,18 @@
 """Samplers of views: gaps and inputs that follow the training, and photos in any order."""
 
 from functools import partial
-from itertools import islice
 
 import numpy as np
 import torch
 from line_scenes import Line, Lines, drawn, judged_samples, samples_of
 from qgs_photos.datasets.view_samplers import Bounded, Farthest, Overlapping
 from tables import must_refuse
-from training_runs import stream_of
+from training_runs import batches, stream_of
 from walk import arc
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.stream import trained_domain, training_batches
+from qgs.data.stream import trained_domain
 from qgs.recipe import resolve
 
 TWO = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
@@ -61,9 +60,9 @@ def small(*options):
     return resolve("tiny/tokengs_bounded.yaml", [*options, "data.image_size=[16, 16]"])
 
 
-def batches(recipe, start, count):
+def in_steps(recipe, start, count):
     """Two samples a batch, two batches a step."""
-    return [*islice(training_batches(stream_of(recipe, per_step=4), 2, start), count)]
+    return batches(stream_of(recipe, per_step=4), count, 2, start=start)
 
 
 def test_a_training_widens_the_gap_and_resumes_where_it_was():
@@ -71,7 +70,7 @@ def test_a_training_widens_the_gap_and_resumes_where_it_was():
     recipe = small("view_sampler.warm_up_steps=5", "view_sampler.initial_max_gap=2")
 
     def gaps(start, count):
-        found = [x for batch in batches(recipe, start, count) for x in batch.input_frames]
+        found = [x for batch in in_steps(recipe, start, count) for x in batch.input_frames]
         return [frames[-1] - frames[0] for frames in found]
 
     whole = gaps(0, 14)
@@ -127,7 +126,7 @@ def test_inputs_stand_where_cameras_move():
 def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
     gaps = "min_gap: 3, max_gap: 7, initial_min_gap: 3, initial_max_gap: 7"
     recipe = small(f"view_sampler={{type: datasets/farthest, {gaps}}}", "views.inputs=4")
-    counts = [batch.inputs.images.shape[1] for batch in batches(recipe, 0, 8)]
+    counts = [batch.inputs.images.shape[1] for batch in in_steps(recipe, 0, 8)]
     assert counts == [2, 2, 3, 3, 4, 4, 2, 2]
     assert trained_domain(stream_of(recipe), steps=600).ranges["views"] == (2, 4)
 
