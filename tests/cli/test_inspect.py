@@ -49,6 +49,10 @@ compose absent.yaml; absent.yaml does not exist
 compose slow.yaml; slow.yaml:12: optimizer.parts.encodr
 list querys; did you mean `queries`
 eval absent; absent
+bench tiny/tokengs.yaml --size 16; --size must be HxW in pixels, such as 256x448, got '16'
+bench tiny/tokengs.yaml --size 16x0; got '16x0'
+bench tiny/tokengs.yaml --size 15x24 --device cpu; 15 x 24
+bench tiny/tokengs.yaml --precision fp16 --device cpu; fp16
 """
 
 

@@ -2,10 +2,9 @@
 
 import re
 
-import yaml
-from commands import done, typed
+from commands import typed
 from qgs_research.bench import run
-from tables import must_refuse, read_json
+from tables import read_json
 
 TOKENGS = "tiny/tokengs.yaml"
 LOCUS = "tiny/locus.yaml"
@@ -51,16 +50,3 @@ def test_a_report_replaces_nothing(tmp_path):
     file.write_text('{"mine": true}')
     assert isinstance(bench(f"{TOKENGS} --json {file}").exception, FileExistsError)
     assert file.read_text() == '{"mine": true}'
-
-
-MISTAKES = """
---size 16: "16"
---size 16x0: "16"
---size 15x24: 15 x 24
---precision fp16: fp16
-"""
-
-
-def test_mistakes():
-    for words, named in yaml.safe_load(MISTAKES).items():
-        must_refuse(named, done, *f"bench {TOKENGS} {words} --device cpu".split())
