@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from commands import done
 from tables import must_refuse
+from training_runs import run, tiny
 from walk import Walk
 
 import qgs
@@ -75,13 +75,4 @@ def test_depth_maps_keep_a_search_on_inputs_alone_near_their_depth(monkeypatch):
 
 
 def test_training_and_evaluation_refuse_a_search(tmp_path):
-    words = ("--set", "views.scale=search", "--set", "training.steps=1")
-    must_refuse(
-        r"views\.scale: search",
-        done,
-        "train",
-        "tiny/tokengs.yaml",
-        "--out",
-        tmp_path / "run",
-        *words,
-    )
+    must_refuse(r"views\.scale: search", run, tiny("tokengs", "views.scale=search"), tmp_path)
