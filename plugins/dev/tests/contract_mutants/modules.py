@@ -8,9 +8,11 @@ from contract_mutants.slots import ChangedSquares
 from contract_mutants.sound import ChangedEncoder
 from contract_mutants.spatial import AtPlaces, BiasedAttention, Extended, PlacesByALayer
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
+from small_parts import made
 from torch import Tensor, nn
 
-from qgs.contracts import ComponentConfig
+from qgs.checkpoint.tensors import shapes_of
+from qgs.contracts import ComponentConfig, ModelDims
 from qgs.losses import Opacity
 from qgs.tokengs import (
     ContentCrossAttention,
@@ -107,16 +109,7 @@ class ReadsItsWeightOnce(Opacity):
         return self.weight * -(prediction.gaussians.opacities + self.config.eps).log().mean()
 
 
-PINNED = {
-    "norm.weight": (32,),
-    "norm.bias": (32,),
-    "mlp.fc1.weight": (128, 32),
-    "mlp.fc1.bias": (128,),
-    "mlp.fc2.weight": (32, 128),
-    "mlp.fc2.bias": (32,),
-}
-
-
+PINNED = shapes_of(made(MlpFeedForward, ModelDims(32, 4, 1)).state_dict())
 """What saved weights of `qgs/mlp` hold in a model of width 32."""
 
 
