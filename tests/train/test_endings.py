@@ -30,6 +30,8 @@ from qgs.train.folder import RunFolder
 from qgs.train.guard import OutOfMemoryError
 from qgs.train.tracking import TrainingProgress
 
+LONGER = tiny("locus", *TRAINED, "training.steps=4")
+
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_ends(tmp_path, monkeypatch, number):
@@ -130,18 +132,16 @@ def test_a_full_disk_is_told_with_what_to_do(copied, monkeypatch):
         path.write_bytes(bytes(40_000))
         raise SafetensorError("I/O error: No space left on device (os error 28)")
 
-    recipe = tiny("locus", *TRAINED, "training.steps=4")
     state = RunFolder(copied).state
     whole = state.read_bytes()
     with monkeypatch.context() as patch:
         patch.setattr("qgs.checkpoint.tensors.save_file", full)
-        must_refuse("--resume", resume, recipe, copied, kind=OSError)
+        must_refuse("--resume", resume, LONGER, copied, kind=OSError)
     assert state.read_bytes() == whole
-    assert resume(recipe, copied).steps == 4
+    assert resume(LONGER, copied).steps == 4
 
 
 def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
-    recipe = tiny("locus", *TRAINED, "training.steps=4")
     state = RunFolder(copied).state
     with safe_open(state, "pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -162,7 +162,7 @@ def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
     for content in damaged:
         state.write_bytes(content)
         before = contents(copied)
-        must_refuse(str(state), resume, recipe, copied, kind=CheckpointError)
+        must_refuse(str(state), resume, LONGER, copied, kind=CheckpointError)
         assert before == contents(copied)
 
 

@@ -143,10 +143,12 @@ class Arc(Line):
         return arc((0.5 / DEPTH * (SHUFFLED - 20)).rad2deg(), DEPTH)
 
 
+HELD_OUT = Arc(40, held_out=(0, 8, 16))
+
+
 def draws(count, views=TWO, **options):
     sampler = made(Overlapping, **options)
-    scene = Arc(40, held_out=(0, 8, 16))
-    return [drawn(scene, views, k, 0, sampler) for k in range(count)]
+    return [drawn(HELD_OUT, views, k, 0, sampler) for k in range(count)]
 
 
 def steps(frames):
@@ -183,8 +185,7 @@ def test_apart_moves_inputs_apart():
 
 
 def test_every_held_out_photo_is_judged_with_inputs_beside_it():
-    scene = Arc(40, held_out=(0, 8, 16))
-    samples = samples_of(Lines(scene), TWO, EvaluationConfig(), SAMPLER)
+    samples = samples_of(Lines(HELD_OUT), TWO, EvaluationConfig(), SAMPLER)
     assert [sample.target_frames for sample in samples] == [(0,), (8,), (16,)]
     for sample in samples:
         first, last = steps(sample.input_frames)
