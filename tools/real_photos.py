@@ -32,7 +32,7 @@ from torch import Tensor
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.data.inputs import scene_depth
 from qgs.data.samples import Sample, make_sample, own_world
-from qgs.metrics.baselines import nearest_input
+from qgs.metrics.baselines import nearest_input, pose_distance
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.scale import at_factor, constant_scale, find_scale
@@ -119,9 +119,8 @@ def rendered(
 
 def on_a_plane(inputs: Views, targets: Cameras, depth: float) -> Tensor:
     """Return for each target the nearest input, warped as a plane at `depth`, (1, T, 3, H, W)."""
-    numbers = torch.arange(inputs.images.shape[1]).view(1, -1, 1, 1, 1)
-    by_number = Views(numbers.float().expand_as(inputs.images), inputs.cameras)
-    nearest = inputs.select(nearest_input(by_number, targets)[0, :, 0, 0, 0].int().tolist())
+    index = pose_distance(inputs.cameras.c2w, targets.c2w)[0].argmin(-1)
+    nearest = inputs.select(index.tolist())
     pose_T44 = nearest.cameras.w2c[0] @ targets.c2w[0]
     step_T3 = pose_T44[:, :3, 3]
     # Of the points of a ray, which the nearest camera turns and shifts, the one at this depth.
