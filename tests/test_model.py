@@ -4,6 +4,7 @@ import re
 
 import pytest
 import torch
+from commands import SMALL
 from odd_views import odd_views
 from tables import must_refuse
 
@@ -11,8 +12,7 @@ import qgs
 
 
 def small(name, *overrides):
-    overrides = ["model.width=32", "model.heads=2", "model.queries.count=12", *overrides]
-    return qgs.compose(f"tiny/{name}.yaml", overrides).eval()
+    return qgs.compose(f"tiny/{name}.yaml", [*SMALL, *overrides]).eval()
 
 
 @pytest.fixture(params=["tokengs", "locus"])
@@ -27,7 +27,7 @@ def views():
 
 def test_the_api_in_five_lines(model, views, tmp_path):
     gaussians = model(views).gaussians
-    assert gaussians.means.shape == (2, 12 * 8, 3)
+    assert gaussians.means.shape == (2, 8 * 8, 3)
     black, white = (
         model.render(gaussians, views.cameras, torch.full((3,), grey)) for grey in (0.0, 1.0)
     )
@@ -53,7 +53,7 @@ def test_a_model_says_its_slots_in_a_few_lines():
     heading, *lines = repr(model).splitlines()
     total = sum(parameter.numel() for parameter in model.parameters())
     assert f"{total:,} parameters" in heading
-    assert "12 queries of 8 Gaussians" in heading
+    assert "8 queries of 8 Gaussians" in heading
     cells = r"^  decoder\.cross_attention +qgs/content, locus/ray_biased +[\d,]+$"
     assert re.search(cells, repr(model), re.M)
     assert sum(int(line.split()[-1].replace(",", "")) for line in lines[:10]) == total

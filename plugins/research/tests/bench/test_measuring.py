@@ -7,6 +7,7 @@ from unittest.mock import Mock, call
 
 import torch
 import torch.nn.functional as F
+from commands import SMALL
 from qgs_research.bench.run import (
     Workload,
     forward_flops,
@@ -23,7 +24,6 @@ from torch import nn
 from qgs.recipe import resolve
 
 TOKENGS = "tiny/tokengs.yaml"
-SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]
 MODEST = Workload(views=2, targets=2, size=(16, 24))
 
 
