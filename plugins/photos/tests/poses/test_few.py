@@ -1,15 +1,17 @@
 """Poses of two photos: from features whose truth is known, and of a textured room."""
 
-from importlib.util import find_spec
-from itertools import combinations
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pycolmap
 import pytest
+import torch
+import torch.nn.functional as F
 from commands import run_qgs
 from PIL import Image
-from qgs_photos.poses import making, worker
-from qgs_photos.poses.few import RefusedError, beginning, described
+from qgs_photos.poses import learned, making, worker
+from qgs_photos.poses.few import NO_MATCHES, RefusedError, beginning, described
 from qgs_photos.poses.two_views import linked
 from upath import UPath
 from walked import PHOTOS, QUIET, write_photos
@@ -120,23 +122,58 @@ def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, l
     assert len(made.posed) == PHOTOS
 
 
-def by_sift(photos, weights, threads):
-    """What `features_and_links` returns."""
-    extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
-    points, descriptors = [], []
-    for photo in photos:
-        pixels = np.array(Image.open(photo).convert("L"))
-        found, own = extractor.extract_from_uint8_array(pixels)
-        points.append(np.array([(point.x, point.y) for point in found]))
-        data = own.data.astype(float)
-        descriptors.append(data / np.linalg.norm(data, axis=1, keepdims=True))
-    pairs = combinations(range(len(photos)), 2)
-    return points, {(a, b): linked(descriptors[a], descriptors[b]) for a, b in pairs}
+class Sift:
+    """A network that finds the features of SIFT, as ALIKED does."""
+
+    def __call__(self, pixels):
+        extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
+        grey = (255 * pixels[0].mean(0)).byte().numpy()
+        points, found = extractor.extract_from_uint8_array(grey)
+        places = torch.tensor([(point.x - 0.5, point.y - 0.5) for point in points])
+        data = F.normalize(torch.from_numpy(found.data.astype(np.float32)), dim=-1)
+        return [SimpleNamespace(keypoints=places.reshape(-1, 2), descriptors=data.reshape(-1, 128))]
 
 
-def test_few_photos_get_poses_by_learned_features(walk, tmp_path, monkeypatch):
-    monkeypatch.setattr(worker, "find_spec", lambda name: find_spec("qgs_photos"))
-    monkeypatch.setattr("qgs_photos.poses.learned.features_and_links", by_sift)
+def matcher(given):
+    """As LightGlue does."""
+    one, other = (given[name]["descriptors"][0].numpy() for name in ("image0", "image1"))
+    if not len(one) or not len(other):
+        return {"matches": [torch.zeros(0, 2).long()], "scores": [torch.zeros(0)]}
+    links = linked(one, other)
+    return {
+        "matches": [torch.from_numpy(links.indices)],
+        "scores": [torch.from_numpy(links.right)],
+    }
+
+
+@pytest.fixture
+def learning(monkeypatch, tmp_path):
+    monkeypatch.setattr(worker, "weights", lambda: tmp_path)
+    monkeypatch.setattr(learned, "SIDE", 200)
+    monkeypatch.setattr(learned, "ALIKED", lambda *_, **__: Sift())
+    monkeypatch.setattr(learned, "LightGlue", lambda *_, **__: matcher)
+    monkeypatch.setattr(learned, "_load", lambda *_: None)
     monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())
+
+
+@pytest.mark.usefixtures("learning")
+def test_learned_features_give_poses_where_the_photos_have_them(images, shots, tmp_path):
+    """Of a reduced photo, a grey one, and one without any."""
+    grey = Image.fromarray(images[3]).convert("L")
+    write_photos(tmp_path / "two", [np.array(grey), images[5], np.zeros((64, 64, 3), np.uint8)])
+    made = making.make_poses(tmp_path / "two", tmp_path / "made", making.Options(), QUIET)
+    assert len(made.posed) == 2
+    assert "ALIKED" in made.remarks[0]
+    one, other = (frame.c2w for frame in read_listing(UPath(tmp_path / "made")).frames)
+    true = np.linalg.inv(shots[5].c2w) @ shots[3].c2w
+    assert_within(2, np.linalg.inv(other) @ one, true[:3, :3], true[:3, 3])
+
+
+@pytest.mark.usefixtures("learning")
+def test_learned_features_connect_photos_or_sift_does(walk, tmp_path, monkeypatch):
     made = making.make_poses(walk, tmp_path / "made", making.Options(side=240), QUIET)
     assert len(made.posed) == PHOTOS
+    monkeypatch.setattr(learned, "learn", Mock(side_effect=RefusedError(NO_MATCHES)))
+    made = making.make_poses(walk, tmp_path / "again", making.Options(side=240), QUIET)
+    assert len(made.posed) == PHOTOS
+    assert not any("ALIKED" in remark for remark in made.remarks)

@@ -11,7 +11,7 @@ import textured_room
 from photo_formats import opened
 from PIL import Image
 from qgs_photos.poses import door, making
-from qgs_photos.poses.making import Options, Poses, make_poses
+from qgs_photos.poses.making import Options, make_poses
 from qgs_photos.poses.photos import PosesError
 from qgs_photos.poses.worker import likely
 from tables import must_not_find, must_refuse, names_in, read_json
@@ -39,11 +39,6 @@ def assert_close(folder, shots):
 
 def record_in(folder):
     return read_json(folder / "poses.json")
-
-
-def test_photos_with_few_points_are_named():
-    *_, unsure = Poses({"a.jpg": 12, "b.jpg": 300}, (), {}, ()).summary
-    assert unsure.endswith("may be wrong: a.jpg (12)")
 
 
 def test_photos_get_the_poses_they_were_taken_with(made, shots):

@@ -25,6 +25,9 @@ PARALLAX = 10
 LENSES = (0.6, 3.7)
 """Range of the focal lengths that a pair gives, in units of the longer side. Photos of two lenses
 seem to have one beyond; so do 5 % of real pairs, nearly all of a lens of 3.0."""
+MOST_DOUBT = 0.97 * USUAL[1]
+"""Deviation of the logarithm of a focal length from which on matches say nothing about it, as those
+of a photo with its mirror image."""
 LEAST_DOUBT = 0.1
 """Least deviation of the logarithm of a focal length that matches of a pair give."""
 BETTER = 50
@@ -85,13 +88,15 @@ def pairs(seen: Mapping[int, View], links: Linked) -> Pairs:
     seen: features of all photos, by number.
     """
     sure = dict[tuple[int, int], TwoViews]()
-    for (one, other), own in links.items():
-        pair = two_views(seen[one], seen[other], own)
-        if pair and pair.score >= own.limits.score:
+    for (one, other), matches in links.items():
+        pair = two_views(seen[one], seen[other], matches)
+        if pair and pair.score >= matches.limits.score:
             sure[one, other] = pair
     if not sure:
         raise RefusedError(NO_MATCHES)
-    apart = {images: own for images, own in sure.items() if own.focals[0] > PARALLAX * own.depth}
+    apart = {
+        images: pair for images, pair in sure.items() if pair.focals[0] > PARALLAX * pair.depth
+    }
     if not apart:
         raise RefusedError(ONE_PLACE)
     return apart
@@ -108,13 +113,13 @@ def described(database: Any) -> Linked:
 
 
 def views(database: Any) -> Mapping[int, View]:
-    """Return the features of all photos that have any, by number."""
+    """Return the features of all photos, by number."""
     found = dict[int, View]()
     for image in database.read_all_images():
-        if not database.num_keypoints_for_image(image.image_id):
-            continue
         camera = database.read_camera(image.camera_id)
-        points = database.read_keypoints(image.image_id)[:, :2]
+        points = np.zeros((0, 2))
+        if database.num_keypoints_for_image(image.image_id):
+            points = database.read_keypoints(image.image_id)[:, :2]
         found[image.image_id] = View(
             points=points - [camera.principal_point_x, camera.principal_point_y],
             side=max(camera.width, camera.height),
@@ -138,7 +143,8 @@ def set_focals(database: Any, links: Linked) -> list[str]:
     if not told:
         for images, pair in pairs(seen, links).items():
             focal = pair.focals[0] / seen[images[0]].side
-            if pair.flat < links[images].limits.flat and LENSES[0] < focal < LENSES[1]:
+            solid = pair.flat < links[images].limits.flat and pair.focal_doubt < MOST_DOUBT
+            if solid and LENSES[0] < focal < LENSES[1]:
                 told.append((focal, np.hypot(pair.focal_doubt, LEAST_DOUBT)))
     if not told:
         raise RefusedError(NO_FOCAL)

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+LENS = "SIMPLE_RADIAL"
+"""COLMAP's camera model for all photos."""
+
 
 @dataclass(frozen=True)
 class Job:

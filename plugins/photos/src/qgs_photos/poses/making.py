@@ -39,8 +39,6 @@ RECORD = "poses.json"
 FEW = 20
 """Largest number of photos for which all pairs are matched. For more photos, pairs that look alike
 are matched."""
-SURE = 50
-"""Number of points in space up to which the pose of a photo may be wrong."""
 MANY = 80
 """Largest number of photos for which pairs that look alike are matched. For more photos, and for
 videos, neighbours in the order of names are matched."""
@@ -70,9 +68,9 @@ class Options:
 class Poses:
     """Result of `make_poses`, with the file names of photos.
 
-    posed: photos with a pose, and how many points in space each shows: the more, the surer.
-    without: photos for which no pose was found. faulty: photos that cannot be read, with the
-    reason. remarks: sentences for the user.
+    posed: photos with a pose, and how many points in space each shows. without: photos for which no
+    pose was found. faulty: photos that cannot be read, with the reason. remarks: sentences for the
+    user.
     """
 
     posed: Mapping[str, int]
@@ -86,8 +84,6 @@ class Poses:
         total = len(self.posed) + len(self.without)
         yield f"{len(self.posed)} of {counted(total, 'photo')} have poses, in an arbitrary unit"
         yield from self.remarks
-        if unsure := [f"{name} ({n})" for name, n in self.posed.items() if n < SURE]:
-            yield f"photos with few points, whose poses may be wrong: {listed(unsure)}"
         if self.faulty:
             reasons = [f"{name} ({reason})" for name, reason in self.faulty.items()]
             yield f"photos that cannot be read: {listed(reasons, 3)}"

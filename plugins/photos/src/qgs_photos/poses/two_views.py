@@ -305,7 +305,10 @@ def _verdict(best: Poses, matches: Matches) -> TwoViews:
     depths = (np.linalg.pinv(system) @ translation[:, None])[..., 0]
     sign = 1.0 if (np.sign(depths) * chances[:, None]).sum() >= 0 else -1.0
     depths = sign * depths
-    right = (depths.min(1) > 0) & (chances > 0.5)
+    front = depths.min(1) > 0
+    right = front & (chances > 0.5)
+    # of what would lie behind a camera, no match is right
+    score = best.scores[0] + (np.log1p(-matches.right) - gains)[~front].sum()
     covariance = np.linalg.inv(_normal(best, matches)[0])[0]
     focal = float(best.focals[0])
     return TwoViews(
@@ -314,7 +317,7 @@ def _verdict(best: Poses, matches: Matches) -> TwoViews:
         focals=(focal, focal / matches.scale),
         points=(one * depths[:, :1])[right],
         indices=matches.indices[right],
-        score=float(best.scores[0]),
+        score=float(score),
         focal_doubt=float(np.sqrt(covariance[6, 6])),
         flat=_flat(matches.one[right], matches.other[right]),
     )

