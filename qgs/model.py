@@ -153,11 +153,9 @@ class QueryGaussianModel(nn.Module):
         for number, index in enumerate(order, start=1):
             if index == again and number > last:
                 before = decoded[number - 1]
-                photos = self.feedback.compared(views)
-                # The rendering is an input of the round, not a loss.
-                with torch.no_grad():
-                    rendering = self.render(before.gaussians, photos.cameras)
-                state, memory = self.feedback(before.state, first, rendering, photos)
+                # Gaussians are an input of the round, not a loss.
+                seen = map_tensors(Tensor.detach, before.gaussians)
+                state, memory = self.feedback(before.state, first, seen, views, self.render)
             elif index == again:
                 first = memory
             refine = self.refinements[self.refinement_of[index]]

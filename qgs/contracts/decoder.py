@@ -6,7 +6,7 @@ refinement runs after each layer.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from qgs.containers import TensorContainer
 from qgs.contracts.component import ComponentConfig, ModelComponent, ModelDims
-from qgs.types import ImageMemory, QueryState, Rendering, Views
+from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Rendering, Views
 
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
@@ -156,12 +156,11 @@ class Refinement(ModelComponent):
 
 
 class Feedback(ModelComponent):
-    """Feedback: (QueryState, ImageMemory, Rendering, Views) -> state and memory of the next round.
+    """Feedback: what the last layer's Gaussians show -> state and memory of the next round.
 
-    A round renders the last layer's Gaussians from the cameras of the input photos, without
-    gradients. Then it runs the last `layers` decoder layers again, which update the state once
-    more. In each round, `forward` gets the image memory that the first of these layers read before
-    any feedback.
+    A round compares these Gaussians with the input photos. Then it runs the last `layers` decoder
+    layers again, which update the state once more. In each round, `forward` gets the image memory
+    that the first of these layers read before any feedback.
 
     layers: number of decoder layers that run again in each round.
     rounds: number of rounds in an evaluation; it may be changed on a built model.
@@ -176,18 +175,18 @@ class Feedback(ModelComponent):
         """Return the number of feedback rounds for one pass in training; it may be random."""
         return self.rounds
 
-    def compared(self, views: Views) -> Views:
-        """Return the input photos, scaled to the image size at which a feedback round renders."""
-        return views
-
     @abstractmethod
     def forward(
-        self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
+        self,
+        state: QueryState,
+        memory: ImageMemory,
+        gaussians: Gaussians,
+        views: Views,
+        render: Callable[[Gaussians, Cameras], Rendering],
     ) -> tuple[QueryState, ImageMemory]:
         """Return the query state and image memory that the first repeated layer reads.
 
         state: the query state after the last layer. memory: the image memory that the first
-            repeated layer read in the first pass. rendering: the last layer's Gaussians, from the
-            cameras of `photos`. photos: the input photos (B, V), which `compared` has scaled to
-            the image size of `rendering`.
+            repeated layer read in the first pass. gaussians: the last layer's Gaussians (B, G),
+            without gradients. views: the input photos (B, V). render: the model's `render`.
         """

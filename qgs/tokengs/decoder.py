@@ -1,5 +1,7 @@
 """The default queries and decoder layer (TokenGS): attention without positions, and an MLP."""
 
+from typing import Any
+
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
@@ -19,7 +21,7 @@ from qgs.contracts import (
     memory_fields,
 )
 from qgs.tokengs.blocks import CrossAttentionCore, LayerScale, Mlp, NormConfig, SelfAttentionCore
-from qgs.types import ImageMemory, QueryState, Rendering, Views
+from qgs.types import ImageMemory, QueryState
 
 
 class LatentQueries(LearnedQueries):
@@ -152,6 +154,6 @@ class NoFeedback(Feedback):
     reads_cameras = False
 
     def forward(
-        self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
+        self, state: QueryState, memory: ImageMemory, *compared: Any
     ) -> tuple[QueryState, ImageMemory]:
         return state, memory

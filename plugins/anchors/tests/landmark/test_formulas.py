@@ -182,11 +182,12 @@ def test_errors_are_added_to_keys_and_values():
     feedback = made(RenderedFeedback, shrink=2, cells=2).double()
     with torch.no_grad():
         feedback.marker += torch.randn(16)
-    given = feedback.compared(VIEWS)
+    given = feedback.shrunk(VIEWS)
     keys, values = drawn(4, 2, 2, 2, TOKENS, 8)
     told = ImageMemory(MEMORY.features, keys, values, grid=GRID)
     rgb, alpha, depth = drawn(5, 2, 2, 5, 8, 12).sigmoid().tensor_split([3, 4], 2)
-    state, after = feedback(CLOUD, told, Rendering(rgb, alpha, depth), given)
+    found = Rendering(rgb, alpha, depth)
+    state, after = feedback(CLOUD, told, None, VIEWS, lambda _, cameras: found)
     assert_close(state.features, CLOUD.features + feedback.marker)
     wrong = torch.cat([4 * (given.images - rgb), rgb, alpha], 2)  # 2 x 2 cells a token: all pixels
     shuffled = F.pixel_unshuffle(wrong.flatten(0, 1), 2)

@@ -61,11 +61,10 @@ def test_rounds_run_the_last_layers_on_the_first_memory():
     found = model(given, layers=[1])
     memory = after = model.encoder(given)
     state = model.queries(memory, given)
-    small = model.feedback.compared(given)
     state, after = run(model, (0, 1, 2), state, after)
     for _ in range(2):
-        rendering = model.render(model.decode(state), small.cameras)
-        state, after = model.feedback(state, memory, rendering, small)
+        gaussians = model.decode(state)
+        state, after = model.feedback(state, memory, gaussians, given, model.render)
         state, after = run(model, (1, 2), state, after)
     assert list(found.layers) == [1, 3, 5, 7]
     assert model.depth == 7

@@ -11,8 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.containers import map_tensors
-from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, ModelDims
+from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, ModelDims, Renderer
 from qgs.geometry.rays import patch_rays, plucker_rays
+from qgs.renderers import TorchRenderer
 from qgs.types import Cameras, Gaussians, ImageMemory, LayerPrediction, QueryState, Rendering, Views
 from qgs_dev.case import Case
 
@@ -178,8 +179,6 @@ class Maker:
         times = self.uniform(0, 1, "BV")
         return replace(views, times=times, target_time=times[:, :1])
 
-    photos = views
-
     def memory(self) -> ImageMemory:
         """Return a random `ImageMemory` with one camera ray per patch of PATCH x PATCH pixels."""
         height, width = self.shape("HW")
@@ -234,6 +233,10 @@ class Maker:
             depth=self.uniform(1, 2, "BV1HW"),
             features=self.uniform(0, 1, "BV4HW") if self.gives("features") else None,
         )
+
+    def render(self) -> Renderer:
+        """Return a renderer that has gradients, and runs on any device."""
+        return TorchRenderer(TorchRenderer.Config())
 
     def target(self) -> Views:
         """Return random images, cameras and masks; and depth maps for a loss that reads them."""

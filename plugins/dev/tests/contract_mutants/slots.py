@@ -69,11 +69,16 @@ class IgnoresRounds(LayerSupervision):
         return super().weights()
 
 
-@mutant("feedback_compares_the_photos", "other rays through their corners")
-class HalvesTheLensAlone(NoFeedback):
-    def compared(self, views):
-        cameras = replace(views.cameras, intrinsics=views.cameras.intrinsics / 2)
-        return replace(views, cameras=cameras)
+@mutant("feedback_repeats_layers", "repeats 3 layers of a decoder with 2")
+class RepeatsTooMuch(NoFeedback):
+    rounds = 1
+    layers = 3
+
+
+@mutant("feedback_repeats_layers", "in `torch.inference_mode`, 0.features: values differ")
+class NeedsGradients(NoFeedback):
+    def forward(self, state, memory, *compared):
+        return state.replace(features=state.features + torch.is_grad_enabled()), memory
 
 
 class NoiseScene(Scene):

@@ -3,7 +3,7 @@
 In a round, the model renders the input photos and runs its last decoder layers again.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 import torch
@@ -20,7 +20,7 @@ from qgs.contracts import (
     memory_fields,
 )
 from qgs.tokengs.blocks import split_heads
-from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
+from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Rendering, Views
 
 CHANNELS = 7
 """Channels of an error map: photo minus rendering (RGB), rendering (RGB), alpha."""
@@ -96,7 +96,7 @@ class RenderedFeedback(Feedback):
         """Return a random number of rounds, uniformly from `least` to `rounds`."""
         return int(torch.randint(self.config.least, self.config.rounds + 1, ()))
 
-    def compared(self, views: Views) -> Views:
+    def shrunk(self, views: Views) -> Views:
         """Return the photos to compare with renderings: averaged to 1/`shrink` of their size."""
         by = self.config.shrink
         cameras = views.cameras
@@ -106,8 +106,16 @@ class RenderedFeedback(Feedback):
         return Views(images, Cameras(cameras.c2w, cameras.intrinsics / by, size))
 
     def forward(
-        self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
+        self,
+        state: QueryState,
+        memory: ImageMemory,
+        gaussians: Gaussians,
+        views: Views,
+        render: Callable[[Gaussians, Cameras], Rendering],
     ) -> tuple[QueryState, ImageMemory]:
+        photos = self.shrunk(views)
+        with torch.no_grad():
+            rendering = render(gaussians, photos.cameras)
         assert memory.grid is not None
         _, rows, columns = memory.grid
         # The rendering is an input too: an error means something else where nothing was drawn.

@@ -30,7 +30,7 @@ RTOL = 1e-4
 ATOL = 1e-5
 
 # Arguments with one entry for every view.
-VIEW_INPUTS = ("views", "memory", "cameras", "rendering", "photos", "target", "inputs")
+VIEW_INPUTS = ("views", "memory", "cameras", "rendering", "target", "inputs")
 
 # Rigid motion of the world that is not about or along any of its axes.
 POSE = (
