@@ -152,10 +152,7 @@ class QueryGaussianModel(nn.Module):
         first = memory
         for number, index in enumerate(order, start=1):
             if index == again and number > last:
-                before = decoded[number - 1]
-                # Gaussians are an input of the round, not a loss.
-                seen = map_tensors(Tensor.detach, before.gaussians)
-                state, memory = self.feedback(before.state, first, seen, views, self.render)
+                state, memory = self.feedback(state, first, views, self.decode, self.render)
             elif index == again:
                 first = memory
             refine = self.refinements[self.refinement_of[index]]

@@ -156,11 +156,11 @@ class Refinement(ModelComponent):
 
 
 class Feedback(ModelComponent):
-    """Feedback: what the last layer's Gaussians show -> state and memory of the next round.
+    """Feedback: (QueryState, ImageMemory, Views) -> the state and memory of the next round.
 
-    A round compares these Gaussians with the input photos. Then it runs the last `layers` decoder
-    layers again, which update the state once more. In each round, `forward` gets the image memory
-    that the first of these layers read before any feedback.
+    A round compares renderings of the last layer's Gaussians with the input photos. Then it runs
+    the last `layers` decoder layers again, which update the state once more. In each round,
+    `forward` gets the image memory that the first of these layers read before any feedback.
 
     layers: number of decoder layers that run again in each round.
     rounds: number of rounds in an evaluation; it may be changed on a built model.
@@ -180,13 +180,13 @@ class Feedback(ModelComponent):
         self,
         state: QueryState,
         memory: ImageMemory,
-        gaussians: Gaussians,
         views: Views,
+        decode: Callable[[QueryState], Gaussians],
         render: Callable[[Gaussians, Cameras], Rendering],
     ) -> tuple[QueryState, ImageMemory]:
         """Return the query state and image memory that the first repeated layer reads.
 
         state: the query state after the last layer. memory: the image memory that the first
-            repeated layer read in the first pass. gaussians: the last layer's Gaussians (B, G),
-            without gradients. views: the input photos (B, V). render: the model's `render`.
+            repeated layer read in the first pass. views: the input photos (B, V). decode, render:
+            the methods of the model. What is compared with photos must have no gradients.
         """

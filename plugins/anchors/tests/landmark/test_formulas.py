@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from odd_views import in_tiles
 from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters, FramedRefinement
+from qgs_anchors.landmark.gradient import GradientFeedback
 from qgs_anchors.landmark.neighbours import NeighbourAttention
 from qgs_anchors.landmark.observed import ObservedQueries
 from qgs_anchors.landmark.rendered import RenderedFeedback
@@ -178,6 +179,30 @@ def test_what_an_anchor_reads_of_the_nearest_is_written_out(monkeypatch):
         assert_close(module(CLOUD), expected, rtol=1e-4, atol=1e-3)
 
 
+def test_steps_against_the_gradient_are_written_out():
+    """The error of a linear rendering A f has the gradient 2 A^T (A f - y); padding has none."""
+    feedback = shaken(made(GradientFeedback, steps=2))
+    matrix = drawn(8, VIEWS.images[0].numel(), 640) / 25
+
+    def render(features, _):
+        rgb = (features[:, :40].flatten(1) @ matrix.T).view_as(VIEWS.images)
+        return Rendering(rgb, rgb[:, :, :1], rgb[:, :, :1])
+
+    f_BX = CLOUD.features.flatten(1)
+    step_BX = 0
+    for _ in range(2):
+        g_BX = (f_BX @ matrix.T - VIEWS.images.flatten(1)) @ matrix
+        g_BX = g_BX / g_BX.square().mean(1, keepdim=True).sqrt()
+        h_BX = g_BX.sign() * (1 + g_BX.abs()).log()
+        step_BX = 0.5 * step_BX - feedback.rate.repeat(40) * h_BX
+        f_BX = f_BX + step_BX
+    expected = f_BX.view(2, 40, 16) + feedback.marker
+    mask_BN = (torch.arange(47) < 40).expand(2, -1)
+    padded = QueryState(F.pad(CLOUD.features, (0, 0, 0, 7)), mask=mask_BN)
+    state, _ = feedback(padded, MEMORY, VIEWS, lambda x: x.features, render)
+    assert_close(state.features[:, :40], expected)
+
+
 def test_errors_are_added_to_keys_and_values():
     feedback = made(RenderedFeedback, shrink=2, cells=2).double()
     with torch.no_grad():
@@ -187,7 +212,7 @@ def test_errors_are_added_to_keys_and_values():
     told = ImageMemory(MEMORY.features, keys, values, grid=GRID)
     rgb, alpha, depth = drawn(5, 2, 2, 5, 8, 12).sigmoid().tensor_split([3, 4], 2)
     found = Rendering(rgb, alpha, depth)
-    state, after = feedback(CLOUD, told, None, VIEWS, lambda _, cameras: found)
+    state, after = feedback(CLOUD, told, VIEWS, lambda state: None, lambda *given: found)
     assert_close(state.features, CLOUD.features + feedback.marker)
     wrong = torch.cat([4 * (given.images - rgb), rgb, alpha], 2)  # 2 x 2 cells a token: all pixels
     shuffled = F.pixel_unshuffle(wrong.flatten(0, 1), 2)

@@ -1,5 +1,6 @@
 """Rounds of feedback: a model's passes against calls of its parts, training, traces, refusals."""
 
+import pytest
 import torch
 import yaml
 from commands import done
@@ -54,17 +55,21 @@ def run(model, layers, state, memory):
     return state, memory
 
 
+GRADIENT = "model.feedback={type: landmark/gradient, rounds: 2, layers: 2, steps: 1}"
+KINDS = pytest.mark.parametrize("kind", [(), (GRADIENT,)], ids=["rendered", "gradient"])
+
+
+@KINDS
 @torch.no_grad()
-def test_rounds_run_the_last_layers_on_the_first_memory():
-    model = built()
+def test_rounds_run_the_last_layers_on_the_first_memory(kind):
+    model = built(*kind)
     given = views()
     found = model(given, layers=[1])
     memory = after = model.encoder(given)
     state = model.queries(memory, given)
     state, after = run(model, (0, 1, 2), state, after)
     for _ in range(2):
-        gaussians = model.decode(state)
-        state, after = model.feedback(state, memory, gaussians, given, model.render)
+        state, after = model.feedback(state, memory, given, model.decode, model.render)
         state, after = run(model, (1, 2), state, after)
     assert list(found.layers) == [1, 3, 5, 7]
     assert model.depth == 7
@@ -73,7 +78,8 @@ def test_rounds_run_the_last_layers_on_the_first_memory():
     assert not torch.allclose(found.layers[3].gaussians.means, found.gaussians.means)
 
 
-def test_an_evaluation_sets_the_number_of_rounds(tmp_path):
+@KINDS
+def test_an_evaluation_sets_the_number_of_rounds(tmp_path, kind):
     """The scores of N rounds are those of a model whose recipe has N."""
     rooms = (
         "plugins=[landmark, locus, rooms]",
@@ -86,7 +92,7 @@ def test_an_evaluation_sets_the_number_of_rounds(tmp_path):
         torch.manual_seed(0)
         file = tmp_path / f"{made}.safetensors"
         out = tmp_path / f"{made}{asked}"
-        qgs.save(built(*rooms, f"model.feedback.rounds={made}"), file)
+        qgs.save(built(*rooms, *kind, f"model.feedback.rounds={made}"), file)
         done("eval", file, "--set", f"model.feedback.rounds={asked}", "--out", out)
         return (out / "scenes.csv").read_text()
 
@@ -96,9 +102,10 @@ def test_an_evaluation_sets_the_number_of_rounds(tmp_path):
     must_refuse("would change the trained model", done, "eval", file, *wrong)
 
 
-def test_training_supervises_every_round_it_draws_and_learns():
+@KINDS
+def test_training_supervises_every_round_it_draws_and_learns(kind):
     """The total is that of the layers and of the ends of rounds, later ones weighing more."""
-    recipe = resolve(RECIPE)
+    recipe = resolve(RECIPE, kind)
     model = recipe.build_model().train()
     given = views(side=16)
     ends = set()
@@ -117,7 +124,7 @@ def test_training_supervises_every_round_it_draws_and_learns():
         assert_close(outcome.total, expected / sum(range(len(layers) + 1)))
     assert ends == {5, 7}
     outcome.total.backward()
-    torch.optim.SGD(model.parameters(), 0.01).step()
+    torch.optim.Adam(model.parameters(), 0.001).step()
     torch.manual_seed(seed)
     assert passes(given, given).total < outcome.total
 
@@ -154,14 +161,16 @@ def started(learned, file, *overrides):
     return model, initialise(model, recipe)
 
 
+@KINDS
 @torch.no_grad()
-def test_a_model_without_rounds_starts_one_with_rounds(tmp_path):
+def test_a_model_without_rounds_starts_one_with_rounds(tmp_path, kind):
     """They repeat its layers: what they add to keys, values and features is 0 at first."""
     plain = built(NO_ROUNDS)
-    model, said = started(plain, tmp_path / "plain.safetensors")
+    model, said = started(plain, tmp_path / "plain.safetensors", *kind)
     given = views()
     assert "feedback.marker: none -> (32,)" in said
-    assert "trained with model.feedback.type: qgs/none (here landmark/rendered)" in said
+    here = f"landmark/{model.feedback.name}"
+    assert f"trained with model.feedback.type: qgs/none (here {here})" in said
     weights = model.state_dict()
     kept = plain.state_dict()
     assert_equal({name: weights[name] for name in kept}, kept)
@@ -176,3 +185,17 @@ def test_rounds_start_from_rounds_of_their_kind(tmp_path):
     assert_equal(more.state_dict(), given[0].state_dict())
     for other in (NO_ROUNDS, "model.feedback.cells=1"):
         must_refuse(r"feedback\.embedding\.weight", started, *given, other, kind=CheckpointError)
+
+
+@pytest.mark.parametrize("name", ["tokengs", "locus", "landmark"])
+def test_gradients_lower_the_error_of_the_photos(name):
+    """In every model, even before it is trained."""
+    given = views(side=16)
+    swap = ("plugins=[locus, landmark, rooms]", GRADIENT)
+    model = resolve(f"tiny/{name}.yaml", swap).build_model().eval()
+    errors = []
+    for model.feedback.rounds in (0, 1):
+        with torch.inference_mode():
+            rendering = model.render(model(given).gaussians, given.cameras)
+        errors.append((rendering.rgb - given.images).square().sum())
+    assert errors[1] < errors[0]

@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -11,9 +12,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.containers import map_tensors
-from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, ModelDims, Renderer
-from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.renderers import TorchRenderer
+from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, ModelDims
+from qgs.geometry.rays import patch_rays, pixel_directions, plucker_rays
+from qgs.geometry.transforms import to_camera
+from qgs.precision import at_least_float32, full_precision
 from qgs.types import Cameras, Gaussians, ImageMemory, LayerPrediction, QueryState, Rendering, Views
 from qgs_dev.case import Case
 
@@ -234,9 +236,24 @@ class Maker:
             features=self.uniform(0, 1, "BV4HW") if self.gives("features") else None,
         )
 
-    def render(self) -> Renderer:
-        """Return a renderer that has gradients, and runs on any device."""
-        return TorchRenderer(TorchRenderer.Config())
+    def decode(self) -> Callable[[QueryState], Gaussians]:
+        """Return a function that decodes K Gaussians of each query from its features."""
+        weights_DX = self.normal("D", 14 * self.axes["K"]) / math.sqrt(self.axes["D"])
+
+        def decoded(state: QueryState) -> Gaussians:
+            raw_BNX = at_least_float32(state.features) @ weights_DX.to(state.features)
+            raw_BGC = raw_BNX.unflatten(-1, (-1, 14)).flatten(1, 2)
+            means, quats, rest = raw_BGC.split((3, 4, 7), -1)
+            # 1: zeros must not give quaternions without a direction.
+            quats = F.normalize(quats + torch.eye(4)[0].to(quats), dim=-1)
+            scales, opacities, colors = rest.sigmoid().split((3, 1, 3), -1)
+            return Gaussians(self.in_front(means), 0.3 * scales, quats, opacities[..., 0], colors)
+
+        return decoded
+
+    def render(self) -> Callable[[Gaussians, Cameras], Rendering]:
+        """Return a stand-in for a renderer, which runs on any device and can be compiled."""
+        return blurred
 
     def target(self) -> Views:
         """Return random images, cameras and masks; and depth maps for a loss that reads them."""
@@ -247,6 +264,19 @@ class Maker:
 
     # Each call draws other images: the inputs of a prediction are not its target.
     inputs = target
+
+
+@full_precision
+def blurred(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+    """Render spots, the larger the angle between ray and mean the fainter, without occlusion."""
+    local_BVG3 = F.normalize(to_camera(gaussians.means, cameras), dim=-1)
+    rays_BVHW3 = F.normalize(pixel_directions(cameras.intrinsics, cameras.size), dim=-1)
+    cosine_BVHWG = torch.einsum("bvhwi,bvgi->bvhwg", rays_BVHW3, local_BVG3)
+    weights_BVHWG = (20 * cosine_BVHWG - 20).exp() * gaussians.opacities[:, None, None, None]
+    total_BVHW1 = 1 + weights_BVHWG.sum(-1, keepdim=True)
+    rgb_BVHW3 = torch.einsum("bvhwg,bgc->bvhwc", weights_BVHWG, gaussians.colors) / total_BVHW1
+    alpha_BV1HW = (1 - 1 / total_BVHW1).movedim(-1, 2)
+    return Rendering(rgb_BVHW3.movedim(-1, 2), alpha_BV1HW, alpha_BV1HW)
 
 
 def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:

@@ -2,6 +2,7 @@
 
 from qgs.contracts import Plugin
 from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters, FramedRefinement
+from qgs_anchors.landmark.gradient import GradientFeedback
 from qgs_anchors.landmark.neighbours import NeighbourAttention
 from qgs_anchors.landmark.observed import ObservedQueries
 from qgs_anchors.landmark.rendered import RenderedFeedback
@@ -14,6 +15,7 @@ plugin = Plugin(
         NeighbourAttention,
         FramedRefinement,
         RenderedFeedback,
+        GradientFeedback,
         FootprintCenters,
         ColoredHead,
     ),
@@ -29,6 +31,9 @@ plugin = Plugin(
         RenderedFeedback.Config(rounds=1, layers=1, shrink=1, cells=1),
     ),
     exemptions={
+        GradientFeedback: {
+            "gradients_match_differences": "it treats the gradient of an error as a constant",
+        },
         NeighbourAttention: {
             "updates_are_explained": "its update depends on values and on positions of neighbours"
         },

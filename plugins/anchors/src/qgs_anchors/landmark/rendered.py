@@ -3,24 +3,18 @@
 In a round, the model renders the input photos and runs its last decoder layers again.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, PositiveInt
-from torch import Tensor, nn
+from pydantic import PositiveInt
+from torch import nn
 
-from qgs.contracts import (
-    ComponentConfig,
-    Feedback,
-    ModelDims,
-    Problem,
-    RecipeContext,
-    memory_fields,
-)
+from qgs.contracts import ModelDims, Problem, RecipeContext, memory_fields
 from qgs.tokengs.blocks import split_heads
 from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Rendering, Views
+from qgs_anchors.landmark.rounds import RoundsFeedback
 
 CHANNELS = 7
 """Channels of an error map: photo minus rendering (RGB), rendering (RGB), alpha."""
@@ -28,7 +22,7 @@ ERROR_GAIN = 4.0
 """Factor for photo minus rendering, which is a few tenths. The other channels reach 1."""
 
 
-class RenderedFeedback(Feedback):
+class RenderedFeedback(RoundsFeedback):
     """Feedback that adds rendering errors to keys and values, and a learned vector to queries.
 
     In each token's patch, the errors of the rendered photo are averaged into `cells` x `cells`
@@ -41,14 +35,9 @@ class RenderedFeedback(Feedback):
     name = "rendered"
     reads = memory_fields("keys", "values", "grid")
 
-    class Config(ComponentConfig):
-        rounds: int = Field(default=2, ge=1, le=16)
-        """Number of rounds in evaluation, and the largest number of rounds in a training step."""
-        least: PositiveInt = 1
-        """Smallest number of rounds in a training step. Each step takes a random number of rounds
-        from `least` to `rounds`."""
-        layers: PositiveInt = 2
-        """Number of decoder layers, counted from the last, that each feedback round runs again."""
+    learned = ("kv_proj.",)
+
+    class Config(RoundsFeedback.Config):
         shrink: PositiveInt = 2
         """Render the input photos at 1/`shrink` of their size."""
         cells: PositiveInt = 2
@@ -58,43 +47,17 @@ class RenderedFeedback(Feedback):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.rounds = config.rounds
-        self.layers = config.layers
-        # It tells a layer that it runs in a round: the weights are those of the first pass.
-        self.marker = nn.Parameter(torch.zeros(dims.width))
         self.embedding = nn.Conv2d(CHANNELS * config.cells**2, dims.width, 3, padding=1)
         self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Report too large `layers` or `least`, and image sizes that `shrink` does not divide."""
-        depth = context.dims.depth
+        """Report the problems of rounds, and image sizes that `shrink` does not divide."""
+        yield from super().problems(config, context)
         size = context.image_size
-        if config.layers > depth:
-            reason = f"a round repeats {config.layers} layers of a decoder of depth {depth}"
-            yield Problem("layers", reason, f"write at most {depth}, or raise model.decoder.depth")
-        if config.least > config.rounds:
-            reason = f"`least` is {config.least}, more than `rounds`, which is {config.rounds}"
-            yield Problem("least", reason, f"write at most {config.rounds}, or raise `rounds`")
         if size and any(side % config.shrink for side in size):
             reason = f"images of {size[0]} x {size[1]} (H x W) cannot shrink by {config.shrink}"
             yield Problem("shrink", reason, "choose a number that divides both sides")
-
-    def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return weights for this feedback, made from the weights `learned` of another model.
-
-        If `learned` is empty, because that model has no feedback, the returned weights give errors
-        of the rendering no effect. Otherwise `learned` is returned unchanged.
-        """
-        # Only a checkpoint of a model with rounds has these names.
-        if learned:
-            return dict(learned)
-        own = self.state_dict()
-        return own | {k: torch.zeros_like(own[k]) for k in own if k.startswith("kv_proj.")}
-
-    def drawn(self) -> int:
-        """Return a random number of rounds, uniformly from `least` to `rounds`."""
-        return int(torch.randint(self.config.least, self.config.rounds + 1, ()))
 
     def shrunk(self, views: Views) -> Views:
         """Return the photos to compare with renderings: averaged to 1/`shrink` of their size."""
@@ -109,13 +72,13 @@ class RenderedFeedback(Feedback):
         self,
         state: QueryState,
         memory: ImageMemory,
-        gaussians: Gaussians,
         views: Views,
+        decode: Callable[[QueryState], Gaussians],
         render: Callable[[Gaussians, Cameras], Rendering],
     ) -> tuple[QueryState, ImageMemory]:
         photos = self.shrunk(views)
         with torch.no_grad():
-            rendering = render(gaussians, photos.cameras)
+            rendering = render(decode(state), photos.cameras)
         assert memory.grid is not None
         _, rows, columns = memory.grid
         # The rendering is an input too: an error means something else where nothing was drawn.

@@ -125,7 +125,7 @@ def check_gradients_match_differences(case: Case) -> None:
     fixed = {"cameras", "masks", "depths"}
     if case.slot == "feedback":
         # What a round compares has no gradients.
-        fixed |= {"gaussians", "views"}
+        fixed |= {"state", "views"}
     points = {name: x for name, x in floating(inputs).items() if fixed.isdisjoint(name.split("."))}
     parameters = dict(module.named_parameters())
     # Two passes for each of many parameters would take minutes, so they move together.

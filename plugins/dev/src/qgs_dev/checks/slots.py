@@ -12,7 +12,7 @@ from torch import nn
 from qgs.contracts import LearnedQueries, Optimizer, ParameterGroup, Split
 from qgs.wording import listed
 from qgs_dev.case import CannotCheck, Case
-from qgs_dev.inputs import Sizes, inputs_of
+from qgs_dev.inputs import Sizes
 from qgs_dev.vocabulary import (
     Trial,
     cloned,
@@ -134,7 +134,7 @@ def check_feedback_repeats_layers(case: Case) -> None:
         f"a round repeats {module.layers} layers of a decoder with {case.dims.depth}",
     )
     with torch.inference_mode():
-        outputs = trial(inputs_of(case))
+        outputs = trial()
     expect_same(trial(), outputs, "in `torch.inference_mode`")
 
 
