@@ -56,7 +56,7 @@ def run(model, layers, state, memory):
 
 
 GRADIENT = "model.feedback={type: landmark/gradient, rounds: 2, layers: 2, steps: 1}"
-KINDS = pytest.mark.parametrize("kind", [(), (GRADIENT,)], ids=["rendered", "gradient"])
+KINDS = pytest.mark.parametrize("kind", [(), (GRADIENT,)])
 
 
 @KINDS

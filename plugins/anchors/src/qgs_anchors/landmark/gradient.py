@@ -39,8 +39,8 @@ class GradientFeedback(RoundsFeedback):
         layers: PositiveInt = 1
         """Number of decoder layers, counted from the last, that each feedback round runs again
         after its steps."""
-        steps: PositiveInt = 4
-        """Number of steps against the gradient in a round."""
+        steps: PositiveInt = 2
+        """Number of steps against the gradient in a round. Each renders all input photos."""
 
     config: Config
 
