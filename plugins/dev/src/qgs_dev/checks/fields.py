@@ -79,25 +79,25 @@ def check_reads_are_declared(case: Case) -> None:
             expect_same(trial.state_of(output), trial.state_of(other), where)
 
 
-class AskedFields(dict[str, Tensor]):
-    """Dict of state fields that records in the set `asked` the names of the fields read."""
+class AskedFields(Mapping[str, Tensor]):
+    """Fields of a state that record in the set `asked` the names of the fields read.
+
+    The base class answers `get` and `in` by reading a field.
+    """
 
     def __init__(self, fields: Mapping[str, Tensor], asked: set[str]) -> None:
-        super().__init__(fields)
+        self.fields = fields
         self.asked = asked
 
     def __getitem__(self, name: str) -> Tensor:
         self.asked.add(name)
-        return super().__getitem__(name)
+        return self.fields[name]
 
-    def __contains__(self, name: object) -> bool:
-        self.asked.add(str(name))
-        return super().__contains__(name)
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.fields)
 
-    def get(self, name: str, default: Any = None) -> Any:
-        """Return the field `name` or `default`, and record the name in `asked`."""
-        self.asked.add(name)
-        return super().get(name, default)
+    def __len__(self) -> int:
+        return len(self.fields)
 
 
 def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
