@@ -79,7 +79,7 @@ class AttentionBias(ABC):
         # Kernels need no (n, M, 3) tensors: they work in registers.
         if kernels is not None:
             return _in_rows(kernels[0], tokens_GM, queries_nF, out_nM)
-        for part_nF, out in zip(*_parts(queries_nF, out_nM), strict=True):
+        for part_nF, out in _parts(queries_nF, out_nM):
             out.copy_(self.value(part_nF, tokens_GM))
 
     @full_precision
@@ -101,7 +101,7 @@ class AttentionBias(ABC):
             _in_rows(kernels[1], tokens_GM, queries_nF, gradient_nM, out_nF)
             return out_nF, None
         found: list[tuple[Tensor, ...]] = []
-        for part_nF, part_nM in zip(*_parts(queries_nF, gradient_nM), strict=True):
+        for part_nF, part_nM in _parts(queries_nF, gradient_nM):
             # A backward pass runs with gradients off.
             with torch.enable_grad():
                 leaves = (
@@ -145,10 +145,10 @@ class AttentionBias(ABC):
                 yield scene, of_block, memory[:, : of_block.stop - first].unbind()
 
 
-def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...], ...]:
-    """Split queries (n, F) and values (n, M) along axis n, into parts of about `_PART` values."""
+def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Split queries (n, F) and values (n, M) along axis n; yield parts of about `_PART` values."""
     rows = max(_PART // max(of_pairs_nM.shape[1], 1), 1)
-    return queries_nF.split(rows), of_pairs_nM.split(rows)
+    return zip(queries_nF.split(rows), of_pairs_nM.split(rows), strict=True)
 
 
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
@@ -237,22 +237,25 @@ class _Dense(torch.autograd.Function):
 
 
 class _BiasGradients:
-    """Gradients of the queries and tokens of an `AttentionBias`, summed over blocks."""
+    """Gradients of the queries and tokens of an `AttentionBias`, summed over blocks.
+
+    A gradient that is not needed stays zero.
+    """
 
     def __init__(self, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> None:
         self._read = (queries, tokens)
         self._bias = bias
-        self.queries = torch.empty_like(queries) if bias.queries.requires_grad else None
-        self.tokens = torch.zeros_like(tokens) if bias.tokens.requires_grad else None
+        self.queries = torch.zeros_like(queries)
+        self.tokens = torch.zeros_like(tokens)
         self.wanted = bias.queries.requires_grad or bias.tokens.requires_grad
 
     def add(self, scene: int, rows: slice, gradient_nM: Tensor) -> None:
         """Add the gradients of a block of n queries, given the gradient of its bias (n, M)."""
         read = self._read[0][scene, rows], self._read[1][scene]
         of_queries, of_tokens = self._bias.gradients(*read, gradient_nM)
-        if self.queries is not None and of_queries is not None:
+        if of_queries is not None:
             self.queries[scene, rows] = of_queries
-        if self.tokens is not None and of_tokens is not None:
+        if of_tokens is not None:
             self.tokens[scene] += of_tokens
 
 
@@ -325,10 +328,10 @@ def _attention_gradients(
 ) -> tuple[Tensor | None, ...]:
     """Return gradients of q, k, v (each (B, h, N or M, d)) and of the bias's queries and tokens.
 
-    Gradients that are not needed are None. For a head with logits S, attention weights
-    P = softmax(S), output O and its gradient dO: dV = P' dO, dS = P * (dO V' - rowsum(dO * O)),
-    dQ = dS K / sqrt(d), dK = dS' Q / sqrt(d). ' transposes, * multiplies entries. The gradient of
-    the bias is the sum of dS over heads.
+    Gradients of q, k and v that are not needed are None. For a head with logits S, attention
+    weights P = softmax(S), output O and its gradient dO: dV = P' dO,
+    dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d), dK = dS' Q / sqrt(d). ' transposes,
+    * multiplies entries. The gradient of the bias is the sum of dS over heads.
     """
     q, k, v, queries, tokens, out, lse = saved
     scale = q.shape[-1] ** -0.5
