@@ -5,13 +5,12 @@ import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from inspect import cleandoc
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 from qgs.contracts import Component, ComponentConfig, MissingExtraError, ModelComponent, ModelDims
 from qgs.recipe.registry import InstalledPlugin, PluginError, default_config, load_plugin
-from qgs.recipe.slots import SLOTS
+from qgs.recipe.slots import SLOTS, summary_of
 from qgs.wording import did_you_mean
 from qgs_dev.case import SMALL, CannotCheck, Case, ContractError
 from qgs_dev.inputs import FACTS, data_file
@@ -41,7 +40,7 @@ class Check(NamedTuple):
     @property
     def contract(self) -> str:
         """Requirement as one sentence: the first paragraph of the check function's docstring."""
-        return " ".join(cleandoc(self.function.__doc__ or "").split("\n\n")[0].split())
+        return summary_of(self.function)
 
 
 def _listed() -> Iterator[Check]:
