@@ -84,28 +84,30 @@ def _bias_gradients(queries, tokens, step, gradient, sums):
 
 
 @jit
-def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
-    """Load `rows` of a scene and head of `x` as (rows, WIDTH); elements outside of `x` are 0.
+def _load(x, rows, count, width, WIDTH: tl.constexpr):
+    """Load `rows` of the program's scene and head of `x`, (rows, WIDTH); outside of `x` it is 0.
 
     x: pair of a tensor (B, h, count, width) and its strides. WIDTH: power of 2, at least `width`.
     """
-    at, inside = _at(x, scene, head, rows, count, width, WIDTH)
+    at, inside = _at(x, rows, count, width, WIDTH)
     return tl.load(at, mask=inside, other=0.0)
 
 
 @jit
-def _store(x, scene, head, rows, count, width, values, WIDTH: tl.constexpr):
-    """Write `values` to `rows` of a scene and head of the tensor in x; do nothing if x is None."""
+def _store(x, rows, count, width, values, WIDTH: tl.constexpr):
+    """Write `values` to `rows` of the program's scene and head of x; do nothing if x is None."""
     if x is not None:
-        at, inside = _at(x, scene, head, rows, count, width, WIDTH)
+        at, inside = _at(x, rows, count, width, WIDTH)
         tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
 
 
 @jit
-def _at(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
+def _at(x, rows, count, width, WIDTH: tl.constexpr):
     tensor, strides = x
     columns = tl.arange(0, WIDTH)[None, :]
-    at = scene * strides[0] + head * strides[1] + columns * strides[3]
+    # Offsets exceed 2^31 for large batches.
+    at = tl.program_id(2).to(tl.int64) * strides[0] + columns * strides[3]
+    at += tl.program_id(1).to(tl.int64) * strides[1]
     at += rows.to(tl.int64)[:, None] * strides[2]
     return tensor + at, (rows[:, None] < count) & (columns < width)
 
@@ -123,20 +125,18 @@ def _forward(
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
     """Write attention to `out`, and the log-sum-exp of each query's logits (B, h, N) to `lse`."""
-    # Offsets exceed 2^31 for large batches.
-    each = tl.program_id(1).to(tl.int64)
-    scene = each // heads
-    head = each % heads
+    scene = tl.program_id(2).to(tl.int64)
+    each = scene * heads + tl.program_id(1)
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
-    of_q = _load(q, scene, head, n, N, width, WIDTH)
+    of_q = _load(q, n, N, width, WIDTH)
     queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
     greatest = tl.full((BLOCK_N,), float("-inf"), tl.float32)
     total = tl.zeros((BLOCK_N,), tl.float32)
     sums = tl.zeros((BLOCK_N, WIDTH), tl.float32)
     for first in range(0, M, BLOCK_M):
         m = first + tl.arange(0, BLOCK_M)
-        of_k = _load(k, scene, head, m, M, width, WIDTH)
-        of_v = _load(v, scene, head, m, M, width, WIDTH)
+        of_k = _load(k, m, M, width, WIDTH)
+        of_v = _load(v, m, M, width, WIDTH)
         tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
         logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
         # The running maximum keeps exp in range. When it rises, earlier sums are scaled down.
@@ -146,7 +146,7 @@ def _forward(
         total = total * shrunk + tl.sum(p, 1)
         sums = sums * shrunk[:, None] + tl.dot(p.to(of_v.dtype), of_v, input_precision="ieee")
         greatest = above
-    _store(out, scene, head, n, N, width, sums / total[:, None], WIDTH)
+    _store(out, n, N, width, sums / total[:, None], WIDTH)
     tl.store(lse + each * N + n, greatest + tl.log(total), mask=n < N)
 
 
@@ -161,12 +161,11 @@ def _backward_queries(
     `dq` or `of_bias` is None, its gradient is not computed. g: gradient of the attention result.
     rowsum: sum of g times the result over the head's channels, (B, h, N).
     """
-    each = tl.program_id(1).to(tl.int64)
-    scene = each // heads
-    head = each % heads
+    scene = tl.program_id(2).to(tl.int64)
+    each = scene * heads + tl.program_id(1)
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
-    of_q = _load(q, scene, head, n, N, width, WIDTH)
-    of_g = _load(g, scene, head, n, N, width, WIDTH)
+    of_q = _load(q, n, N, width, WIDTH)
+    of_g = _load(g, n, N, width, WIDTH)
     # Rows outside get weights exp(-inf) = 0.
     of_lse = tl.load(lse + each * N + n, mask=n < N, other=float("inf"))
     of_rowsum = tl.load(rowsum + each * N + n, mask=n < N, other=0.0)
@@ -175,8 +174,8 @@ def _backward_queries(
     bias_sums = (tl.zeros((BLOCK_N,), tl.float32),) * F
     for first in range(0, M, BLOCK_M):
         m = first + tl.arange(0, BLOCK_M)
-        of_k = _load(k, scene, head, m, M, width, WIDTH)
-        of_v = _load(v, scene, head, m, M, width, WIDTH)
+        of_k = _load(k, m, M, width, WIDTH)
+        of_v = _load(v, m, M, width, WIDTH)
         tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
         logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
         of_p = tl.dot(of_g, tl.trans(of_v), input_precision="ieee")
@@ -185,7 +184,7 @@ def _backward_queries(
             sums += tl.dot(ds.to(of_k.dtype), of_k, input_precision="ieee")
         if of_bias is not None:
             bias_sums = _bias_gradients(queries, tokens, M, ds, bias_sums)
-    _store(dq, scene, head, n, N, width, sums * scale, WIDTH)
+    _store(dq, n, N, width, sums * scale, WIDTH)
     if of_bias is not None:
         for f in tl.static_range(F):
             tl.store(of_bias + (each * N + n) * F + f, bias_sums[f], mask=n < N)
@@ -201,19 +200,18 @@ def _backward_tokens(
     Rows beyond the last query get log-sum-exp inf, so their attention weights are 0. g: gradient
     of the attention result. rowsum: sum of g times the result over the head's channels, (B, h, N).
     """
-    each = tl.program_id(1).to(tl.int64)
-    scene = each // heads
-    head = each % heads
+    scene = tl.program_id(2).to(tl.int64)
+    each = scene * heads + tl.program_id(1)
     m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
-    of_k = _load(k, scene, head, m, M, width, WIDTH)
-    of_v = _load(v, scene, head, m, M, width, WIDTH)
+    of_k = _load(k, m, M, width, WIDTH)
+    of_v = _load(v, m, M, width, WIDTH)
     tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
     k_sums = tl.zeros((BLOCK_M, WIDTH), tl.float32)
     v_sums = tl.zeros((BLOCK_M, WIDTH), tl.float32)
     for first in range(0, N, BLOCK_N):
         n = first + tl.arange(0, BLOCK_N)
-        of_q = _load(q, scene, head, n, N, width, WIDTH)
-        of_g = _load(g, scene, head, n, N, width, WIDTH)
+        of_q = _load(q, n, N, width, WIDTH)
+        of_g = _load(g, n, N, width, WIDTH)
         of_lse = tl.load(lse + each * N + n, mask=n < N, other=float("inf"))
         of_rowsum = tl.load(rowsum + each * N + n, mask=n < N, other=0.0)
         queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
@@ -224,8 +222,8 @@ def _backward_tokens(
         if dk is not None:
             ds = p * (tl.dot(of_g, tl.trans(of_v), input_precision="ieee") - of_rowsum[:, None])
             k_sums += tl.dot(tl.trans(ds.to(of_q.dtype)), of_q, input_precision="ieee")
-    _store(dk, scene, head, m, M, width, k_sums * scale, WIDTH)
-    _store(dv, scene, head, m, M, width, v_sums, WIDTH)
+    _store(dk, m, M, width, k_sums * scale, WIDTH)
+    _store(dv, m, M, width, v_sums, WIDTH)
 
 
 class TritonAttention(torch.autograd.Function):
@@ -272,8 +270,8 @@ def _launch(kernel: Any, *tensors: Any) -> None:
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)
     over = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
-    # One program per block and head. Blocks are of queries, or of tokens in the third kernel.
-    grid = -(-over[0] // sizes[over[1]]), scenes * heads
+    # One program per block (of queries, or of tokens in the third kernel), head and scene.
+    grid = -(-over[0] // sizes[over[1]]), heads, scenes
     arguments = [(x, x.stride()) if x is not None and x.ndim == 4 else x for x in tensors]
     with torch.cuda.device_of(q):
         kernel[grid](*arguments, heads, N, M, width, width**-0.5, **sizes)
