@@ -14,7 +14,14 @@ import torch
 from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, refuse_nonfinite, write_checkpoint
-from qgs.checkpoint.tensors import CheckpointError, TensorFile, nonfinite, pickle_kind, shapes_of
+from qgs.checkpoint.tensors import (
+    CheckpointError,
+    TensorFile,
+    copied,
+    nonfinite,
+    pickle_kind,
+    shapes_of,
+)
 from qgs.files import AnyPath, refuse_existing, write_text
 from qgs.recipe import Recipe, resolve
 from qgs.recipe.recipe import differing_predictions
@@ -217,13 +224,8 @@ def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list
             f"{file.path} holds weights that are not floating-point numbers: {listed(strange)} "
             f"({report}); save the weights as float32"
         )
-    tensors: dict[str, Tensor] = {}
-    stored: set[int] = set()
-    for name, tensor in given.items():
-        tensor = tensor.to(torch.float32).contiguous()
-        # Names may share a tensor in a torch file; a checkpoint stores each on its own.
-        tensors[name] = tensor.clone() if tensor.data_ptr() in stored else tensor
-        stored.add(tensor.data_ptr())
+    # Names may share a tensor in a torch file; a checkpoint stores each on its own.
+    tensors = copied({name: tensor.to(torch.float32) for name, tensor in given.items()})
     refuse_nonfinite({names.published[name]: t for name, t in tensors.items()}, file.path)
     return tensors, [f"converted to float32: {report}"] if others else []
 
