@@ -7,6 +7,7 @@ is neither used nor listed as unused by its layout is an error.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -198,8 +199,7 @@ def _without_prefix(file: WeightFile) -> WeightFile:
     """
     # A common prefix is a prefix of any name, so the first name is enough.
     modules = next(iter(file.tensors)).split(".")[:-1]
-    for depth in range(1, len(modules) + 1):
-        prefix = ".".join(modules[:depth]) + "."
+    for prefix in accumulate(f"{module}." for module in modules):
         tensors = {name.removeprefix(prefix): tensor for name, tensor in file.tensors.items()}
         if all(name.startswith(prefix) for name in file.tensors) and recognise(shapes_of(tensors)):
             note = f"removed the prefix {prefix!r} from all {len(tensors)} names"
@@ -240,8 +240,9 @@ def export_checkpoint(name: AnyPath, out: Path, half: bool) -> None:
         tensors = file.tensors
         refuse_nonfinite(tensors, file.path)
         if half:
-            real = {name: t.half() for name, t in tensors.items() if t.is_floating_point()}
-            tensors = {**tensors, **real}
+            tensors = {
+                name: t.half() if t.is_floating_point() else t for name, t in tensors.items()
+            }
         # A finite float32 may be infinite in float16.
         if broken := nonfinite(tensors):
             raise CheckpointError(
