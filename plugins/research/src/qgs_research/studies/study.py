@@ -22,7 +22,7 @@ from pydantic import (
 
 from qgs.contracts import ComponentConfig, OptionError
 from qgs.evaluate.evaluation import SECTIONS
-from qgs.paths import open_file
+from qgs.paths import read_file
 from qgs.recipe.decode import decode_config
 from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.files import found_recipe, merge
@@ -260,8 +260,7 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
     chain: files that extend this one, to find cycles.
     """
     try:
-        with open_file(file) as opened:
-            text = opened.read().decode("utf-8")
+        text = read_file(file).decode("utf-8")
     except (OSError, ValueError) as error:
         fix = "check the path, or take one such as studies/tiny/structural.yaml"
         problems.stop(Origin(str(file)), "study", f"{file} cannot be read: {error}", fix)
