@@ -42,8 +42,8 @@ def resized(x_BCHW: Tensor, size: Sequence[int]) -> Tensor:
 
 
 def group_norm(width: int) -> nn.GroupNorm:
-    """Make a GroupNorm with 8 groups, or with 4 if 8 does not divide `width`."""
-    return nn.GroupNorm(8 if width % 8 == 0 else 4, width)
+    """Make a GroupNorm with 8 groups; `width` is a multiple of 8."""
+    return nn.GroupNorm(8, width)
 
 
 class OverViews(nn.Sequential):
