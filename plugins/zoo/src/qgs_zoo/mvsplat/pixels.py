@@ -27,7 +27,7 @@ from qgs.contracts import (
 )
 from qgs.geometry.harmonics import SH_C0
 from qgs.precision import full_precision
-from qgs.types import Cameras, GaussianAttributes, ImageMemory, QueryState, Views
+from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
 from qgs_zoo.mvsplat.adapter import (
     SH_DEGREE,
     camera_quaternions,
@@ -66,9 +66,11 @@ def degree_of(width: int) -> int:
     return max([1, *(degree for least, degree in WIDTHS.items() if least <= width)])
 
 
-def numbers_of(features_BND: Tensor) -> Tensor:
-    """Return features, padded with zeros if they have fewer channels than a pixel needs."""
-    return F.pad(features_BND, (0, max(0, min(WIDTHS) - features_BND.shape[-1])))
+def parts_of(features_BND: Tensor) -> tuple[Tensor, ...]:
+    """Split the features of pixels in CHANNELS, coefficients of harmonics, and unread features."""
+    first = sum(CHANNELS)
+    last = first + 3 * coefficients(degree_of(features_BND.shape[-1]))
+    return features_BND.tensor_split([first, last], -1)
 
 
 def width_problems(context: RecipeContext) -> Iterable[Problem]:
@@ -97,10 +99,12 @@ class PixelQueries(Queries):
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         assert memory.grid is not None
-        # Harmonics are predicted in the camera's axes and rendered in the world's.
-        features = in_world(memory.features, views.cameras.c2w[..., :3, :3])
+        rotation_BV33 = views.cameras.c2w[..., :3, :3]
         _, rows, columns = memory.grid
-        return QueryState(features, pixel_fields(views.cameras, rows, columns))
+        turn = quaternions(rotation_BV33).repeat_interleave(rows * columns, 1)
+        fields = {PIXEL: pixel_rays(views.cameras, rows, columns), TURN: turn}
+        # Harmonics are predicted in the camera's axes and rendered in the world's.
+        return QueryState(in_world(memory.features, rotation_BV33), fields)
 
 
 @full_precision
@@ -111,24 +115,10 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
     """
     degree = degree_of(features_BMD.shape[-1])
     views = rotation_BV33.shape[1]
-    first = sum(CHANNELS)
-    last = first + 3 * coefficients(degree)
-    before, sh_BMC, behind = numbers_of(features_BMD).tensor_split([first, last], -1)
+    before, sh_BMC, behind = parts_of(features_BMD)
     sh_BVPXK = sh_BMC.unflatten(1, (views, -1)).unflatten(-1, (3, -1))
     world = torch.einsum("bvkl,bvpxl->bvpxk", world_harmonics(rotation_BV33, degree), sh_BVPXK)
-    world = world.flatten(1, 2).flatten(2)
-    changed = torch.cat([before, world, behind], -1)
-    # without the zeros that `numbers_of` appended
-    return changed[..., : features_BMD.shape[-1]]
-
-
-def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
-    """Return the fields PIXEL_FIELDS of queries, for images of rows x columns pixels.
-
-    Each field is (B, V * rows * columns, ...): rays of a pixel, or the rotation of its camera.
-    """
-    turn = quaternions(cameras.c2w[..., :3, :3]).repeat_interleave(rows * columns, 1)
-    return {PIXEL: pixel_rays(cameras, rows, columns), TURN: turn}
+    return torch.cat([before, world.flatten(1, 2).flatten(2), behind], -1)
 
 
 class OnRays(Centers):
@@ -197,15 +187,12 @@ class PixelHead(Head):
     def gaussians_per_query(self) -> int:
         return 1
 
-    @classmethod
-    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        return width_problems(context)
-
     @full_precision
     def forward(self, state: QueryState) -> GaussianAttributes:
-        raw_BN1C = numbers_of(state.features)[:, :, None, : sum(CHANNELS)]
-        sh = harmonics_of(state.features)[:, :, None]
-        log_depth, logit, place, scale, rotation = raw_BN1C.split(CHANNELS, -1)
+        raw_BNC, sh_BNC, _ = parts_of(state.features)
+        log_depth, logit, place, scale, rotation = raw_BNC[:, :, None].split(CHANNELS, -1)
+        # Harmonics of degrees above 3 are left out, because they are not rendered.
+        sh = rearrange(sh_BNC, "b n (x k) -> b n 1 k x", x=3)[..., : coefficients(SH_DEGREE), :]
         return GaussianAttributes(
             offsets=torch.cat([place, log_depth], -1),
             scales=self.scales(scale, log_depth, state),
@@ -273,18 +260,6 @@ class WorldHead(PixelHead):
 
     def scales(self, raw: Tensor, log_depth: Tensor, state: QueryState) -> Tensor:
         return F.softplus(raw - SCALE_SHIFT).clamp(self.config.scale_min, self.config.scale_max)
-
-
-def harmonics_of(features_BND: Tensor) -> Tensor:
-    """Return the coefficients (B, N, K, 3) of K harmonics from the features of pixels.
-
-    Harmonics of degrees above 3 are left out, because they are not rendered.
-    """
-    degree = degree_of(features_BND.shape[-1])
-    first = sum(CHANNELS)
-    sh_BNC = numbers_of(features_BND)[..., first : first + 3 * coefficients(degree)]
-    sh_BNK3 = rearrange(sh_BNC, "b n (x k) -> b n k x", x=3)
-    return sh_BNK3[..., : coefficients(min(degree, SH_DEGREE)), :]
 
 
 def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
