@@ -67,8 +67,12 @@ class Shape(NamedTuple):
     cut_texture: int = 0
     scale: float = 1.0
 
-    def moved(self, to: Point, turn: Turn, size: float = 1.0) -> "Shape":
-        """Return the shape scaled by `size` about the origin, turned, then moved by `to`."""
+    def moved(self, angle: float, to: Point = (0.0, 0.0, 0.0), size: float = 1.0) -> "Shape":
+        """Return the shape scaled by `size`, turned about the z axis, then moved by `to`.
+
+        angle: of the turn, in radians. The origin is the centre of scaling.
+        """
+        turn = about_z(angle)
         cut = self.cut and self.cut.moved(to, turn, size)
         body = self.body.moved(to, turn, size)
         return self._replace(body=body, cut=cut, scale=self.scale * size)

@@ -186,7 +186,7 @@ def _around_table(make: Furniture, sizes: Sizes) -> Piece:
                 away = sign * (d / 2 + rng.uniform(0.0, 0.2))
                 at = (sign * x, away, 0.0)
                 chair = make.piece("chair", **alike)
-                piece += [part.moved(at, about_z(turn)) for part in chair]
+                piece += [part.moved(turn, at) for part in chair]
     return piece
 
 

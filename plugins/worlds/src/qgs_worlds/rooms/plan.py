@@ -6,7 +6,7 @@ from random import Random
 import numpy as np
 
 from qgs_worlds.caster.interiors import floor_shadows
-from qgs_worlds.caster.shapes import Shape, about_z
+from qgs_worlds.caster.shapes import Shape
 from qgs_worlds.caster.tables import LIGHT, Room
 from qgs_worlds.rooms.furniture import (
     AGAINST_WALLS,
@@ -81,7 +81,7 @@ class Furnisher:
         if not self.free(low, high):
             return False
         self._taken.append((low[0], low[1], high[0], high[1]))
-        self.shapes += [shape.moved((x, y, 0.0), about_z(turn)) for shape in piece]
+        self.shapes += [shape.moved(turn, (x, y, 0.0)) for shape in piece]
         return True
 
     def free(self, low: Point, high: Point) -> bool:
@@ -194,7 +194,7 @@ def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
             hung = {place: make.piece("picture") for place in places}
         for place, item in hung.items():
             x, y = _from_wall(side, across / 2, place)
-            shapes += [shape.moved((x, y, 0.0), about_z(turn)) for shape in item]
+            shapes += [shape.moved(turn, (x, y, 0.0)) for shape in item]
     return shapes
 
 
@@ -211,7 +211,7 @@ def _fixed(make: Furniture, size: Size) -> list[Shape]:
         deep = rng.uniform(0.35, 0.6) * d
         rug = box(0, 0, 0, wide, deep, 0.012, make.material("rug"))
         x, y = [rng.uniform(-0.3, 0.3) for _ in range(2)]
-        shapes.append(rug.moved((x, y, 0.0), about_z(rng.gauss(0, 0.1))))
+        shapes.append(rug.moved(rng.gauss(0, 0.1), (x, y, 0.0)))
     return shapes
 
 

@@ -68,6 +68,7 @@ def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
         fields = _varied(rng, palette, highlights) if varied else _plain(rng, palette)
         for name, value in fields.items():
             row[name] = value
+        row["seed"] = rng.randrange(1 << 16)
     return table
 
 
@@ -80,7 +81,7 @@ def _plain(rng: Random, palette: Palette) -> Texture:
     if rng.random() >= 0.5:
         mark = palette.color()
         fields |= _pattern(rng, _PLAIN_PATTERNS)
-    return {**fields, "seed": rng.randrange(1 << 16), "colors": [*ramp, mark]}
+    return {**fields, "colors": [*ramp, mark]}
 
 
 def _pattern(rng: Random, kinds: tuple[int, ...]) -> dict[str, float]:
@@ -131,7 +132,7 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
     if highlights and shiny:
         fields |= gloss
     mark = palette.color()
-    return {**fields, "seed": rng.randrange(1 << 16), "colors": [*ramp, mark]}
+    return {**fields, "colors": [*ramp, mark]}
 
 
 @kernel

@@ -144,7 +144,7 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
         wall = [Shape(body, hole, texture, 1, common, scale)]
         if hole and rng.random() < 0.6:
             wall += _panes(rng, things, hole)
-        shapes += [part.moved((0.0, 0.0, 0.0), about_z(side * math.pi / 2)) for part in wall]
+        shapes += [part.moved(side * math.pi / 2) for part in wall]
     ceiling = _box((0.0, 0.0, height + _WALL), (half_x + 2 * _WALL, half_y + 2 * _WALL, _WALL))
     return [*shapes, things.skinned(ceiling, scale)._replace(faces=1)]
 
@@ -236,7 +236,7 @@ def _objects(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
     if rng.random() < 0.3:
         wall = _box((rng.uniform(1.5, 3), 0.0, 3.0), (0.1, 30.0, 4.0))
         wall = things.skinned(wall, spread(rng, 0.3, 1.5))
-        shapes.append(wall.moved((0.0, 0.0, 0.0), about_z(any_angle(rng))))
+        shapes.append(wall.moved(any_angle(rng)))
     level = wide = 0.0
     if rng.random() < 0.4:
         level = rng.uniform(0.02, 0.8)

@@ -164,7 +164,7 @@ class Things:
         grow = rng.choice((1.0, 1.0, rng.uniform(0.8, 1.2)))
         places = [k - (count - 1) / 2 for k in range(count)]
         return [
-            first.moved((s * way[0], s * way[1], s * way[2]), about_z(s * angle), grow**s)
+            first.moved(s * angle, (s * way[0], s * way[1], s * way[2]), grow**s)
             for s in places
         ]
 
@@ -219,4 +219,4 @@ def placed(thing: Thing, to: Point, turn: float, size: float) -> Thing:
     to: x, y, and the height of the object's lowest point, in metres.
     """
     place = (to[0], to[1], to[2] - lowest(thing) * size)
-    return [shape.moved(place, about_z(turn), size) for shape in thing]
+    return [shape.moved(turn, place, size) for shape in thing]
