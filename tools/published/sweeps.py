@@ -9,8 +9,9 @@ from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, expected_disparity
 from qgs_zoo.mvsplat.sweep import (
     Sweep,
+    bounds,
     cyclic_neighbours,
-    inverse_depth_candidates,
+    evenly_spaced,
     relative_poses,
 )
 from qgs_zoo.mvsplat.windows import shift_mask
@@ -108,7 +109,8 @@ def of_mvsplat(found: Tensors, encoder: MVSplatEncoder, sweep: Sweep, numbers: T
 
     numbers: output of the networks for each pixel, (B, V, H, W, C).
     """
-    disparity = inverse_depth_candidates(sweep.near, sweep.far, encoder.config.candidates)
+    disparity = evenly_spaced(*bounds(sweep), encoder.config.candidates)
+    disparity = disparity.flatten(1).unflatten(0, sweep.near.shape)
     found["disparity_candidates"] = disparity
     found["match_pdf"] = found["match_logits"].softmax(2)
     coarse = encoder.depth_predictor.match(found["features"], sweep)[0]
@@ -182,11 +184,11 @@ def of_depthsplat(found: Tensors, predictor: DepthPredictor, sweep: Sweep) -> No
     found["neighbours"] = torch.cat([first, sweep.neighbours], -1)
     poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
     counts = [predictor.candidates(scale) for scale in range(predictor.sizes.scales)]
-    candidates = inverse_depth_candidates(sweep.near, sweep.far, counts[0])
-    found["inverse_depth_candidates.0"] = candidates
+    candidates = evenly_spaced(*bounds(sweep), counts[0])
+    coarsest = candidates.flatten(1).unflatten(0, shape)
+    found["inverse_depth_candidates.0"] = coarsest
     low = found["cost_volume.0"].shape[-2:]
-    found["warp_grid.0"] = warps(sweep.cameras, poses, low, candidates[..., ::8])
-    candidates = candidates.flatten(0, 1)[..., None, None]
+    found["warp_grid.0"] = warps(sweep.cameras, poses, low, coarsest[..., ::8])
     for scale, count in enumerate(counts):
         if scale:
             coarse = found["coarse_inverse_depth.0"].flatten(0, 1)

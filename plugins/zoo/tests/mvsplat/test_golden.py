@@ -77,7 +77,7 @@ def test_both_ways_to_correlate_agree(monkeypatch):
     cameras = views_of(golden).cameras
     features = golden.tensors["features_mv.0"]
     neighbours = nearest_neighbours(cameras.c2w, 2)
-    inverse = golden.tensors["inverse_depth_candidates.0"][..., None, None]
+    inverse = golden.tensors["inverse_depth_candidates.0"].flatten(0, 1)[..., None, None]
     given = sweep.Sweep(cameras, neighbours, golden.input("near"), golden.input("far"))
 
     gradients = []

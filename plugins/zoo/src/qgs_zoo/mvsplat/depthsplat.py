@@ -18,12 +18,13 @@ from qgs.tokengs.encoder import imagenet_normalised
 from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS, Stages
 from qgs_zoo.mvsplat.dpt import LEVELS, DptHead
-from qgs_zoo.mvsplat.mvsplat import bounds, expected_disparity
+from qgs_zoo.mvsplat.mvsplat import expected_disparity
 from qgs_zoo.mvsplat.sweep import (
     Sweep,
+    bounds,
     cost_volume,
     cyclic_neighbours,
-    inverse_depth_candidates,
+    evenly_spaced,
 )
 from qgs_zoo.mvsplat.unet import (
     OverViews,
@@ -165,8 +166,7 @@ def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) 
     low_N1hw = (centre_N1hw - count // 2 * step).clamp(least, most)
     high_N1hw = (centre_N1hw + (count // 2 - 1) * step).clamp(least, most)
     # Linear between clamped ends: near a bound, steps shrink and the centre is not a candidate.
-    part_D11 = torch.linspace(0, 1, count, device=centre_N1hw.device).to(centre_N1hw)[:, None, None]
-    return low_N1hw + part_D11 * (high_N1hw - low_N1hw)
+    return evenly_spaced(low_N1hw, high_N1hw, count)
 
 
 class DepthPredictor(nn.Module):
@@ -246,15 +246,10 @@ class DepthPredictor(nn.Module):
         for scale, (own, features) in enumerate(zip(multi, mono, strict=True)):
             count = self.candidates(scale)
             if scale == 0:
-                candidates = inverse_depth_candidates(sweep.near, sweep.far, count)
-                candidates = candidates.flatten(0, 1)[..., None, None]
+                candidates = evenly_spaced(*bounds(sweep), count)
             else:
                 candidates = finer_candidates(found[-1], sweep, self.candidates(0), count)
-            cost_BVDhw = cost_volume(
-                own.unflatten(0, sweep.near.shape),
-                candidates.unflatten(0, sweep.near.shape),
-                sweep,
-            )
+            cost_BVDhw = cost_volume(own.unflatten(0, sweep.near.shape), candidates, sweep)
             # Published weights expect this order.
             seen = [cost_BVDhw.flatten(0, 1), cnn.second if scale else cnn.features, own, features]
             seen = torch.cat(seen, 1)

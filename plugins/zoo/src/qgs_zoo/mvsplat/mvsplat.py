@@ -19,9 +19,10 @@ from qgs_zoo.mvsplat.sweep import (
     DepthRange,
     Sweep,
     SweepEncoder,
+    bounds,
     cost_volume,
     cyclic_neighbours,
-    inverse_depth_candidates,
+    evenly_spaced,
 )
 from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, group_norm, resized, two_convolutions
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
@@ -167,17 +168,16 @@ class DepthPredictor(nn.Module):
         The confidence of a pixel is the largest probability of a depth of the sweep.
         """
         count = self.regressor_residual.out_channels
-        candidates_BVD = inverse_depth_candidates(sweep.near, sweep.far, count)
+        candidates_ND11 = evenly_spaced(*bounds(sweep), count)
         size = features_BVDhw.shape[3:]
-        volume_BVDhw = features_BVDhw.new_zeros(*candidates_BVD.shape, *size)
+        volume_BVDhw = features_BVDhw.new_zeros(*sweep.near.shape, count, *size)
         if self.compares:
-            volume_BVDhw = cost_volume(features_BVDhw, candidates_BVD[..., None, None], sweep)
+            volume_BVDhw = cost_volume(features_BVDhw, candidates_ND11, sweep)
         matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
         refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
         # The network only corrects the volume, so that matches survive an untrained U-Net.
         refined = refined + self.regressor_residual(matched)
-        logits_NDhw = self.depth_head_lowres(refined)
-        return expected_disparity(logits_NDhw, candidates_BVD.flatten(0, 1)[..., None, None])
+        return expected_disparity(self.depth_head_lowres(refined), candidates_ND11)
 
 
 @full_precision
@@ -190,13 +190,6 @@ def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Te
     # A mean, not the best candidate: it has a gradient and can lie between candidates.
     disparity = (probability * candidates_NDhw).sum(1, keepdim=True)
     return disparity, probability.amax(1, keepdim=True)
-
-
-def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
-    """Return the least and the largest inverse depth of a sweep, two tensors (B V, 1, 1, 1)."""
-    # Inverse depth grows towards the camera.
-    least, most = (1 / x.flatten()[:, None, None, None] for x in (sweep.far, sweep.near))
-    return least, most
 
 
 @full_precision

@@ -62,12 +62,18 @@ class Sweep(NamedTuple):
     far: Tensor
 
 
+def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
+    """Return the least and the largest inverse depth of a sweep, two tensors (B V, 1, 1, 1)."""
+    # Inverse depth grows towards the camera.
+    least, most = (1 / x.flatten()[:, None, None, None] for x in (sweep.far, sweep.near))
+    return least, most
+
+
 @full_precision
-def inverse_depth_candidates(near_BV: Tensor, far_BV: Tensor, count: int) -> Tensor:
-    """Return D = `count` inverse depths (B, V, D), evenly spaced from 1/far to 1/near inclusive."""
-    step_D = torch.linspace(0, 1, count, device=near_BV.device).to(near_BV)
-    least = 1 / far_BV[..., None]
-    return least + step_D * (1 / near_BV[..., None] - least)
+def evenly_spaced(low_N1hw: Tensor, high_N1hw: Tensor, count: int) -> Tensor:
+    """Return D = `count` inverse depths (N, D, h, w), from `low` to `high` inclusive."""
+    part_D11 = torch.linspace(0, 1, count, device=low_N1hw.device).to(low_N1hw)[:, None, None]
+    return low_N1hw + part_D11 * (high_N1hw - low_N1hw)
 
 
 @full_precision
@@ -121,7 +127,7 @@ def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
     return sampled.unflatten(2, grid_NDhw2.shape[1:3])
 
 
-def cost_volume(features_BVChw: Tensor, inverse_depth_BVDhw: Tensor, sweep: Sweep) -> Tensor:
+def cost_volume(features_BVChw: Tensor, inverse_depth_NDhw: Tensor, sweep: Sweep) -> Tensor:
     """Correlate the features of each pixel with those of neighbour views at D depths.
 
     Returns the mean over neighbours of <f, f'> / sqrt(C), (B, V, D, h, w). f is the feature of a
@@ -130,8 +136,7 @@ def cost_volume(features_BVChw: Tensor, inverse_depth_BVDhw: Tensor, sweep: Swee
     may be 1, which gives all pixels the same depths.
     """
     scenes, views, channels, height, width = features_BVChw.shape
-    depth_NDhw = (1 / inverse_depth_BVDhw.detach()).flatten(0, 1)
-    depth_NDhw = depth_NDhw.expand(-1, -1, height, width)
+    depth_NDhw = (1 / inverse_depth_NDhw.detach()).expand(-1, -1, height, width)
     own_NChw = features_BVChw.flatten(0, 1)
     neighbours_BVJ = sweep.neighbours
     lens_N4 = feature_lenses(sweep.cameras, (height, width)).flatten(0, 1)
