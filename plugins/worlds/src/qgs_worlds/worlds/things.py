@@ -164,8 +164,7 @@ class Things:
         grow = rng.choice((1.0, 1.0, rng.uniform(0.8, 1.2)))
         places = [k - (count - 1) / 2 for k in range(count)]
         return [
-            first.moved(s * angle, (s * way[0], s * way[1], s * way[2]), grow**s)
-            for s in places
+            first.moved(s * angle, (s * way[0], s * way[1], s * way[2]), grow**s) for s in places
         ]
 
     def _rods(self, points: list[Point], pairs: list[tuple[int, int]], radius: float) -> Thing:
