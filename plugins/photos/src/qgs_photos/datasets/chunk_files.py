@@ -285,17 +285,19 @@ class Chunk:
 
     def __init__(self, path: UPath) -> None:
         self.path = path
-        self.entries: dict[str, Any] = {}
-        self._parsed: dict[str, Record] = {}
+        entries: dict[str, Any] = {}
+        self.entries = entries
+        # without `self`, so that a closed chunk leaves the memory at once
+        self._parsed = cache(lambda key: parse_record(str(path), entries[key]))
         for place, entry in enumerate(load_chunk(path)):
             key = entry.get("key") if isinstance(entry, dict) else None
             if not isinstance(key, str):
                 # raises
                 parse_record(f"{path}: entry {place}", entry)
-            elif key in self.entries:
+            elif key in entries:
                 raise ValueError(f"{path} holds the scene {key!r} twice: pack the data set again")
             else:
-                self.entries[key] = entry
+                entries[key] = entry
 
     def record(self, key: str) -> Record:
         """Return the scene `key`. Raises ValueError if it is invalid or not in this chunk."""
@@ -304,9 +306,7 @@ class Chunk:
                 f"{self.path} does not hold the scene {key!r}, although index.json says so: pack "
                 "the data set again, or remove index.json to list the scenes from the chunks"
             )
-        if key not in self._parsed:
-            self._parsed[key] = parse_record(str(self.path), self.entries[key])
-        return self._parsed[key]
+        return self._parsed(key)
 
 
 def has_chunks(folder: UPath) -> bool:
