@@ -7,6 +7,7 @@ name is an error.
 import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any
 
@@ -158,6 +159,7 @@ def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
     return next((key for key in keys if values.get(key) is not None), "")
 
 
+@dataclass
 class _Camera:
     """A camera in `cameras.json`, the `file`.
 
@@ -165,27 +167,12 @@ class _Camera:
     returns the existing file of each listed photo; called only if the entry has no image size.
     """
 
-    def __init__(
-        self,
-        file: UPath,
-        values: Mapping[str, Any],
-        path: UPath,
-        find: Callable[[], Mapping[UPath, UPath]],
-    ) -> None:
-        self.file = file
-        self.values = values
-        self.path = path
-        self.find = find
-        self.problems = list[FrameProblem]()
-        sides = [values.get(s, values.get(long)) for s, long in (("h", "height"), ("w", "width"))]
-        self.size: Size | None = None
-        if None not in sides:
-            # some programs write numbers as text
-            plain = numbers(sides)
-            self.size, wrong = listed_size(*(plain if plain.shape == (2,) else _NO_SIZE))
-            self.problems += wrong
-        self.pose = self._pose()
-        self.intrinsics = self._intrinsics()
+    file: UPath
+    values: Mapping[str, Any]
+    path: UPath
+    find: Callable[[], Mapping[UPath, UPath]]
+    size: Size | None = None
+    problems: list[FrameProblem] = field(default_factory=list)
 
     def _wrong(self, reason: str) -> None:
         self.problems.append(FrameProblem(reason, f"write {_FORM}"))
@@ -247,6 +234,16 @@ class _Camera:
 
     def frame(self) -> PhotoFrame:
         """Return the photo and its camera; the photo's name is its path from the file's folder."""
+        values = self.values
+        sides = [values.get(s, values.get(long)) for s, long in (("h", "height"), ("w", "width"))]
+        if None not in sides:
+            # some programs write numbers as text
+            plain = numbers(sides)
+            self.size, wrong = listed_size(*(plain if plain.shape == (2,) else _NO_SIZE))
+            self.problems += wrong
+        pose = self._pose()
+        # may read the size of the file
+        intrinsics = as_intrinsics(self._intrinsics())
         folder = self.file.parent
         name = "" if self.path == folder else "/".join(inside(folder, self.path))
         if not name:
@@ -254,8 +251,8 @@ class _Camera:
         return PhotoFrame(
             name=name,
             path=self.path,
-            c2w=self.pose,
-            intrinsics=as_intrinsics(self.intrinsics),
+            c2w=pose,
+            intrinsics=intrinsics,
             size=self.size,
             problems=(*self.problems,),
         )
