@@ -13,7 +13,7 @@ from torch import Tensor
 
 from qgs.containers import map_tensors
 from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, ModelDims
-from qgs.geometry.rays import patch_rays, pixel_directions, plucker_rays
+from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.geometry.transforms import to_camera
 from qgs.precision import at_least_float32, full_precision
 from qgs.types import Cameras, Gaussians, ImageMemory, LayerPrediction, QueryState, Rendering, Views
@@ -237,23 +237,22 @@ class Maker:
         )
 
     def decode(self) -> Callable[[QueryState], Gaussians]:
-        """Return a function that decodes K Gaussians of each query from its features."""
-        weights_DX = self.normal("D", 14 * self.axes["K"]) / math.sqrt(self.axes["D"])
+        """Return a function that decodes K round Gaussians of each query from its features."""
+        weights_DX = self.normal("D", 7 * self.axes["K"]) / math.sqrt(self.axes["D"])
 
         def decoded(state: QueryState) -> Gaussians:
             raw_BNX = at_least_float32(state.features) @ weights_DX.to(state.features)
-            raw_BGC = raw_BNX.unflatten(-1, (-1, 14)).flatten(1, 2)
-            means, quats, rest = raw_BGC.split((3, 4, 7), -1)
-            # 1: zeros must not give quaternions without a direction.
-            quats = F.normalize(quats + torch.eye(4)[0].to(quats), dim=-1)
-            scales, opacities, colors = rest.sigmoid().split((3, 1, 3), -1)
-            return Gaussians(self.in_front(means), 0.3 * scales, quats, opacities[..., 0], colors)
+            raw_BGC = raw_BNX.unflatten(-1, (-1, 7)).flatten(1, 2)
+            means, opacities, colors = raw_BGC.split((3, 1, 3), -1)
+            quats = F.pad(torch.ones_like(opacities), (0, 3))
+            opacities = opacities[..., 0].sigmoid()
+            return Gaussians(self.in_front(means), means.sigmoid(), quats, opacities, colors)
 
         return decoded
 
     def render(self) -> Callable[[Gaussians, Cameras], Rendering]:
         """Return a stand-in for a renderer, which runs on any device and can be compiled."""
-        return blurred
+        return plain
 
     def target(self) -> Views:
         """Return random images, cameras and masks; and depth maps for a loss that reads them."""
@@ -267,16 +266,14 @@ class Maker:
 
 
 @full_precision
-def blurred(gaussians: Gaussians, cameras: Cameras) -> Rendering:
-    """Render spots, the larger the angle between ray and mean the fainter, without occlusion."""
-    local_BVG3 = F.normalize(to_camera(gaussians.means, cameras), dim=-1)
-    rays_BVHW3 = F.normalize(pixel_directions(cameras.intrinsics, cameras.size), dim=-1)
-    cosine_BVHWG = torch.einsum("bvhwi,bvgi->bvhwg", rays_BVHW3, local_BVG3)
-    weights_BVHWG = (20 * cosine_BVHWG - 20).exp() * gaussians.opacities[:, None, None, None]
-    total_BVHW1 = 1 + weights_BVHWG.sum(-1, keepdim=True)
-    rgb_BVHW3 = torch.einsum("bvhwg,bgc->bvhwc", weights_BVHWG, gaussians.colors) / total_BVHW1
-    alpha_BV1HW = (1 - 1 / total_BVHW1).movedim(-1, 2)
-    return Rendering(rgb_BVHW3.movedim(-1, 2), alpha_BV1HW, alpha_BV1HW)
+def plain(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+    """Render one colour, a mean in which Gaussians far in front of the camera weigh more."""
+    depths_BVG = to_camera(gaussians.means, cameras)[..., 2]
+    weights_BVG = depths_BVG.sigmoid() * gaussians.opacities[:, None]
+    # Not a matrix product, which a check would take for a learned layer.
+    rgb_BVC = (weights_BVG[..., None] * gaussians.colors[:, None]).sum(2)
+    pixels_BVCHW = rgb_BVC[..., None, None].expand(-1, -1, -1, *cameras.size)
+    return Rendering(pixels_BVCHW, pixels_BVCHW[:, :, :1], pixels_BVCHW[:, :, :1])
 
 
 def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
