@@ -5,12 +5,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Any
 
 import torch
 from torch import nn
-from torch.nn import Module
 
 from qgs import contracts
 from qgs.contracts import (
@@ -19,10 +17,6 @@ from qgs.contracts import (
     Fields,
     Metric,
     ModelDims,
-    Objective,
-    Optimizer,
-    Renderer,
-    ViewSampler,
 )
 from qgs.recipe.build import load_pretrained
 from qgs.recipe.yaml_text import dump
@@ -210,10 +204,6 @@ class Case:
         return replace(self, dims=replace(self.dims, **sizes))
 
 
-# Device types that a renderer can support.
-DEVICES = ("cpu", "cuda", "mps")
-
-
 def component_fault(component: type[Component]) -> str:
     """Return why recipes cannot use `component`, such as "has no `name`"; "" if they can."""
     name = getattr(component, "name", None)
@@ -222,30 +212,8 @@ def component_fault(component: type[Component]) -> str:
     # Otherwise `type: PLUGIN/NAME` would be ambiguous.
     if not re.fullmatch(r"[^\s/]+", name):
         return f"has the `name` {name!r}; use at least one character, and no slash or space"
-    if issubclass(component, Renderer):
-        given: object = component.devices
-        if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
-            return f"has `devices` {given!r}; give some of {DEVICES} as a tuple"
     if issubclass(component, Metric) and not getattr(component, "definition", ""):
         return "has no `definition`; describe what it measures (protocols hash this text)"
-    config = component.Config
-    if not config.model_config.get("frozen"):
-        return "has a Config that is not frozen; leave `frozen` of its `model_config` at True"
-    if "type" in config.model_fields:
+    if "type" in component.Config.model_fields:
         return "has an option `type`; rename it, because `type` names the component in a recipe"
-    fields: Mapping[str, Any] = config.model_fields
-    scheduled: object = component.scheduled
-    known = {n for n, option in fields.items() if _may_be_number(option.annotation)}
-    if not (isinstance(scheduled, frozenset) and scheduled <= known):
-        return f"has `scheduled` {scheduled!r}; give a frozenset of names of number options"
-    # Other components are built once and do not follow the training steps.
-    if scheduled and not issubclass(component, Module | Objective | Optimizer | ViewSampler):
-        return f"lists `scheduled` options, but those of the slot `{component.slot}` cannot change"
     return ""
-
-
-def _may_be_number(annotation: Any) -> bool:
-    """Return True if an option of type `annotation` can hold an int or a float."""
-    # `float | None` and numbers with limits count; a list of numbers does not.
-    parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
-    return annotation in (int, float) or any(map(_may_be_number, parts))
