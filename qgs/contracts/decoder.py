@@ -8,7 +8,7 @@ refinement runs after each layer.
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 from torch import Tensor
 
@@ -16,6 +16,10 @@ from qgs.containers import TensorContainer
 from qgs.contracts.component import ComponentConfig, ModelComponent, ModelDims
 from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Rendering, Views
 
+Decode: TypeAlias = Callable[[QueryState], Gaussians]
+"""Function of a model that decodes a query state into Gaussians."""
+Render: TypeAlias = Callable[[Gaussians, Cameras], Rendering]
+"""Function of a model that renders Gaussians (B, G) from cameras (B, V)."""
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 """Slots of the decoder for which each layer may have another component."""
@@ -181,8 +185,8 @@ class Feedback(ModelComponent):
         state: QueryState,
         memory: ImageMemory,
         views: Views,
-        decode: Callable[[QueryState], Gaussians],
-        render: Callable[[Gaussians, Cameras], Rendering],
+        decode: Decode,
+        render: Render,
     ) -> tuple[QueryState, ImageMemory]:
         """Return the query state and image memory that the first repeated layer reads.
 

@@ -2,7 +2,6 @@
 
 import math
 import tomllib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -12,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.containers import map_tensors
-from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, ModelDims
+from qgs.contracts import MEMORY_FIELDS, Decode, Fields, FieldSpec, ModelDims, Render
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.geometry.transforms import to_camera
 from qgs.precision import at_least_float32, full_precision
@@ -236,7 +235,7 @@ class Maker:
             features=self.uniform(0, 1, "BV4HW") if self.gives("features") else None,
         )
 
-    def decode(self) -> Callable[[QueryState], Gaussians]:
+    def decode(self) -> Decode:
         """Return a function that decodes K round Gaussians of each query from its features."""
         weights_DX = self.normal("D", 7 * self.axes["K"]) / math.sqrt(self.axes["D"])
 
@@ -250,7 +249,7 @@ class Maker:
 
         return decoded
 
-    def render(self) -> Callable[[Gaussians, Cameras], Rendering]:
+    def render(self) -> Render:
         """Return a stand-in for a renderer, which runs on any device and can be compiled."""
         return plain
 

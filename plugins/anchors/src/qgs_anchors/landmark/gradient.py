@@ -1,15 +1,13 @@
 """`landmark/gradient`: feedback of the gradient of rendering errors to the queries, in rounds."""
 
-from collections.abc import Callable
-
 import torch
 from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from qgs.containers import map_tensors
-from qgs.contracts import ModelDims
+from qgs.contracts import Decode, ModelDims, Render
 from qgs.precision import full_precision
-from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Rendering, Views
+from qgs.types import ImageMemory, QueryState, Views
 from qgs_anchors.landmark.rounds import RoundsFeedback
 
 RATE = 0.05
@@ -33,7 +31,7 @@ class GradientFeedback(RoundsFeedback):
     """
 
     name = "gradient"
-    learned = ("rate",)
+    learned = "rate"
 
     class Config(RoundsFeedback.Config):
         layers: PositiveInt = 1
@@ -53,8 +51,8 @@ class GradientFeedback(RoundsFeedback):
         state: QueryState,
         memory: ImageMemory,
         views: Views,
-        decode: Callable[[QueryState], Gaussians],
-        render: Callable[[Gaussians, Cameras], Rendering],
+        decode: Decode,
+        render: Render,
     ) -> tuple[QueryState, ImageMemory]:
         step_BND = torch.zeros_like(state.features)
         for _ in range(self.config.steps):
@@ -68,8 +66,8 @@ class GradientFeedback(RoundsFeedback):
 def normalised_slope(
     state: QueryState,
     views: Views,
-    decode: Callable[[QueryState], Gaussians],
-    render: Callable[[Gaussians, Cameras], Rendering],
+    decode: Decode,
+    render: Render,
 ) -> Tensor:
     """Return h = sign(g) log(1 + |g| / s), of shape (B, N, D), as `GradientFeedback` explains."""
     # Tensors of inference mode have no gradients, but copies outside it do.

@@ -3,7 +3,7 @@
 In a round, the model renders the input photos and runs its last decoder layers again.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from pydantic import PositiveInt
 from torch import nn
 
-from qgs.contracts import ModelDims, Problem, RecipeContext, memory_fields
+from qgs.contracts import Decode, ModelDims, Problem, RecipeContext, Render, memory_fields
 from qgs.tokengs.blocks import split_heads
-from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Rendering, Views
+from qgs.types import Cameras, ImageMemory, QueryState, Views
 from qgs_anchors.landmark.rounds import RoundsFeedback
 
 CHANNELS = 7
@@ -35,7 +35,7 @@ class RenderedFeedback(RoundsFeedback):
     name = "rendered"
     reads = memory_fields("keys", "values", "grid")
 
-    learned = ("kv_proj.",)
+    learned = "kv_proj."
 
     class Config(RoundsFeedback.Config):
         shrink: PositiveInt = 2
@@ -73,8 +73,8 @@ class RenderedFeedback(RoundsFeedback):
         state: QueryState,
         memory: ImageMemory,
         views: Views,
-        decode: Callable[[QueryState], Gaussians],
-        render: Callable[[Gaussians, Cameras], Rendering],
+        decode: Decode,
+        render: Render,
     ) -> tuple[QueryState, ImageMemory]:
         photos = self.shrunk(views)
         with torch.no_grad():

@@ -15,10 +15,10 @@ class RoundsFeedback(Feedback):
 
     marker: learned vector (D,), which `forward` adds to the features of all queries. It tells a
         layer that it runs in a round: the weights are those of the first pass.
-    learned: beginnings of the names of weights without which feedback has no effect.
+    learned: beginning of the names of weights without which feedback has no effect.
     """
 
-    learned: ClassVar[tuple[str, ...]]
+    learned: ClassVar[str]
 
     class Config(ComponentConfig):
         rounds: int = Field(default=2, ge=1, le=16)

@@ -6,21 +6,19 @@ Sources: ALIKED (Zhao et al. 2023), LightGlue (Lindenberger et al. 2023).
 
 from itertools import combinations
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 import torch
 from kornia.feature import ALIKED, LightGlue
 from PIL import Image
 
 from qgs_photos.poses.job import LENS, Job
-from qgs_photos.poses.two_views import Limits, Links
+from qgs_photos.poses.two_views import Array, Limits, Links
 
 # Takes dictionaries for options, which its types do not say.
 COLMAP: Any = pycolmap
-Array: TypeAlias = npt.NDArray[Any]
 
 SIDE = 640
 """Longer side, in pixels, to which photos are reduced."""

@@ -111,7 +111,7 @@ def mapped(job: Job) -> Mapping[str, Any]:
     learned = weights() if total <= SEARCHED and job.matching == "exhaustive" else None
     model: Any = None
     remarks: Sequence[str] = ()
-    refused: RefusedError | None = None
+    refused = RefusedError(NO_MATCHES)
     # SIFT finds more in photos that are turned or blurred
     for folder in (learned, None) if learned else (None,):
         own = replace(job, database=f"{job.database}.{'learned' if folder else 'sift'}")
@@ -127,7 +127,6 @@ def mapped(job: Job) -> Mapping[str, Any]:
         if model.num_reg_images() == total:
             break
     if model is None:
-        assert refused is not None
         raise refused
     return {"posed": _written(model, job), "remarks": remarks}
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field, PositiveInt
+from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, ModelDims
@@ -36,7 +36,7 @@ class VitConfig(ComponentConfig):
 
     width: PositiveInt = 384
     """Width of tokens: 384 for ViT-S, 768 for ViT-B, 1024 for ViT-L."""
-    depth: int = Field(default=12, ge=1, le=256)
+    depth: PositiveInt = 12
     """Number of blocks: 12 for ViT-S and ViT-B, 24 for ViT-L."""
     heads: Heads = 6
     """Number of attention heads: 6 for ViT-S, 12 for ViT-B, 16 for ViT-L, of 64 channels each."""

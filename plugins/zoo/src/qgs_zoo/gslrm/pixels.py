@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -66,7 +66,7 @@ class Transformer(PatchEncoder):
     writes = memory_fields("features", "patch_rays", "grid")
 
     class Config(PatchEncoder.Config):
-        depth: int = Field(default=24, ge=0, le=256)
+        depth: NonNegativeInt = 24
         """Number of blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width of the MLPs, as a multiple of the model's width (rounded down)."""

@@ -210,7 +210,7 @@ class LatentBottleneck(MultiscaleReadout):
     unlearned = ("feature_k_norm.bias",)
 
     class Config(MultiscaleReadout.Config):
-        depth: int = Field(default=12, ge=1, le=256)
+        depth: PositiveInt = 12
         """Number of ViT blocks."""
         blocks: tuple[int, ...] = Field(default=(6, 8, 10, 12), min_length=1)
         """Numbers of the ViT blocks whose outputs are read, in ascending order. The first block is
@@ -219,7 +219,7 @@ class LatentBottleneck(MultiscaleReadout):
         """L, the number of learned latents (TokenGS: 4096)."""
         latent_std: NonNegativeFloat = 0.02
         """Standard deviation of the initial latents, which are normally distributed."""
-        latent_depth: int = Field(default=12, ge=1, le=256)
+        latent_depth: PositiveInt = 12
         """Number of transformer blocks that update the latents. Sizes of their MLPs and initial
         LayerScales are those of the ViT."""
 
