@@ -177,7 +177,8 @@ class ObservedQueries(Queries):
         else:
             photos = memory.grid[0]
             aspect = aspect_of(config.cells or 1)
-            view_N, place_N2, share_2 = spread(self._drawn(), photos, size, aspect, device)
+            count = self._drawn(config.count)
+            view_N, place_N2, share_2 = spread(count, photos, size, aspect, device)
             # Several tokens of a tile start one query, so that it knows more than the centre.
             middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
             view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
@@ -186,10 +187,8 @@ class ObservedQueries(Queries):
             x_BND, nearness_BN1 = self._joined(*self._swept(x_BXD, views, view_X, place_X2))
         return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_N2, share_2))
 
-    def _drawn(self) -> int:
+    def _drawn(self, count: int) -> int:
         """Return the number of queries for one pass. It is random in training with `least`."""
-        count = self.config.count
-        assert count is not None
         if not self.training or self.config.least is None:
             return count
         share = torch.rand(()).item()

@@ -16,7 +16,6 @@ from qgs_photos.poses.two_views import USUAL, Links, TwoViews, View, linked, two
 COLMAP: Any = pycolmap
 # By the numbers of two photos.
 Linked: TypeAlias = Mapping[tuple[int, int], Links]
-Pairs: TypeAlias = Mapping[tuple[int, int], TwoViews]
 
 SEARCHED = 8
 """Largest number of photos whose pairs are searched by this module."""
@@ -82,7 +81,7 @@ def beginning(database: Any, links: Linked) -> tuple[Any, list[str], bool]:
     return model(database, (one, other), pair), remarks, estimated
 
 
-def pairs(seen: Mapping[int, View], links: Linked) -> Pairs:
+def pairs(seen: Mapping[int, View], links: Linked) -> Mapping[tuple[int, int], TwoViews]:
     """Return pairs of photos far enough apart. Raises RefusedError if there are none.
 
     seen: features of all photos, by number.

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-LENS = "SIMPLE_RADIAL"
-"""COLMAP's camera model for all photos."""
+LENS = {"camera_model": "SIMPLE_RADIAL"}
+"""COLMAP's options for the cameras of all photos."""
 
 
 @dataclass(frozen=True)

