@@ -103,18 +103,17 @@ class CheckpointFile(TensorFile):
 
     def _resized(self, recipe: Recipe, gaussians: int) -> Recipe:
         """Return `recipe` with the number of queries that makes about this many Gaussians."""
-        each = recipe.build_model("meta", pretrained=False).head.gaussians_per_query
-        count = max(1, round(gaussians / each))
-        try:
-            resized = resolve(recipe.tree, [f"model.queries.count={count}"])
-            model = resized.build_model("meta", pretrained=False)
-            refuse_misfit(model, self.tensors, self.path)
-        except (RecipeError, CheckpointError) as error:
-            raise ValueError(
-                f"{self.path} makes a number of Gaussians that its training or its photos fix: "
-                "leave out the number"
-            ) from error
-        return resized
+        model = recipe.build_model("meta", pretrained=False)
+        each = model.head.gaussians_per_query
+        count = round(gaussians / each)
+        if count == model.queries.count:
+            return recipe
+        least, most = model.queries.trained_counts or (0, 0)
+        if not least <= count <= most:
+            trained = f"was trained with {least * each:,} to {most * each:,} Gaussians: choose one"
+            reason = trained if most else "makes a number of Gaussians that is fixed: choose none"
+            raise ValueError(f"{self.path} {reason}")
+        return resolve(recipe.tree, [f"model.queries.count={count}"])
 
     @cached_property
     def tensors(self) -> dict[str, Tensor]:

@@ -47,8 +47,8 @@ Gaussians: TypeAlias = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="About how many Gaussians the model makes, if its queries start at photos, such as "
-        "those of Landmark. Default: as in the recipe.",
+        help="About how many Gaussians the model makes, if it was trained with random numbers of "
+        "queries (option `least` of landmark/observed). Default: as in the recipe.",
     ),
 ]
 Frames: TypeAlias = Annotated[

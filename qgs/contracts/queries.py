@@ -33,6 +33,14 @@ class Queries(ModelComponent):
         """Number N of queries, by default the option `count`; None if N depends on the views."""
         return getattr(self.config, "count", None)
 
+    @property
+    def trained_counts(self) -> tuple[int, int] | None:
+        """Least and largest number of queries in a training step; None if it is always the same.
+
+        A trained model may have any number between them.
+        """
+        return None
+
     @abstractmethod
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Return the initial state of every scene."""

@@ -86,7 +86,7 @@ def test_only_plugins_that_are_used_are_needed(tmp_path, monkeypatch):
     monkeypatch.setattr("qgs.recipe.registry.available_plugins", lambda: without_rooms)
     assert set(CheckpointFile(path).recipe.releases) == {"qgs", "locus", "datasets"}
     assert qgs.load(path).queries.count == 8
-    must_refuse("leave out the number", qgs.load, path, gaussians=1)
+    must_refuse("that is fixed: choose none", qgs.load, path, gaussians=1)
     must_refuse("offers a plugin `rooms`", qgs.compose, photos, SMALL, kind=RecipeError)
 
 

@@ -146,7 +146,9 @@ def test_a_number_of_anchors_is_that_for_any_number_of_photos(tmp_path):
     qgs.save(built("model.queries.count=20", "model.queries.least=5"), file)
     model = qgs.load(file)
     assert [model(views(count)).gaussians.count for count in (2, 5)] == [80, 80]
-    assert qgs.load(file, gaussians=121)(views()).gaussians.count == 120
+    assert qgs.load(file, gaussians=41)(views()).gaussians.count == 40
+    for wrong in (10, 121):
+        must_refuse("with 20 to 80 Gaussians", qgs.load, file, gaussians=wrong)
     torch.manual_seed(0)
     drawn = {model.train()(views()).gaussians.count for _ in range(20)}
     assert min(drawn) < 30

@@ -160,7 +160,6 @@ def view(
     frames: Frames = None,
     size: Size = None,
     scale: Scale = None,
-    gaussians: Gaussians = None,
     overrides: ViewsSettings = None,
     query: Query = None,
     html: Page = None,
@@ -197,7 +196,6 @@ def view(
         frames=frames,
         inputs=inputs,
         size=pixels,
-        gaussians=gaussians,
         overrides=[*(overrides or ()), *scale_settings(scale)],
     )
     console = Console()
@@ -241,10 +239,10 @@ def demo(
             f"give at most one folder of photos or video, got {', '.join(given or ())}"
         )
     # an option without effect would look as if it had one
-    if (size, scale) != (None, None) and (train or not given):
+    if (size, scale, gaussians) != (None, None, None) and (train or not given):
         raise ValueError(
-            "--size and --scale have an effect only on your own photos: give a folder of photos, "
-            "without --train, or leave both options out"
+            "--size, --scale and --gaussians have an effect only on your own photos: give a folder "
+            "of photos, without --train, or leave these options out"
         )
     from qgs_viewer.compare import RECIPES, compare_models, compare_trainings
 

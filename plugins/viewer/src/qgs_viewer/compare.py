@@ -56,7 +56,6 @@ def compare_models(
             model.evaluation.write(target / model.name)
         options = ["--size", size] if size else []
         options += ["--scale", f"{scale:g}"] if scale else []
-        options += ["--gaussians", f"{gaussians}"] if gaussians else []
         commands = next_commands(names, opened, target, photos, options)
     trained = "; ".join(f"{model.name}: {model.step or 'not known'}" for model in opened)
     facts = {"Steps of the last training run": trained}

@@ -178,7 +178,6 @@ def open_model(
     frames: str | None = None,
     inputs: int | None = None,
     size: Size | None = None,
-    gaussians: int | None = None,
     overrides: Sequence[str] = (),
 ) -> Source:
     """Open a model on a scene of `photos`, by default on a test scene of the recipe's data.
@@ -186,9 +185,9 @@ def open_model(
     The other arguments are the options of `qgs view` with these names. scene: name of the scene;
     None takes the first. frames: indices or files of the input photos; None chooses them. inputs:
     number of photos to choose; None takes the number in the recipe. size: (H, W) of the photos in
-    pixels. gaussians: as for `qgs.load`. overrides: settings of `views`, as `KEY=VALUE`.
+    pixels. overrides: settings of `views`, as `KEY=VALUE`.
     """
-    with CheckpointFile(name, gaussians) as file:
+    with CheckpointFile(name) as file:
         model = file.model(device)
         recipe = file.recipe
     if overrides:
@@ -358,7 +357,8 @@ def _with_queries(
             f"cameras.json must name a model on this machine (model: {name or 'not known'}); to "
             "see queries, use `qgs view MODEL PHOTOS`."
         )
-    with CheckpointFile(name, record.get("gaussians")) as file:
+    count = plain.gaussians.count if record.get("gaussians") else None
+    with CheckpointFile(name, count) as file:
         model = file.model(device)
         # the stored cameras are in the model's world already
         views = constant_scale(file.recipe.views, 1.0)

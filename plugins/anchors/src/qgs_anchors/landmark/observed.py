@@ -95,12 +95,11 @@ class ObservedQueries(Queries):
         """N, the number of queries, spread evenly over the input photos. The footprint of
         a query is the part of a photo that the query represents. If photos divide into N equal
         tiles with nearly square cells, each footprint is a tile; otherwise it is a square around
-        the query's point. Null puts `per_token` queries at the centre of each token's patch. A
-        trained model may have another number."""
+        the query's point. Null puts `per_token` queries at the centre of each token's patch."""
         least: PositiveInt | None = None
         """Smallest number of queries in a training step. Each step takes a random number from
-        `least` to `count`, with an even distribution of its logarithm. Null always takes
-        `count`."""
+        `least` to `count`, with an even distribution of its logarithm. Then all footprints are
+        squares, and a trained model may have any number between. Null always takes `count`."""
         tokens: PositiveInt = 1
         """S, the number of points in the footprint of a query at which the query samples tokens
         and depths. It has an effect only if `count` is a number."""
@@ -163,6 +162,11 @@ class ObservedQueries(Queries):
             reason = f"`least` is {config.least}, more than `count`, which is {config.count}"
             yield Problem("least", reason, f"write at most {config.count}, or raise `count`")
 
+    @property
+    def trained_counts(self) -> tuple[int, int] | None:
+        config = self.config
+        return (config.least, config.count) if config.least and config.count else None
+
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Return initial queries: features (B, N, D), and the fields in `fields_written`."""
         assert memory.grid is not None
@@ -176,7 +180,8 @@ class ObservedQueries(Queries):
             x_BND, nearness_BN1 = self._swept(x_BND, views, view_N, place_N2)
         else:
             photos = memory.grid[0]
-            aspect = aspect_of(config.cells or 1)
+            # Few random numbers fill photos with tiles, but training and evaluation must agree.
+            aspect = math.inf if config.least else aspect_of(config.cells or 1)
             count = self._drawn(config.count)
             view_N, place_N2, share_2 = spread(count, photos, size, aspect, device)
             # Several tokens of a tile start one query, so that it knows more than the centre.
@@ -260,7 +265,8 @@ class ObservedQueries(Queries):
         radii_BN1 = config.radius * side * z_BN1 / focal_BN1
         rows = 0
         if config.cells is not None:
-            fill = rows_in_square if config.count is None else rows_in_tile
+            square = config.count is None or config.least
+            fill = rows_in_square if square else rows_in_tile
             rows = fill(config.cells)
         shape_3 = F.pad(
             share_2.to(z_BN1) * constant([width, height], z_BN1) / side, (0, 1), value=rows

@@ -51,11 +51,10 @@ class RoundsFeedback(Feedback):
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return weights for this feedback, made from the weights `learned` of another model.
 
-        If `learned` is empty, because that model has no feedback, the returned weights give
-        renderings no effect. Otherwise `learned` is returned unchanged.
+        If that model has no feedback or another kind, the returned weights give renderings no
+        effect. Otherwise `learned` is returned unchanged.
         """
-        # Only a checkpoint of a model with rounds has these names.
-        if learned:
+        if any(name.startswith(self.learned) for name in learned):
             return dict(learned)
         own = self.state_dict()
         return own | {k: torch.zeros_like(own[k]) for k in own if k.startswith(self.learned)}
