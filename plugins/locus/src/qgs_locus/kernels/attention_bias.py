@@ -154,15 +154,12 @@ def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> Iterator[tuple[Tensor, Te
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
     """Call a kernel on several threads, each with all tokens and some rows of the other tensors."""
     tokens = tokens_GM.numpy()
-    queries, *others = (x.numpy() for x in of_rows)
-    pairs = len(queries) * tokens.shape[1]
+    count = len(of_rows[0])
+    pairs = count * tokens.shape[1]
     threads = min(torch.get_num_threads(), -(-pairs // _UNIT)) or 1
-    step = -(-len(queries) // threads)
-    work = []
-    for first in range(0, len(queries), step):
-        part = slice(first, first + step)
-        work.append((queries[part], tokens, *(x[part] for x in others)))
-    in_threads(kernel, work)
+    step = -(-count // threads)
+    parts = zip(*(x.split(step) for x in of_rows), strict=True)
+    in_threads(kernel, [(q.numpy(), tokens, *(x.numpy() for x in more)) for q, *more in parts])
 
 
 def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
