@@ -269,9 +269,9 @@ def _launch(kernel: Any, *tensors: Any) -> None:
     q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)
-    over = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
+    count, block = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
     # One program per block (of queries, or of tokens in the third kernel), head and scene.
-    grid = -(-over[0] // sizes[over[1]]), heads, scenes
+    grid = triton.cdiv(count, sizes[block]), heads, scenes
     arguments = [(x, x.stride()) if x is not None and x.ndim == 4 else x for x in tensors]
     with torch.cuda.device_of(q):
         kernel[grid](*arguments, heads, N, M, width, width**-0.5, **sizes)
