@@ -64,11 +64,12 @@ def check_name(name: str) -> None:
 
 def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
     """Yield path and content of every file of the template, filled in for the plugin `name`."""
-    from jinja2 import Environment, StrictUndefined
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
     import qgs
 
-    environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True)
+    loader = PackageLoader("qgs_dev", "template")
+    environment = Environment(loader=loader, undefined=StrictUndefined, keep_trailing_newline=True)
     major, minor = qgs.__version__.split(".")[:2]
     values = {
         "name": name,
@@ -78,9 +79,7 @@ def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
         "oldest_qgs": f"{major}.{minor}",
         "next_qgs": f"{major}.{int(minor) + 1}",
     }
-    folder = Path(__file__).with_name("template")
-    for file in sorted(folder.rglob("*.jinja")):
-        path = file.relative_to(folder).with_suffix("")
+    for file in environment.list_templates(extensions=["jinja"]):
+        path = PurePosixPath(file).with_suffix("")
         parts = [values["package"] if part == "package" else part for part in path.parts]
-        text = environment.from_string(file.read_text(encoding="utf-8")).render(values)
-        yield PurePosixPath(*parts), text
+        yield PurePosixPath(*parts), environment.get_template(file).render(values)
