@@ -233,7 +233,7 @@ def cases_of(installed: InstalledPlugin) -> list[Case]:
         if getattr(type(example), "__component__", None) not in plugin.components:
             fault = f"{example!r} is not a Config of its components; give MyComponent.Config()"
             raise _unsound(installed, "examples", fault)
-    defaults = [default_config(component) for component in plugin.components]
+    defaults = map(default_config, plugin.components)
     configs = [config for config in defaults if config is not None]
     configs += [example for example in plugin.examples if example not in configs]
     return [_case(config) for config in configs]
