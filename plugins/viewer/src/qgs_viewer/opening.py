@@ -357,7 +357,7 @@ def _with_queries(
             f"cameras.json must name a model on this machine (model: {name or 'not known'}); to "
             "see queries, use `qgs view MODEL PHOTOS`."
         )
-    count = plain.gaussians.count if record.get("gaussians") else None
+    count = record.get("gaussians") and plain.gaussians.count
     with CheckpointFile(name, count) as file:
         model = file.model(device)
         # the stored cameras are in the model's world already

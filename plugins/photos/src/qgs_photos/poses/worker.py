@@ -174,7 +174,7 @@ def _connected(job: Job, learned: Path | None) -> tuple[Any, list[str]]:
     if start is None:
         raise refused
     if learned:
-        remarks.insert(0, "ALIKED and LightGlue found and matched the features")
+        remarks.append("ALIKED and LightGlue found and matched the features")
     return start, remarks
 
 
