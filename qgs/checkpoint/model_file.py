@@ -108,7 +108,7 @@ class CheckpointFile(TensorFile):
         count = round(gaussians / each)
         if count == model.queries.count:
             return recipe
-        least, most = model.queries.trained_counts or (0, 0)
+        least, most = model.queries.trained_counts or (1, 0)
         if not least <= count <= most:
             trained = f"was trained with {least * each:,} to {most * each:,} Gaussians: choose one"
             reason = trained if most else "makes a number of Gaussians that is fixed: choose none"
