@@ -116,6 +116,7 @@ def _decode_options(
     A corner is a step at which a schedule may have an extreme value. For invalid options, adds
     problems and returns None.
     """
+    assert component.scheduled <= {*component.Config.model_fields}, component
     schedules: dict[str, Schedule] = {}
     steps = {0}
     for option, value, origin in node.entries():
