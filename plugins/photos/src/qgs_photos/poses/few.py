@@ -8,12 +8,9 @@ from itertools import combinations
 from typing import Any, TypeAlias
 
 import numpy as np
-import pycolmap
 
-from qgs_photos.poses.two_views import USUAL, Links, TwoViews, View, linked, two_views
+from qgs_photos.poses.two_views import COLMAP, USUAL, Links, TwoViews, View, linked, two_views
 
-# Takes dictionaries for options, which its types do not say.
-COLMAP: Any = pycolmap
 # By the numbers of two photos.
 Linked: TypeAlias = Mapping[tuple[int, int], Links]
 

@@ -9,16 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import torch
 from kornia.feature import ALIKED, LightGlue
 from PIL import Image
 
 from qgs_photos.poses.job import LENS, Job
-from qgs_photos.poses.two_views import Array, Limits, Links
-
-# Takes dictionaries for options, which its types do not say.
-COLMAP: Any = pycolmap
+from qgs_photos.poses.two_views import COLMAP, Array, Limits, Links
 
 SIDE = 640
 """Longer side, in pixels, to which photos are reduced."""

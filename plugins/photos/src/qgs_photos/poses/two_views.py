@@ -69,7 +69,8 @@ class Limits(NamedTuple):
 class Links(NamedTuple):
     """Matches of two photos.
 
-    indices: (N, 2) of the features of both. right: (N,) chance of each match to be right.
+    indices: (N, 2) of the features of both. right: (N,) chance of each match to be right. limits:
+    those of a pair that has such features.
     """
 
     indices: Array

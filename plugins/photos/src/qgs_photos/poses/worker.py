@@ -10,16 +10,14 @@ import os
 import sys
 import threading
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-import pycolmap
 
 from qgs_photos.poses.few import (
     NO_MATCHES,
@@ -31,10 +29,7 @@ from qgs_photos.poses.few import (
     described,
 )
 from qgs_photos.poses.job import LENS, Job
-
-# Takes dictionaries for options, which its types do not say.
-COLMAP: Any = pycolmap
-Array: TypeAlias = npt.NDArray[Any]
+from qgs_photos.poses.two_views import COLMAP, Array
 
 # Of a photo; fewer give no poses.
 FEW_FEATURES = 40
@@ -110,7 +105,7 @@ def mapped(job: Job) -> Mapping[str, Any]:
     total = len(job.sizes)
     learned = weights() if total <= SEARCHED and job.matching == "exhaustive" else None
     model: Any = None
-    remarks: Sequence[str] = ()
+    remarks = list[str]()
     refused = RefusedError(NO_MATCHES)
     # SIFT finds more in photos that are turned or blurred
     for folder in (learned, None) if learned else (None,):
