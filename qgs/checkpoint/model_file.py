@@ -88,8 +88,7 @@ class CheckpointFile(TensorFile):
         number of Gaussians cannot be chosen.
         """
         try:
-            recipe = self.stored_recipe()
-            return recipe if self.gaussians is None else self._resized(recipe, self.gaussians)
+            return self._resized(self.stored_recipe())
         except RecipeError as error:
             names = self.mapping(_DISTRIBUTIONS)
             versions = self.mapping(_PLUGINS).items()
@@ -101,11 +100,13 @@ class CheckpointFile(TensorFile):
                 f"installed ones do not fit its recipe:\n{error}"
             ) from error
 
-    def _resized(self, recipe: Recipe, gaussians: int) -> Recipe:
-        """Return `recipe` with the number of queries that makes about this many Gaussians."""
+    def _resized(self, recipe: Recipe) -> Recipe:
+        """Return `recipe` with queries for about `self.gaussians`; unchanged if this is None."""
+        if self.gaussians is None:
+            return recipe
         model = recipe.build_model("meta", pretrained=False)
         each = model.head.gaussians_per_query
-        count = round(gaussians / each)
+        count = round(self.gaussians / each)
         if count == model.queries.count:
             return recipe
         least, most = model.queries.trained_counts or (1, 0)

@@ -59,7 +59,7 @@ def reconstruct(
     """Reconstruct a scene from photos.
 
     Writes Gaussians (PLY), renderings, depth maps, an orbit and cameras. Scores held-out photos.
-    Searches for the best scale of the camera positions of your own photos.
+
     `qgs refine OUT PHOTOS` then fits the Gaussians to all photos; `qgs video OUT` films.
     """
     _refuse_unusable(out, overwrite)

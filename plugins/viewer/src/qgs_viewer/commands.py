@@ -239,7 +239,7 @@ def demo(
             f"give at most one folder of photos or video, got {', '.join(given or ())}"
         )
     # an option without effect would look as if it had one
-    if any((size, scale, gaussians)) and (train or not given):
+    if (size, scale, gaussians) != (None, None, None) and (train or not given):
         raise ValueError(
             "--size, --scale and --gaussians have an effect only on your own photos: give a folder "
             "of photos, without --train, or leave these options out"

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 import torch
-from pydantic import PositiveInt
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, Feedback, ModelDims, Problem, RecipeContext
@@ -21,7 +21,7 @@ class RoundsFeedback(Feedback):
     learned: ClassVar[str]
 
     class Config(ComponentConfig):
-        rounds: PositiveInt = 2
+        rounds: int = Field(default=2, ge=1, le=16)
         """Number of rounds in evaluation, and the largest number of rounds in a training step."""
         least: PositiveInt = 1
         """Smallest number of rounds in a training step. Each step takes a random number of rounds
