@@ -1,17 +1,15 @@
 """Scores of models on real photos, over many windows, at the best scale that a search finds.
 
-    python tools/real_photos.py PHOTOS ... [--model rooms/locus-64 ...]
-        [--distances .5 1 2] [--refine 10] [--windows 12] [--out JSON]
+    python tools/real_photos.py PHOTOS ... [--model rooms/locus-64 --model ...]
+        [--distance .5 --distance 1 ...] [--refine 10] [--windows 12] [--out JSON]
 
 A window is a set of neighbouring photos, some as inputs and some as targets. Windows are those that
 `qgs demo` chooses for the first model; every eighth photo is a target. PSNR and SSIM of each window
 are computed for: the model at the best scale; the model with `views.scale: auto`; the nearest input
 photo; this photo as a plane at the depth of the scene; and, with --refine, the model after a
-refinement on the inputs. The means are printed as Markdown. --distances: distance between inputs,
-relative to the distance in the model's training.
+refinement on the inputs. The means are printed as Markdown.
 """
 
-import argparse
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -22,6 +20,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+import typer
 from kornia.geometry.transform import warp_perspective
 from qgs_photos.datasets.view_samplers import apart
 from qgs_photos.refine import refine
@@ -32,6 +31,7 @@ from torch import Tensor
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.data.inputs import scene_depth
 from qgs.data.samples import Sample, make_sample, own_world
+from qgs.domain import Domain
 from qgs.metrics.baselines import nearest_input, pose_distance
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
@@ -40,36 +40,41 @@ from qgs.types import Cameras, Views
 
 SYSTEMS = ("landmark", "locus", "tokengs")
 MODELS = [f"{data}/{system}-64" for data in ("worlds", "rooms") for system in SYSTEMS]
+DISTANCES = [1.0]
 
 Row = dict[str, Any]
 
 
-def main() -> None:
-    options = parsed()
-    torch.set_num_threads(options.threads)
+def main(
+    photos: list[Path],
+    model: list[str] = MODELS,
+    distance: list[float] = DISTANCES,
+    refine: float = 0.0,
+    windows: int = 12,
+    threads: int = 1,
+    out: Path | None = None,
+) -> None:
+    """Print scores of models on PHOTOS, folders of photos with camera poses.
+
+    --distance: distance between inputs, relative to that in the model's training. --refine: seconds
+    of a refinement on the inputs, 0 for none. --windows: largest number for each scene. --out: JSON
+    file for the scores of all windows.
+    """
+    torch.set_num_threads(threads)
     rows: list[Row] = []
-    for given in product(options.model, options.photos, options.distances):
-        rows += scene_rows(*given, options)
+    # Its weights are not read: only the cameras that it was trained on are asked for.
+    with CheckpointFile(model[0]) as file:
+        domain = file.domain
+    for name, folder, factor in product(model, photos, distance):
+        for row in scene_rows(name, folder, apart(domain, factor), windows, refine):
+            rows.append({**row, "distance": factor})
     print(table(rows))
-    if options.out:
-        options.out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
-
-
-def parsed() -> argparse.Namespace:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("photos", nargs="+", type=Path, help="folders of photos with camera poses")
-    parser.add_argument("--model", nargs="+", default=MODELS, help=f"default: {', '.join(MODELS)}")
-    parser.add_argument("--distances", type=float, nargs="+", default=[1.0], metavar="FACTOR")
-    parser.add_argument("--refine", type=float, default=0.0, metavar="SECONDS", help="on inputs")
-    parser.add_argument("--windows", type=int, default=12, help="largest number per scene")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="JSON file for the scores of all windows")
-    return parser.parse_args()
+    if out:
+        out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
 def scene_rows(
-    name: str, photos: Path, distance: float, options: argparse.Namespace
+    name: str, photos: Path, domain: Domain, windows: int, seconds: float
 ) -> Iterator[Row]:
     """Yield a row for each window of the scene in the folder `photos`."""
     with CheckpointFile(name) as file:
@@ -77,10 +82,7 @@ def scene_rows(
         model = file.model("cpu")
     scene = recipe.build_data().scenes("test")[0]
     views = recipe.views
-    # Its weights are not read: only the cameras that it was trained on are asked for.
-    with CheckpointFile(options.model[0]) as file:
-        domain = apart(file.domain, distance)
-    for inputs, targets in spread_windows(scene, views.inputs, domain, options.windows):
+    for inputs, targets in spread_windows(scene, views.inputs, domain, windows):
         found = find_scale(model, scene, inputs, targets, views).factor
         auto = float(own_world(scene, inputs, views.model_copy(update={"scale": "auto"}))[1])
         sample = make_sample(scene, inputs, targets, constant_scale(views, 1.0), mirror=False)
@@ -90,9 +92,9 @@ def scene_rows(
             "nearest": nearest_input(sample.inputs, sample.targets.cameras),
             "plane": on_a_plane(sample.inputs, sample.targets.cameras, scene_depth(scene)),
         }
-        if options.refine:
-            shown["refined"] = rendered(model, sample, found, options.refine)
-        row: Row = {"model": name, "scene": photos.name, "distance": distance, "scale": found}
+        if seconds:
+            shown["refined"] = rendered(model, sample, found, seconds)
+        row: Row = {"model": name, "scene": photos.name, "scale": found}
         row |= {"inputs": list(inputs), "targets": list(targets)}
         for kind, images in shown.items():
             row[f"{kind} PSNR"] = float(psnr(images, sample.targets.images).mean())
@@ -120,18 +122,13 @@ def rendered(
 def on_a_plane(inputs: Views, targets: Cameras, depth: float) -> Tensor:
     """Return for each target the nearest input, warped as a plane at `depth`, (1, T, 3, H, W)."""
     index = pose_distance(inputs.cameras.c2w, targets.c2w)[0].argmin(-1)
-    nearest = inputs.select(index.tolist())
-    pose_T44 = nearest.cameras.w2c[0] @ targets.c2w[0]
-    step_T3 = pose_T44[:, :3, 3]
-    # Of the points of a ray, which the nearest camera turns and shifts, the one at this depth.
-    plane_T33 = (depth - step_T3[:, 2, None, None]) * torch.eye(3) + F.pad(
-        step_T3[..., None], (2, 0)
-    )
-    onto_T33 = lenses(nearest.cameras) @ plane_T33 @ pose_T44[:, :3, :3] @ lenses(targets).inverse()
-    size = targets.size
-    return warp_perspective(nearest.images[0], onto_T33.inverse(), size, padding_mode="border")[
-        None
-    ]
+    views = inputs.select(index.tolist())
+    nearest = views.cameras
+    pose_T44 = targets.w2c[0] @ nearest.c2w[0]
+    # Of a point at this depth, z / depth is 1: it adds the shift to the turned point.
+    plane_T33 = pose_T44[:, :3, :3] + F.pad(pose_T44[:, :3, 3:] / depth, (2, 0))
+    onto_T33 = lenses(targets) @ plane_T33 @ lenses(nearest).inverse()
+    return warp_perspective(views.images[0], onto_T33, targets.size, padding_mode="border")[None]
 
 
 def lenses(cameras: Cameras) -> Tensor:
@@ -144,20 +141,18 @@ def lenses(cameras: Cameras) -> Tensor:
 def table(rows: Sequence[Row]) -> str:
     """Return a Markdown table of means: a row for each model, scene and distance, and model."""
     scores = [name for name in rows[0] if name.endswith(("PSNR", "SSIM"))]
-    groups: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
+    groups = defaultdict[tuple[str, str, str], dict[str, Row]](dict)
     for row in rows:
-        groups[row["model"], row["scene"], f"{row['distance']:g}"].append(row)
-        # A window may be the best at several distances; it counts once.
-        whole = groups[row["model"], "**all**", ""]
-        window = (row["scene"], row["inputs"], row["targets"])
-        if window not in [(other["scene"], other["inputs"], other["targets"]) for other in whole]:
-            whole.append(row)
+        window = f"{row['scene']} {row['inputs']} {row['targets']}"
+        # A window may be the best at several distances; of all, it counts once.
+        for names in ((row["scene"], f"{row['distance']:g}"), ("**all**", "")):
+            groups[row["model"], *names].setdefault(window, row)
     lines = [["model", "scene", "distance", "windows", *scores]]
     for names, part in sorted(groups.items()):
-        means = [f"{mean(row[score] for row in part):.3f}" for score in scores]
+        means = [f"{mean(row[score] for row in part.values()):.3f}" for score in scores]
         lines.append([*names, str(len(part)), *means])
     return markdown_table(lines)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)
