@@ -11,39 +11,37 @@ kill-training and kill-study, processes are killed COUNT times, and no results m
 code is 1 if something is wrong.
 """
 
-import argparse
 import random
 import sys
-import tempfile
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
 
 import torch
+import typer
 from fuzzing.cases import fuzz
 
+Kind = Literal["recipes", "checkpoints", "data", "kill-training", "kill-study"]
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    kinds = ("recipes", "checkpoints", "data", "kill-training", "kill-study")
-    parser.add_argument("kind", choices=kinds)
-    parser.add_argument("--count", type=int, default=100, help="number of cases or kills")
-    parser.add_argument("--seed", type=int, default=0, help="random seed of all cases")
-    parser.add_argument("--only", type=int, help="number of a single case to use and show")
-    options = parser.parse_args()
+
+def main(kind: Kind, count: int = 100, seed: int = 0, only: int | None = None) -> None:
+    """Give qgs COUNT random damaged cases, or kill it COUNT times; exit with 1 if one is wrong.
+
+    --seed: random seed of all cases. --only: number of a single case to use and show.
+    """
     torch.set_num_threads(1)
-    module, _, killed = options.kind.partition("-")
+    name, _, killed = kind.partition("-")
     # Photos in all formats are written by what the tests have.
     sys.path.append(str(Path(__file__).parents[1] / "tests"))
-    kind = import_module(f"fuzzing.{module}")
-    with tempfile.TemporaryDirectory() as folder:
+    module = import_module(f"fuzzing.{name}")
+    with TemporaryDirectory() as folder:
         scratch = Path(folder)
         if killed:
-            random.seed(options.seed)
-            return getattr(kind, killed)(scratch, options.count)
-        return fuzz(kind, scratch, options.seed, options.count, options.only)
+            random.seed(seed)
+            sys.exit(getattr(module, killed)(scratch, count))
+        sys.exit(fuzz(module, scratch, seed, count, only))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    typer.run(main)
