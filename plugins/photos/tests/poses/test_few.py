@@ -75,6 +75,13 @@ def assert_within(degrees, pose, rotation, translation):
     assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < degrees
 
 
+def assert_poses_of_the_room(folder, shots):
+    """Of photos 3 and 5."""
+    one, other = (frame.c2w for frame in read_listing(UPath(folder)).frames)
+    true = np.linalg.inv(shots[5].c2w) @ shots[3].c2w
+    assert_within(2, np.linalg.inv(other) @ one, true[:3, :3], true[:3, 3])
+
+
 @pytest.mark.parametrize("focals", [(FOCAL, FOCAL), (0, 0), (FOCAL, 0), (2 * FOCAL, 2 * FOCAL)])
 def test_two_views_give_pose_focal_length_and_points(found, focals):
     model, remarks, _ = found(seen_twice(12, MOTION), *focals)
@@ -109,17 +116,27 @@ def test_two_photos_get_poses_and_a_blank_one_none(images, shots, tmp_path):
     shown = run_qgs("poses", tmp_path / "two", "--threads", 1).output
     assert "2 of 3 photos have poses" in shown
     assert "times their longer side" in shown
-    one, other = (frame.c2w for frame in read_listing(UPath(tmp_path / "two_poses")).frames)
-    true = np.linalg.inv(shots[5].c2w) @ shots[3].c2w
-    assert_within(2, np.linalg.inv(other) @ one, true[:3, :3], true[:3, 3])
+    assert_poses_of_the_room(tmp_path / "two_poses", shots)
 
 
+@pytest.fixture
+def alone(monkeypatch):
+    """COLMAP runs in this process, where it can be changed."""
+    monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())
+
+
+def remarks_on_all(walk, out):
+    """Of all photos, which have poses."""
+    made = making.make_poses(walk, out, making.Options(side=240), QUIET)
+    assert len(made.posed) == PHOTOS
+    return " ".join(made.remarks)
+
+
+@pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("least", ["few.PARALLAX", "worker.FEW_MATCHES"])
 def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, least):
     monkeypatch.setattr(f"qgs_photos.poses.{least}", np.inf)
-    monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())
-    made = making.make_poses(walk, tmp_path / "made", making.Options(side=240), QUIET)
-    assert len(made.posed) == PHOTOS
+    remarks_on_all(walk, tmp_path / "made")
 
 
 class Sift:
@@ -147,13 +164,12 @@ def matcher(given):
 
 
 @pytest.fixture
-def learning(monkeypatch, tmp_path):
+def learning(monkeypatch, tmp_path, alone):
     monkeypatch.setattr(worker, "weights", lambda: tmp_path)
     monkeypatch.setattr(learned, "SIDE", 200)
     monkeypatch.setattr(learned, "ALIKED", lambda *_, **__: Sift())
     monkeypatch.setattr(learned, "LightGlue", lambda *_, **__: matcher)
     monkeypatch.setattr(learned, "_load", lambda *_: None)
-    monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())
 
 
 @pytest.mark.usefixtures("learning")
@@ -164,16 +180,11 @@ def test_learned_features_give_poses_where_the_photos_have_them(images, shots, t
     made = making.make_poses(tmp_path / "two", tmp_path / "made", making.Options(), QUIET)
     assert len(made.posed) == 2
     assert any("ALIKED" in remark for remark in made.remarks)
-    one, other = (frame.c2w for frame in read_listing(UPath(tmp_path / "made")).frames)
-    true = np.linalg.inv(shots[5].c2w) @ shots[3].c2w
-    assert_within(2, np.linalg.inv(other) @ one, true[:3, :3], true[:3, 3])
+    assert_poses_of_the_room(tmp_path / "made", shots)
 
 
 @pytest.mark.usefixtures("learning")
 def test_learned_features_connect_photos_or_sift_does(walk, tmp_path, monkeypatch):
-    made = making.make_poses(walk, tmp_path / "made", making.Options(side=240), QUIET)
-    assert len(made.posed) == PHOTOS
+    remarks_on_all(walk, tmp_path / "made")
     monkeypatch.setattr(learned, "learn", Mock(side_effect=RefusedError(NO_MATCHES)))
-    made = making.make_poses(walk, tmp_path / "again", making.Options(side=240), QUIET)
-    assert len(made.posed) == PHOTOS
-    assert not any("ALIKED" in remark for remark in made.remarks)
+    assert "ALIKED" not in remarks_on_all(walk, tmp_path / "again")
