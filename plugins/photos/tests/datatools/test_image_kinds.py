@@ -22,9 +22,14 @@ MILLIMETRES = 1000 * METRES
 
 
 def photos(folder, files, key="file_path"):
-    """Photos as they are read, and what is found of them. files: bytes by name, of each frame."""
+    """Photos as they are read, and what is found of them.
+
+    files: by name, what each frame has: bytes, or pixels, which are written as the name says.
+    """
     write_row(folder, [RGB] * len(files), cameras=[{key: x} for x in files], fl_x=5.0, w=6, h=4)
     for name, data in files.items():
+        if not isinstance(data, bytes):
+            data = encoded(data, "TIFF" if name.endswith("tif") else "PNG")
         (folder / name).write_bytes(data)
     return scene(folder, SIZE), check(UPath(folder), Options(geometry=0)).findings
 
@@ -45,15 +50,15 @@ def colours_of_16_bits():
 
 
 def with_alpha(alpha):
-    return encoded(np.dstack([RGB, 0 * GREY + np.uint8(alpha)]))
+    return np.dstack([RGB, 0 * GREY + np.uint8(alpha)])
 
 
 def palette(pixels):
-    return encoded(Image.fromarray(pixels).convert("P", palette=Image.Palette.ADAPTIVE))
+    return Image.fromarray(pixels).convert("P", palette=Image.Palette.ADAPTIVE)
 
 
-def plain(mode, color, kind="PNG"):
-    return encoded(Image.new(mode, SIZE[::-1], color), kind)
+def plain(mode, color):
+    return Image.new(mode, SIZE[::-1], color)
 
 
 def array(values):
@@ -63,53 +68,53 @@ def array(values):
 
 
 IMAGES = {
-    "grey.png": (encoded(GREY), GREY),
-    "grey of 16 bits.png": (encoded(wide(GREY, 257)), GREY),
-    "grey of 16 bits.tif": (encoded(wide(GREY, 257), "TIFF"), GREY),
+    "grey.png": (GREY, GREY),
+    "grey of 16 bits.png": (wide(GREY, 257), GREY),
+    "grey of 16 bits.tif": (wide(GREY, 257), GREY),
     "colours of 16 bits.png": (colours_of_16_bits(), RGB),
-    "1 bit.png": (encoded(GREY >= 128), 255 * (GREY >= 128)),
-    "colours.png": (encoded(RGB), RGB),
+    "1 bit.png": (GREY >= 128, 255 * (GREY >= 128)),
+    "colours.png": (RGB, RGB),
     "opaque alpha.png": (with_alpha(255), RGB),
     "no alpha.png": (with_alpha(0), 0 * GREY + 255),
     "grey and alpha.png": (plain("LA", (0, 51)), 0 * GREY + 204),
     "palette.png": (palette(RGB), RGB),
-    "CMYK.tif": (plain("CMYK", (255, 0, 51, 0), "TIFF"), 0 * RGB + np.uint8([0, 255, 204])),
+    "CMYK.tif": (plain("CMYK", (255, 0, 51, 0)), 0 * RGB + np.uint8([0, 255, 204])),
 }
 MASKS = {
-    "255.png": encoded(WHITE),
-    "1.png": encoded(MASK),
-    "1 bit.png": encoded(MASK > 0),
-    "16 bits.png": encoded(wide(MASK, 65535)),
-    "255 of 16 bits.png": encoded(wide(MASK, 255)),
-    "grey colours.png": encoded(WHITE.convert("RGB")),
-    "grey palette.png": encoded(WHITE.convert("P")),
+    "255.png": WHITE,
+    "1.png": MASK,
+    "1 bit.png": MASK > 0,
+    "16 bits.png": wide(MASK, 65535),
+    "255 of 16 bits.png": wide(MASK, 255),
+    "grey colours.png": WHITE.convert("RGB"),
+    "grey palette.png": WHITE.convert("P"),
 }
 DEPTHS = {
-    "16 bits.png": encoded(np.uint16(MILLIMETRES)),
-    "16 bits.tif": encoded(MILLIMETRES.astype(">u2"), "TIFF"),
-    "float.tif": encoded(MILLIMETRES, "TIFF"),
-    "32 bits.tif": encoded(np.int32(MILLIMETRES), "TIFF"),
+    "16 bits.png": np.uint16(MILLIMETRES),
+    "16 bits.tif": MILLIMETRES.astype(">u2"),
+    "float.tif": MILLIMETRES,
+    "32 bits.tif": np.int32(MILLIMETRES),
     "array.npy": array(MILLIMETRES[..., None]),
 }
 NO_IMAGES = {
-    "float.tif": encoded(METRES, "TIFF"),
-    "32 bits.tif": encoded(np.int32(GREY), "TIFF"),
-    "LAB.tif": plain("LAB", 0, "TIFF"),
+    "float.tif": METRES,
+    "32 bits.tif": np.int32(GREY),
+    "LAB.tif": plain("LAB", 0),
     "PostScript.png": encoded(RGB, "EPS"),
     "text.png": b"no image",
     "cut off.png": encoded(RGB)[:60],
 }
 NO_MASKS = {
-    "colours.png": encoded(MASK[..., None] * np.uint8([255, 0, 0])),
+    "colours.png": MASK[..., None] * np.uint8([255, 0, 0]),
     "palette.png": palette(MASK[..., None] * np.uint8([200, 10, 10])),
     "alpha.png": plain("LA", (255, 128)),
-    "float.tif": encoded(np.float32(MASK), "TIFF"),
-    "another aspect ratio.png": encoded(WHITE.resize(SIZE)),
+    "float.tif": np.float32(MASK),
+    "another aspect ratio.png": WHITE.resize(SIZE),
     "text.png": b"no image",
 }
 NO_DEPTHS = {
-    "colours.png": encoded(RGB),
-    "1 bit.png": encoded(MASK > 0),
+    "colours.png": RGB,
+    "1 bit.png": MASK > 0,
     "objects.npy": array(np.array([[{}] * 6] * 4, object)),
     "false header.npy": array(METRES).replace(b"(4, 6), }", b"(2000000, 1000000), }"),
     "cut off.npy": array(METRES)[:-4],
