@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+import yaml
 from commands import ONE_LAYER
 from photo_formats import centred, synthetic, write_nerfstudio
 from walk import Walk, arc, pinhole
@@ -42,43 +43,52 @@ class Painter(torch.nn.Linear):
         return SimpleNamespace(rgb=torch.full((1, 2, 3, *size), 0.5 + self.errors[size[0]]))
 
 
-def test_the_better_size_is_taken_and_the_larger_of_equal_ones(monkeypatch):
+@pytest.fixture(autouse=True)
+def small_photos_are_large_enough(monkeypatch):
     monkeypatch.setattr("qgs.reconstruction.scale.LEAST", 8)
+
+
+def found_of(errors, compared, scene):
+    return find_size(Painter(errors), scene, (1, 4), compared, ViewsConfig())
+
+
+def test_the_better_size_is_taken_and_the_larger_of_equal_ones():
     for errors, best in (({8: 0.1, 16: 0.2}, 8), ({8: 0.2, 16: 0.1}, 16), ({8: 0.1, 16: 0.1}, 16)):
-        found = find_size(Painter(errors), Grey(), (1, 4), (2,), ViewsConfig())
+        found = found_of(errors, (2,), Grey())
         assert found.halved == (best == 8)
         assert found.gaussians == (best, best)
         assert found.text.startswith(f"size {best} x {best}: ")
-        inputs = find_size(Painter(errors), Grey(), (1, 4), (0, 2, 3, 5), ViewsConfig()).text
+        inputs = found_of(errors, (0, 2, 3, 5), Grey()).text
         assert "photos/01.png, photos/04.png" in inputs
 
 
-def test_a_sample_without_targets_is_halved_and_a_moving_scene_is_not(monkeypatch):
-    monkeypatch.setattr("qgs.reconstruction.scale.LEAST", 8)
-    model = Painter({8: 0.1, 16: 0.2})
-    small = half(make_sample(Grey(), (1, 4), (), ViewsConfig(), mirror=False), model)
+def test_a_sample_without_targets_is_halved_and_a_moving_scene_is_not():
+    errors = {8: 0.1, 16: 0.2}
+    sample = make_sample(Grey(), (1, 4), (), ViewsConfig(), mirror=False)
+    small = half(sample, Painter(errors))
     assert small.inputs.images.shape == (1, 2, 3, 8, 8)
     assert small.targets.images.shape == (1, 0, 3, 8, 8)
     moving = Grey()
     moving.times = torch.arange(len(moving)).double()
-    assert find_size(model, moving, (1, 4), (2,), ViewsConfig()) is None
+    assert found_of(errors, (2,), moving) is None
 
 
-@pytest.mark.parametrize(
-    ("trained", "stored", "expected"),
-    [
-        (16, (30, 40), (16, 24)),
-        (64, (118, 180), (64, 96)),
-        (128, (200, 300), (128, 192)),
-        (128, (300, 400), (256, 336)),
-        (256, (300, 400), (256, 336)),
-    ],
-)
+SIZES = """
+- [16, [30, 40], [16, 24]]
+- [64, [118, 180], [64, 96]]
+- [128, [200, 300], [128, 192]]
+- [128, [300, 400], [256, 336]]
+- [256, [300, 400], [256, 336]]
+"""
+"""Side in the training, size of the photos, size at which they are read."""
+
+
+@pytest.mark.parametrize(("trained", "stored", "expected"), yaml.safe_load(SIZES))
 def test_photos_are_never_enlarged_nor_larger_than_256(tmp_path, trained, stored, expected):
     write_nerfstudio(tmp_path, centred(synthetic(tmp_path / "photos", 4, stored)))
     data = {"type": "rooms/procedural", "image_size": [trained, trained]}
     recipe = resolve(ONE_LAYER | {"plugins": ["rooms"], "data": data})
     scene, _ = chosen_scene(recipe, str(tmp_path), None, None)
-    assert scene.cameras.size == expected
+    assert [*scene.cameras.size] == expected
     half = [side // 2 for side in expected]
     assert trained < 128 or not any(side % 8 for side in half)
