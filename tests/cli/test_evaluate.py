@@ -88,8 +88,9 @@ def test_other_weights_of_a_run_keep_its_evaluation(tmp_path):
 
 
 def test_settings_of_the_trained_model_are_refused(trained):
-    words = ("eval", trained[1], "--set", "training.steps=1")
-    must_refuse("would change the trained model", done, *words)
+    for setting in ("training.steps=1", "model.feedback.rounds_more=1"):
+        words = ("eval", trained[1], "--set", setting)
+        must_refuse("would change the trained model", done, *words)
 
 
 def test_tune_says_what_and_how_often():

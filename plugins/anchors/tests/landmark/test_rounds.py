@@ -97,9 +97,6 @@ def test_an_evaluation_sets_the_number_of_rounds(tmp_path, kind):
         return (out / "scenes.csv").read_text()
 
     assert scores(2, 1) == scores(1, 1) != scores(2, 2)
-    file = tmp_path / "2.safetensors"
-    wrong = ("--set", "model.feedback.rounds_more=1")
-    must_refuse("would change the trained model", done, "eval", file, *wrong)
 
 
 @KINDS
