@@ -33,15 +33,10 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
     factor. K: number of functions.
     """
     x, y, z = directions.unbind(-1)
-    # cos and sin of m times the azimuth, by angle addition, without computing an angle.
-    cosine = [torch.ones_like(x)]
-    sine = [torch.zeros_like(x)]
-    # Both are multiplied by sin^m of the angle to the pole.
-    for _ in range(degree):
-        c = cosine[-1]
-        s = sine[-1]
-        cosine = [*cosine, z * c - x * s]
-        sine = [*sine, z * s + x * c]
+    # cos and i sin of m times the azimuth, times sin^m of the angle to the pole, by angle addition:
+    # no angle is computed.
+    step = torch.complex(z, x)
+    power = torch.ones_like(step)
     found: dict[tuple[int, int], Tensor] = {}
     for m in range(degree + 1):
         # Associated Legendre functions divided by sin^m, by their recurrence in l.
@@ -52,8 +47,11 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
         for n in range(m, degree + 1):
             ratio = math.factorial(n - m) / math.factorial(n + m)
             scale = math.sqrt((2 * n + 1) * ratio * (2 if m else 1))
-            found[n, m] = scale * legendre[n - m + 1] * cosine[m]
-            found[n, -m] = scale * legendre[n - m + 1] * sine[m] if m else found[n, 0]
+            values = scale * legendre[n - m + 1] * power
+            # For m = 0 both are one function, the real part.
+            found[n, -m] = values.imag
+            found[n, m] = values.real
+        power = power * step
     return torch.stack([found[n, m] for n in range(degree + 1) for m in range(-n, n + 1)], -1)
 
 
