@@ -11,13 +11,7 @@ import torch
 from torch import nn
 
 from qgs import contracts
-from qgs.contracts import (
-    Component,
-    ComponentConfig,
-    Fields,
-    Metric,
-    ModelDims,
-)
+from qgs.contracts import Component, ComponentConfig, Fields, Metric, ModelDims
 from qgs.recipe.build import load_pretrained
 from qgs.recipe.yaml_text import dump
 from qgs.tokengs import ContentCrossAttention, ContentSelfAttention, MlpFeedForward

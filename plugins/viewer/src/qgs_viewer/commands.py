@@ -71,8 +71,7 @@ Page = Annotated[
     ),
 ]
 Host = Annotated[
-    str,
-    typer.Option(help="IP address to serve at. 0.0.0.0 lets other machines open the viewer."),
+    str, typer.Option(help="IP address to serve at. 0.0.0.0 lets other machines open the viewer.")
 ]
 Port = Annotated[
     int,

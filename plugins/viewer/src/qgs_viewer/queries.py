@@ -216,10 +216,7 @@ def notable_queries(
 
 
 def query_picture(
-    model: QueryGaussianModel,
-    gaussians: Gaussians,
-    chosen: Sequence[DrawnQuery],
-    cameras: Cameras,
+    model: QueryGaussianModel, gaussians: Gaussians, chosen: Sequence[DrawnQuery], cameras: Cameras
 ) -> Picture:
     """Draw the Gaussians of the queries `chosen` in colour over the scene in grey.
 

@@ -155,10 +155,7 @@ class QueryScene:
 
 @torch.no_grad()
 def explained(
-    model: QueryGaussianModel,
-    views: Views,
-    frames: Sequence[int],
-    placement: Placement = IDENTITY,
+    model: QueryGaussianModel, views: Views, frames: Sequence[int], placement: Placement = IDENTITY
 ) -> QueryScene:
     """Reconstruct a scene from V views (1, V) by `model`, with its queries after each layer.
 

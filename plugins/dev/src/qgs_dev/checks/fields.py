@@ -9,13 +9,7 @@ import torch
 from torch import Tensor
 
 from qgs.containers import map_tensors
-from qgs.contracts import (
-    CONTRACT_VERSION,
-    GAUSSIAN_FIELDS,
-    MEMORY_FIELDS,
-    Fields,
-    Plugin,
-)
+from qgs.contracts import CONTRACT_VERSION, GAUSSIAN_FIELDS, MEMORY_FIELDS, Fields, Plugin
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.recipe.slots import SECTIONS
 from qgs.recipe.yaml_text import inline

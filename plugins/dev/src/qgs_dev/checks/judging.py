@@ -95,10 +95,7 @@ def check_metric_gives_its_columns(case: Case) -> None:
         before = cloned(given)
         values = _values(module, given)
         keys = sorted(module.columns())
-        expect(
-            sorted(values) == keys,
-            f"its values are {sorted(values)}, its columns are {keys}",
-        )
+        expect(sorted(values) == keys, f"its values are {sorted(values)}, its columns are {keys}")
         expect_finite(values, "as the value of a column")
         expect_same(values, _values(module, given), "a second call gives other values")
         expect_same(before, given, "the component changes its inputs")
@@ -130,11 +127,7 @@ def _metric_input(case: Case, module: Metric, noise: float) -> MetricInput:
     target = maker.target()
     depth = maker.uniform(1, 2, "BV1HW")
     off = noise * maker.normal("BV3HW")
-    optional = {
-        "gaussians": maker.gaussians(),
-        "depth": depth + off[:, :, :1],
-        "true_depth": depth,
-    }
+    optional = {"gaussians": maker.gaussians(), "depth": depth + off[:, :, :1], "true_depth": depth}
     return MetricInput(
         images=target.images + off,
         targets=target if "masks" in module.needs else replace(target, masks=None),

@@ -129,11 +129,7 @@ def _shuffled(count: int) -> list[int]:
 
 
 def _difference_after(
-    case: Case,
-    names: Collection[str],
-    permute: Callable[[Any], Any],
-    outputs_too: bool,
-    part: int,
+    case: Case, names: Collection[str], permute: Callable[[Any], Any], outputs_too: bool, part: int
 ) -> str:
     """Permute the inputs `names`, and compare the outputs with those that the contract requires.
 

@@ -314,11 +314,7 @@ def quartiles(samples: Sequence[float]) -> dict[str, float]:
     return dict(zip(names, np.quantile(samples, (0.25, 0.5, 0.75)).tolist(), strict=True))
 
 
-def in_turn(
-    tasks: Sequence[Task],
-    rounds: int,
-    warmup: int,
-) -> list[list[float]]:
+def in_turn(tasks: Sequence[Task], rounds: int, warmup: int) -> list[list[float]]:
     """Call all tasks in each round, and return the seconds of each task in each round.
 
     The first `warmup` rounds are not measured. On a GPU, the clock waits for the end of the work.

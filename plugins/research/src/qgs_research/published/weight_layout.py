@@ -65,9 +65,7 @@ class WeightLayout:
 
 
 def layout(
-    name: str,
-    read: Callable[[Shapes], dict[str, Any]],
-    base: WeightLayout | None = None,
+    name: str, read: Callable[[Shapes], dict[str, Any]], base: WeightLayout | None = None
 ) -> WeightLayout:
     """Load the layout in `name`.toml.
 

@@ -16,8 +16,7 @@ compare_app = typer.Typer(help="Compare results of evaluations.")
 diff_app = typer.Typer(help="Compare recipes.")
 
 StudyFile: TypeAlias = Annotated[
-    str,
-    typer.Argument(metavar="STUDY", help="Study file, or name of a study that comes with qgs."),
+    str, typer.Argument(metavar="STUDY", help="Study file, or name of a study that comes with qgs.")
 ]
 
 

@@ -201,11 +201,7 @@ class Scores:
         return self.estimate({(model, evaluation): 1}, metric)
 
     def difference(
-        self,
-        model: str,
-        metric: str,
-        evaluation: str = MAIN,
-        confidence: float = CONFIDENCE,
+        self, model: str, metric: str, evaluation: str = MAIN, confidence: float = CONFIDENCE
     ) -> Estimate | None:
         """Return the mean score of a model minus that of the reference model.
 

@@ -74,11 +74,7 @@ Motion: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 def draw_cameras(
-    rng: Generator,
-    place: Place,
-    world: tuple[np.ndarray, np.ndarray],
-    count: int,
-    varied: bool,
+    rng: Generator, place: Place, world: tuple[np.ndarray, np.ndarray], count: int, varied: bool
 ) -> Rig:
     """Return `count` random cameras in `place` with useful views.
 

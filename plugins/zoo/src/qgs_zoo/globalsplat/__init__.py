@@ -9,15 +9,7 @@ from qgs_zoo.globalsplat.streams import Round, SlotQueries
 plugin = Plugin(
     name="globalsplat",
     contract_version=1,
-    components=(
-        PosedPatches,
-        SlotQueries,
-        Round,
-        MergingHead,
-        Frustum,
-        Regularisers,
-        TwoPasses,
-    ),
+    components=(PosedPatches, SlotQueries, Round, MergingHead, Frustum, Regularisers, TwoPasses),
     examples=(
         PosedPatches.Config(patch_size=4, rgb_width=24, ray_width=16, bands=2, registers=0),
         SlotQueries.Config(count=12, extra=3, std=0.3),

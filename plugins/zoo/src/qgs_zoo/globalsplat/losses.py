@@ -12,15 +12,7 @@ import torch.nn.functional as F
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from qgs.contracts import (
-    ComponentConfig,
-    Loss,
-    Objective,
-    Outcome,
-    Passes,
-    Problem,
-    RecipeContext,
-)
+from qgs.contracts import ComponentConfig, Loss, Objective, Outcome, Passes, Problem, RecipeContext
 from qgs.geometry.transforms import to_camera
 from qgs.losses import mean_of_gaussians
 from qgs.precision import full_precision

@@ -56,7 +56,7 @@ plugin = Plugin(
         },
         DepthSplatEncoder: {
             "parameters_learn": f"{_BIASES}; and where two layers that start at zero follow each "
-            "other, the first gets a gradient only after a step of the second",
+            "other, the first gets a gradient only after a step of the second"
         },
     },
 )

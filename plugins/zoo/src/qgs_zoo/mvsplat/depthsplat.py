@@ -19,20 +19,8 @@ from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS, Stages
 from qgs_zoo.mvsplat.dpt import LEVELS, DptHead
 from qgs_zoo.mvsplat.mvsplat import expected_disparity
-from qgs_zoo.mvsplat.sweep import (
-    Sweep,
-    bounds,
-    cost_volume,
-    cyclic_neighbours,
-    evenly_spaced,
-)
-from qgs_zoo.mvsplat.unet import (
-    OverViews,
-    UNet,
-    conv3,
-    resized,
-    two_convolutions,
-)
+from qgs_zoo.mvsplat.sweep import Sweep, bounds, cost_volume, cyclic_neighbours, evenly_spaced
+from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, resized, two_convolutions
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 
 GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4

@@ -15,13 +15,7 @@ from pydantic import PositiveFloat
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from qgs.contracts import (
-    ComponentConfig,
-    Encoder,
-    Problem,
-    RecipeContext,
-    memory_fields,
-)
+from qgs.contracts import ComponentConfig, Encoder, Problem, RecipeContext, memory_fields
 from qgs.contracts.settings import Far
 from qgs.geometry.constants import constant
 from qgs.precision import full_precision
