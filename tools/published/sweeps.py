@@ -4,14 +4,14 @@ from typing import Any
 
 import torch
 from qgs_zoo.dinov2.vit import PATCH
-from qgs_zoo.mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
-from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
+from qgs_zoo.mvsplat.depthsplat import DepthPredictor, DepthSplatEncoder, finer_candidates
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, expected_disparity
 from qgs_zoo.mvsplat.sweep import (
     Sweep,
     bounds,
     cyclic_neighbours,
     evenly_spaced,
+    nearest_neighbours,
     relative_poses,
 )
 from qgs_zoo.mvsplat.windows import shift_mask

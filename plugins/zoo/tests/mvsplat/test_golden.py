@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from published.files import read_golden
 from published.splats import model_of, views_of
 from qgs_zoo.mvsplat import sweep
-from qgs_zoo.mvsplat.depthsplat import nearest_neighbours
+from qgs_zoo.mvsplat.sweep import nearest_neighbours
 from torch import nn
 from torch.testing import assert_close
 

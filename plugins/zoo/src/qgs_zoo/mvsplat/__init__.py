@@ -2,7 +2,7 @@
 
 from qgs.contracts import Plugin
 from qgs_zoo.dinov2.vit import VitConfig
-from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
+from qgs_zoo.mvsplat.depthsplat import DepthSplatEncoder
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder
 from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries, RayHead, WorldHead
 from qgs_zoo.mvsplat.two_depths import DecayedSupervision, DepthError, Exchange

@@ -1,10 +1,10 @@
-"""DepthSplat (Xu et al., arXiv 2410.13862): depth from a plane sweep and a pretrained ViT.
+"""`mvsplat/depthsplat`: DepthSplat (arXiv 2410.13862), a plane sweep and a pretrained ViT.
 
 Names of parameters are those of the released weights. Level 0, 1 or 2 means maps of 1/2, 1/4 or 1/8
 of the image size. Scale 0 means the first plane sweep, scale 1 the second.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -12,14 +12,27 @@ import torch.nn.functional as F
 from pydantic import Field, NonNegativeInt, PositiveInt, ValidationInfo, field_validator
 from torch import Tensor, nn
 
-from qgs.contracts import ComponentConfig, OptionError
+from qgs.contracts import ComponentConfig, ModelDims, OptionError, Problem, RecipeContext
+from qgs.geometry.harmonics import SH_C0
 from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs.encoder import imagenet_normalised
+from qgs.types import Views
 from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
+from qgs_zoo.mvsplat.adapter import coefficients
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS, Stages
 from qgs_zoo.mvsplat.dpt import LEVELS, DptHead
 from qgs_zoo.mvsplat.mvsplat import expected_disparity
-from qgs_zoo.mvsplat.sweep import Sweep, bounds, cost_volume, cyclic_neighbours, evenly_spaced
+from qgs_zoo.mvsplat.pixels import WIDTHS as TOKEN_WIDTHS
+from qgs_zoo.mvsplat.pixels import degree_of
+from qgs_zoo.mvsplat.sweep import (
+    DepthRange,
+    Sweep,
+    SweepEncoder,
+    bounds,
+    cost_volume,
+    evenly_spaced,
+    nearest_neighbours,
+)
 from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, resized, two_convolutions
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 
@@ -121,22 +134,6 @@ class Pyramid(nn.Module):
 
     def forward(self, x_NChw: Tensor) -> list[Tensor]:
         return [stage(x_NChw) for stage in self.stages]
-
-
-def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
-    """Return the indices (B, V, J) of the views with which each view is compared.
-
-    With up to three views, these are all other views in ascending order. With more views, they are
-    the J = `count` views with the nearest cameras, nearest first.
-    """
-    scenes, views = c2w_BV44.shape[:2]
-    if views <= 3:
-        return cyclic_neighbours(scenes, views, c2w_BV44.device).sort(-1).values
-    centre_BV3 = at_least_float32(c2w_BV44[..., :3, 3])
-    order_BVV = torch.cdist(centre_BV3, centre_BV3).argsort(-1)
-    # The first is assumed to be the view itself (released code). If two cameras are at the same
-    # place, it may be the other one.
-    return order_BVV[..., 1 : count + 1]
 
 
 @full_precision
@@ -329,3 +326,71 @@ class DepthSplat(nn.Module):
             torch.cat([hidden, images_N3HW, features_NFHW, found.confidence], 1)
         )
         return found.depths, raw.unflatten(0, images_BV3HW.shape[:2])
+
+
+class DepthSplatEncoder(SweepEncoder):
+    """Encoder that predicts depth and raw Gaussian of each pixel, with a plane sweep and a ViT.
+
+    The ViT is pretrained. The memory has a token for each pixel. The D numbers of a token are those
+    of `qgs_zoo.mvsplat.pixels.CHANNELS`, then coefficients of harmonics. The pixel's colour is
+    added to the constant coefficient. D is the model's width: 38 for harmonics of degree 2
+    (published). In a wider model, tokens have zeros at the end.
+    """
+
+    name = "depthsplat"
+
+    class Config(DepthSplatConfig, DepthRange):
+        coarse_depth: bool = False
+        """Store the logarithm of the first sweep's depth in the last of a token's D numbers, for
+        the decoder layer `mvsplat/exchange`. This needs `scales: 2`, and one more channel in
+        `model.width` (published: 39)."""
+
+    config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        if config.coarse_depth and config.scales == 1:
+            reason = "with `scales: 1` there is no coarse depth"
+            yield Problem("coarse_depth", reason, "write false, or set scales to 2")
+        if config.coarse_depth and context.dims.width in TOKEN_WIDTHS:
+            width = context.dims.width
+            reason = f"the {width} numbers of a token leave none for a coarse depth"
+            yield Problem("coarse_depth", reason, f"set model.width to {width + 1}")
+        if config.features % (32 * config.scales):
+            reason = f"{config.features} features do not split into heads of 32 in both sweeps"
+            yield Problem("features", reason, "write a multiple of 64")
+        yield from super().problems(config, context)
+
+    @classmethod
+    def multiple(cls, config: Config) -> int:
+        # The U-Nets halve the features of each sweep.
+        return 4 * config.stride
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.network = DepthSplat(config, coefficients(degree_of(dims.width)))
+
+    def load_pretrained(self) -> None:
+        self.network.depth_predictor.pretrained.load(self.config.vit.weights)
+
+    def decays(self, name: str, parameter: nn.Parameter) -> bool:
+        """Return True, because all parameters have weight decay (released code)."""
+        return True
+
+    def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
+        # Chosen once: both scales and the transformer read the same views.
+        neighbours = nearest_neighbours(views.cameras.c2w, self.config.neighbours)
+        sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
+        depths, raw_BVCHW = self.network(views.images, sweep)
+        gaussian, sh_BVCHW = at_least_float32(raw_BVCHW).tensor_split([GAUSSIAN_CHANNELS], 2)
+        sh_BV3KHW = sh_BVCHW.unflatten(2, (3, -1))
+        # The pixel's colour is added to the constant: an untrained network copies the photo.
+        constant = sh_BV3KHW[:, :, :, :1] + ((views.images - 0.5) / SH_C0)[:, :, :, None]
+        sh_BV3KHW = torch.cat([constant, sh_BV3KHW[:, :, :, 1:]], 3)
+        # Logarithms of depths have about the range of features.
+        logs = [depth[:, :, None].log() for depth in depths]
+        numbers = torch.cat([logs[-1], gaussian, sh_BV3KHW.flatten(2, 3)], 2)
+        # It is the last number, where `mvsplat/exchange` expects it.
+        coarse = logs[:1] if self.config.coarse_depth else []
+        left = self.dims.width - numbers.shape[2] - len(coarse)
+        return torch.cat([F.pad(numbers, (0, 0, 0, 0, 0, left)), *coarse], 2)

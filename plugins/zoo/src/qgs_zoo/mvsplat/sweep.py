@@ -18,7 +18,7 @@ from torch.utils.checkpoint import checkpoint
 from qgs.contracts import ComponentConfig, Encoder, Problem, RecipeContext, memory_fields
 from qgs.contracts.settings import Far
 from qgs.geometry.constants import constant
-from qgs.precision import full_precision
+from qgs.precision import at_least_float32, full_precision
 from qgs.types import Cameras, ImageMemory, Views
 from qgs_zoo.mvsplat.pixels import width_problems
 
@@ -41,6 +41,22 @@ def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
     # A single view is compared with itself.
     step = torch.arange(1, max(views, 2), device=device)
     return ((view[:, None] + step) % views).expand(scenes, -1, -1)
+
+
+def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
+    """Return the indices (B, V, J) of the views with which each view is compared.
+
+    With up to three views, these are all other views in ascending order. With more views, they are
+    the J = `count` views with the nearest cameras, nearest first.
+    """
+    scenes, views = c2w_BV44.shape[:2]
+    if views <= 3:
+        return cyclic_neighbours(scenes, views, c2w_BV44.device).sort(-1).values
+    centre_BV3 = at_least_float32(c2w_BV44[..., :3, 3])
+    order_BVV = torch.cdist(centre_BV3, centre_BV3).argsort(-1)
+    # The first is assumed to be the view itself (released code). If two cameras are at the same
+    # place, it may be the other one.
+    return order_BVV[..., 1 : count + 1]
 
 
 class Sweep(NamedTuple):
