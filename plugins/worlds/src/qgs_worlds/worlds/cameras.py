@@ -70,7 +70,7 @@ class Path(NamedTuple):
 
 
 Motion: TypeAlias = tuple[np.ndarray, np.ndarray]
-"""Camera centres (F, 3), and the points (F, 3) that the cameras look at."""
+"""Camera centres (F, 3), and the points (F, 3), or one point, that the cameras look at."""
 
 
 def draw_cameras(
@@ -130,9 +130,7 @@ def _still(rng: Generator, place: Place, shapes: np.ndarray, count: int, rig: Ri
     base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
     eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
     target = np.array(place.targets[0])
-    return Rig(
-        _look_at(eyes, np.tile(target, (count, 1)), np.zeros(count)), rig.fov, rig.distance, "still"
-    )
+    return Rig(_look_at(eyes, target, np.zeros(count)), rig.fov, rig.distance, "still")
 
 
 def _draw(rng: Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
@@ -219,7 +217,7 @@ def _orbit(rng: Generator, path: Path) -> Motion:
     rise = 0.2 * length * rng.normal() * s
     x, y = _turned(offset, angles)
     eyes = target + np.stack([nearer * x, nearer * y, offset[2] + rise], 1)
-    return eyes, np.tile(target, (len(s), 1))
+    return eyes, target
 
 
 def _round(rng: Generator, path: Path) -> Motion:
@@ -240,7 +238,7 @@ def _gather(rng: Generator, path: Path) -> Motion:
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
     # the square root spreads them nearly evenly over the disc
     offsets *= rng.random((len(s), 1)) ** 0.5 / np.linalg.norm(offsets, axis=1, keepdims=True)
-    return base + 0.5 * length * offsets, np.tile(target, (len(s), 1))
+    return base + 0.5 * length * offsets, target
 
 
 _MOTIONS = {"walk": _walk, "orbit": _orbit, "round": _round, "gather": _gather}
