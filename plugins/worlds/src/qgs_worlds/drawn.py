@@ -83,7 +83,7 @@ class DrawnScene(Scene):
         from qgs_worlds.caster.casting import cast
 
         depths = cast(self.tables, self.c2w[list(frames)], self.lens, self._config.image_size)
-        return torch.from_numpy(np.where(np.isfinite(depths), depths, 0))[:, None] * self.scale
+        return torch.from_numpy(np.nan_to_num(depths, posinf=0))[:, None] * self.scale
 
     def painted(
         self, frames: list[int], paint: Callable[..., None], kind: type[np.number]

@@ -89,8 +89,8 @@ def camera_path(
     """
     # drawn along one wall, then turned, so that all four walls are equally likely
     side = int(rng.integers(4))
-    across = size[0] if side % 2 == 0 else size[1]
-    along = size[1] if side % 2 == 0 else size[0]
+    across = size[side % 2]
+    along = size[1 - side % 2]
     travel = rng.uniform(*TRAVEL)
     back = rng.uniform(WALL + 0.1, 0.25 * across) - across / 2
     middle = rng.uniform(-1, 1) * max(along / 2 - WALL - travel / 2 - 0.1, 0.0)
