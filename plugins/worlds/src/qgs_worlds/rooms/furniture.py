@@ -6,9 +6,7 @@ axis goes through the centre of the room. Shapes are upright and may be turned a
 
 import math
 import re
-import tomllib
 from collections.abc import Sequence
-from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -17,7 +15,7 @@ import numpy as np
 from qgs_worlds.caster import shapes
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.shapes import Point, Primitive, Shape, about_z
-from qgs_worlds.rooms.materials import Materials, between
+from qgs_worlds.rooms.materials import Materials, between, kinds_beside
 
 # Surfaces of a room: -x, +x, -y, +y, floor and ceiling.
 WALLS = 6
@@ -81,28 +79,23 @@ LOOSE = ("balls", "chair", "crates", "plant", "floor_lamp", "round_table")
 _LEVEL = 0.38
 
 
-def _terms(value: float | str) -> float | list[tuple[float, str]]:
+def _terms(value: float | str) -> list[tuple[float, str]]:
     """Parse a sum of lengths such as "h-0.3r" into pairs (factor, name of a length).
 
-    The name of a plain number in the sum is "". A `value` that is a number is returned unchanged.
+    The name of a plain number is "".
     """
     if not isinstance(value, str):
-        return value
+        return [(value, "")]
     found = re.findall(r"([+-]?)(?=[\d.a-z])([\d.]*)([a-z]*)", value)
     return [(float(f"{sign}{factor or 1}"), name) for sign, factor, name in found]
 
 
 def _lengths(values: list[Any], sizes: Sizes) -> list[float]:
-    lengths = []
-    for value in values:
-        if isinstance(value, list):
-            value = sum([factor * sizes.get(name, 1.0) for factor, name in value])
-        lengths.append(value)
-    return lengths
+    return [sum([factor * sizes.get(name, 1.0) for factor, name in terms]) for terms in values]
 
 
-# The file explains its keys. Sums are parsed once, because rooms are drawn often.
-_KINDS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+# Sums are parsed once, because rooms are drawn often.
+_KINDS = kinds_beside(__file__)
 _MAKERS: dict[str, Any] = {"box": box, "cylinder": cylinder, "sphere": sphere}
 for _kind in _KINDS.values():
     for _row in _kind.setdefault("parts", []):

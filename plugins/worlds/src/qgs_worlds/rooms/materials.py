@@ -14,8 +14,13 @@ from qgs_worlds.caster.tables import TEXTURE
 
 Color = Sequence[float]
 
-# The file explains its keys.
-_KINDS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+
+def kinds_beside(module: str) -> dict[str, Any]:
+    """Read the TOML file beside a Python file, which has its name; it explains its keys."""
+    return tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
+
+
+_KINDS = kinds_beside(__file__)
 _FIXED: dict[str, Color] = {"white": (0.95, 0.94, 0.91), "dark": (0.10, 0.09, 0.09)}
 _WOODS: list[Color] = _KINDS["floor"]["kinds"][0]["paints"]["board"]["any"]
 
