@@ -32,10 +32,9 @@ class Primitive(NamedTuple):
 
     def moved(self, to: Point, turn: Turn, size: float) -> "Primitive":
         """Return the primitive scaled by `size` about the origin, turned, then moved by `to`."""
-        x, y, z = rotated(turn, self.center)
-        center = (to[0] + size * x, to[1] + size * y, to[2] + size * z)
-        a, b, c = self.half
-        half = (size * a, size * b, size * c)
+        turned = rotated(turn, self.center)
+        center = tuple(start + size * way for start, way in zip(to, turned, strict=True))
+        half = tuple(size * part for part in self.half)
         return Primitive(self.kind, center, half, product(turn, self.turn), self.extra)
 
     def reach(self) -> float:
