@@ -74,32 +74,22 @@ def _darken(darkness, body, size, lamp):
 
 
 @kernel
-def _blurred(values):
-    """Return a blurred map (C, C): each cell is the mean of the 3 x 3 cells around it."""
-    last = values.shape[0] - 1
-    result = np.empty(values.shape)
-    for i in range(values.shape[0]):
-        for j in range(values.shape[0]):
-            total = 0.0
-            for a in range(-1, 2):
-                for b in range(-1, 2):
-                    total += values[min(max(i + a, 0), last), min(max(j + b, 0), last)]
-            result[i, j] = total / 9
-    return result
+def darkened_floor(shapes, size, lamp):
+    """Return the shares (C, C) of the light on the floor that shadows remove.
 
-
-@kernel
-def floor_shadows(shapes, size, lamp):
-    """Return the factors (C, C) by which shadows reduce the light on the floor.
-
-    The factors are indexed by cell along x, then along y; 1 is a cell without shadow.
+    The shares are indexed by cell along x, then along y.
     """
     darkness = np.zeros((_SHADOW_CELLS, _SHADOW_CELLS))
     # the first shape is the room
     for i in range(1, shapes.shape[0]):
         _darken(darkness, shapes[i].body, size, lamp)
-    # blurring twice is nearly a Gaussian; lamps are wide
-    return 1 - _blurred(_blurred(darkness))
+    return darkness
+
+
+def blurred(values: np.ndarray) -> np.ndarray:
+    """Return a blurred map (C, C): each cell is the mean of the 3 x 3 cells around it."""
+    padded = np.pad(values, 1, "edge")
+    return np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).mean((2, 3))
 
 
 @inner

@@ -5,7 +5,7 @@ from random import Random
 
 import numpy as np
 
-from qgs_worlds.caster.interiors import floor_shadows
+from qgs_worlds.caster.interiors import blurred, darkened_floor
 from qgs_worlds.caster.shapes import Shape
 from qgs_worlds.caster.tables import LIGHT, Room
 from qgs_worlds.rooms.furniture import (
@@ -59,7 +59,8 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
     furnisher.shapes += _fixed(make, size)
     shapes = packed(size, furnisher.shapes)
     lights = _lights(rng, size, window_side)
-    floor = floor_shadows(shapes, size, lights["place"][0])
+    # blurring twice is nearly a Gaussian; lamps are wide
+    floor = 1 - blurred(blurred(darkened_floor(shapes, size, lights["place"][0])))
     return Room(shapes, NO_HEIGHTS, material.table(surfaces), size, lights, floor)
 
 
