@@ -6,7 +6,7 @@ from random import Random
 import numpy as np
 
 from qgs_worlds.caster.interiors import blurred, darkened_floor
-from qgs_worlds.caster.shapes import Shape
+from qgs_worlds.caster.shapes import Point, Shape
 from qgs_worlds.caster.tables import LIGHT, Room
 from qgs_worlds.rooms.furniture import (
     AGAINST_WALLS,
@@ -29,7 +29,6 @@ _GAP = 0.05
 NO_HEIGHTS = np.zeros((1, 2, 2), np.float32)
 
 Size = tuple[float, float, float]
-Point = tuple[float, float, float]
 # Corners of a piece that fits at every place where another piece fits.
 _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
@@ -71,7 +70,7 @@ class Furnisher:
         self.size = size
         self.eyes = eyes.tolist()
         self.shapes: list[Shape] = []
-        self._taken: list[tuple[float, float, float, float]] = []
+        self._taken: list[tuple[Point, Point]] = []
 
     def place(self, piece: Piece, x: float, y: float, turn: float) -> bool:
         """Place `piece` at (x, y), turned by `turn` radians, if it fits.
@@ -81,7 +80,7 @@ class Furnisher:
         low, high = turned(*bounds(piece), x, y, turn)
         if not self.free(low, high):
             return False
-        self._taken.append((low[0], low[1], high[0], high[1]))
+        self._taken.append((low, high))
         self.shapes += [shape.moved(turn, (x, y, 0.0)) for shape in piece]
         return True
 
@@ -94,14 +93,13 @@ class Furnisher:
         half_y = self.size[1] / 2
         if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
             return False
-        for x0, y0, x1, y1 in self._taken:
+        for (x0, y0, _), (x1, y1, _) in self._taken:
             beside_x = low[0] >= x1 + _GAP or high[0] <= x0 - _GAP
             if not (beside_x or low[1] >= y1 + _GAP or high[1] <= y0 - _GAP):
                 return False
-        for x, y, z in self.eyes:
-            apart = zip(low, (x, y, z), high, strict=True)
-            dx, dy, dz = (max(start - eye, eye - end, 0.0) for start, eye, end in apart)
-            if dx * dx + dy * dy + dz * dz <= CLEARANCE**2:
+        for eye in self.eyes:
+            apart = (max(a - x, x - b, 0.0) for a, x, b in zip(low, eye, high, strict=True))
+            if sum(away * away for away in apart) <= CLEARANCE**2:
                 return False
         return True
 
@@ -110,9 +108,9 @@ def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
     """Return the lowest and the highest corner of the box around all of `shapes`."""
     center, half, turn = map(np.array, zip(*[shape.body[1:4] for shape in shapes], strict=True))
     reach = (abs(turn.reshape(-1, 3, 3)) @ half[..., None])[..., 0]
-    x0, y0, z0 = (center - reach).min(0).tolist()
-    x1, y1, z1 = (center + reach).max(0).tolist()
-    return (x0, y0, z0), (x1, y1, z1)
+    low = (center - reach).min(0).tolist()
+    high = (center + reach).max(0).tolist()
+    return low, high
 
 
 def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
