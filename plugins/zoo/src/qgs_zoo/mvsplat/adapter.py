@@ -4,7 +4,6 @@ These models predict spherical harmonics in e3nn's basis and rotations in the ca
 """
 
 import math
-from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -78,16 +77,6 @@ with torch.inference_mode(False):
     _FITTED = {degree: _fitted(degree) for degree in (1, 2, 3, 4)}
 
 
-@cache
-def _on_gpu(degree: int, device: torch.device) -> tuple[Tensor, ...]:
-    with torch.inference_mode(False):
-        return tuple(x.to(device) for x in _FITTED[degree])
-
-
-def _fixed(degree: int, device: torch.device) -> tuple[Tensor, ...]:
-    return _FITTED[degree] if device.type == "cpu" else _on_gpu(degree, device)
-
-
 @full_precision
 def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
     """Return Wigner matrices (..., K, K) of rotations (..., 3, 3) for K harmonics of e3nn.
@@ -96,7 +85,8 @@ def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
     function. They are an exact fit, in float64, to values in 64 directions. The released code uses
     Euler angles, which lose digits for small tilts.
     """
-    directions, inverse, _ = _fixed(degree, rotation.device)
+    # Small copies, for which the CPU does not wait. Kept ones could be those of another mode.
+    directions, inverse = (x.to(rotation.device, non_blocking=True) for x in _FITTED[degree][:2])
     turned = torch.einsum("...ij,sj->...si", rotation.double(), directions)
     # Y(R d) = D Y(d) for every direction d.
     return (inverse @ e3nn_harmonics(turned, degree)).mT.to(rotation.dtype)
@@ -123,7 +113,7 @@ def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
     weights were trained with this order and with `views.frame: given`, so they need both.
     """
     turn = turn_of_harmonics(rotation, degree) * band_mask(degree, rotation)
-    return _fixed(degree, rotation.device)[2].to(rotation) @ turn
+    return _FITTED[degree][2].to(rotation, non_blocking=True) @ turn
 
 
 def camera_quaternions(raw_xyzw: Tensor) -> Tensor:
