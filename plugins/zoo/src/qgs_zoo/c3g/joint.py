@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from einops import rearrange
 from pydantic import Field, PositiveFloat, PositiveInt
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.contracts import DecoderLayer, Head, LayerParts, ModelDims, memory_fields
 from qgs.geometry.harmonics import SH_C0
@@ -54,24 +54,16 @@ class JointLayer(DecoderLayer):
         # Image tokens come first, so that one cut separates them from queries.
         tokens = memory.features.shape[1]
         x_BTD = torch.cat([memory.features, state.features], 1)
-        x_BTD = x_BTD + self.attention(self.norm(x_BTD), state.mask)
+        # Without a mask torch uses its fastest kernel.
+        mask_B11T = None
+        if state.mask is not None:
+            mask_B11T = F.pad(state.mask, (tokens, 0), value=True)[:, None, None]
+        # Masked queries still read other tokens, but no token reads them.
+        qkv_BTX = self.qkv(self.norm(x_BTD))
+        x_BTD = x_BTD + self.proj(self_attention(qkv_BTX, self.dims.heads, mask_B11T))
         x_BTD = x_BTD + self.mlp(self.mlp_norm(x_BTD))
         tokens_BMD, queries_BND = x_BTD.tensor_split([tokens], 1)
         return state.replace(features=queries_BND), memory.replace(features=tokens_BMD)
-
-    def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:
-        """Return multi-head self-attention (B, T, D) of all T tokens, after a last linear layer.
-
-        mask: True for queries to which tokens attend. None means that tokens attend to all queries.
-        All tokens attend to all image tokens.
-        """
-        # Without a mask torch uses its fastest kernel.
-        mask_B11T = None
-        if mask_BN is not None:
-            images = x_BTD.shape[1] - mask_BN.shape[1]
-            mask_B11T = F.pad(mask_BN, (images, 0), value=True)[:, None, None]
-        # Masked queries still read other tokens, but no token reads them.
-        return self.proj(self_attention(self.qkv(x_BTD), self.dims.heads, mask_B11T))
 
 
 CHANNELS = (3, 1, 3, 4, 3)
@@ -107,13 +99,10 @@ class C3GHead(Head):
         return True
 
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """Return attributes of (B, N, K) Gaussians from features (B, N, D)."""
+        """Return attributes of (B, N, K) Gaussians, at least float32, from features (B, N, D)."""
         raw_BNC = self.linear(self.norm(state.features))
         # One linear layer gives all K Gaussians of a query, Gaussian by Gaussian.
-        return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
-
-    def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
-        """Return attributes of Gaussians, float32 or float64, from raw channels (B, N, K, 14)."""
+        raw_BNKC = rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS))
         offsets, opacity, scale, rotation, sh = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         return GaussianAttributes(
             offsets=offsets,
