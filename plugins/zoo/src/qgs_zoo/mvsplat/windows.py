@@ -124,7 +124,10 @@ class Attention(nn.Module):
         k = self.k_proj(source_BVWLC)
         v = self.v_proj(source_BVWLC)
         if neighbours_BVJ is not None:
-            k, v = (_of_neighbours(x, neighbours_BVJ) for x in (k, v))
+            # Pixels are ordered by position in the window, then by neighbour.
+            scenes = torch.arange(len(x_BVWLC), device=x_BVWLC.device)[:, None, None]
+            order = "n v j w l c -> n v w (l j) c"
+            k, v = (rearrange(x[scenes, neighbours_BVJ], order) for x in (k, v))
             # Published weights expect this order. Keys are ordered by pixels, then views, but the
             # mask is repeated view by view: with three or more views it applies to other keys.
             mask = None if mask is None else mask.repeat(1, 1, neighbours_BVJ.shape[-1])
@@ -136,15 +139,6 @@ class Attention(nn.Module):
         if self.mlp is not None:
             message = self.norm2(self.mlp(torch.cat([x_BVWLC, message], -1)))
         return x_BVWLC + message
-
-
-def _of_neighbours(x_BVWLC: Tensor, neighbours_BVJ: Tensor) -> Tensor:
-    """Return the windows of each view's J neighbours (B, V, 4, L J, C).
-
-    Pixels are ordered by position in the window, then by neighbour. L: pixels of a window.
-    """
-    scenes = torch.arange(len(x_BVWLC), device=x_BVWLC.device)[:, None, None]
-    return rearrange(x_BVWLC[scenes, neighbours_BVJ], "n v j w l c -> n v w (l j) c")
 
 
 class Layer(nn.Module):
