@@ -75,8 +75,13 @@ def _indoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
     for _ in range(count):
         # things leave space for cameras
         extent = min(spread(rng, 0.15, 1.0), 0.3 * min(size))
-        at = (rng.uniform(-x, x) * 0.85, rng.uniform(-y, y) * 0.85, 0.0)
-        shapes += _put(rng, things, at, extent, z)
+        aside, behind = (rng.uniform(-half, half) * 0.85 for half in (x, y))
+        thing = things.draw()
+        lift = 0.0
+        # things of varied scenes may float
+        if rng.random() < 0.3 and not plain:
+            lift = rng.uniform(0.2, max(z - 2.2 * extent, 0.3))
+        shapes += placed(thing, (aside, behind, lift), any_angle(rng), extent)
     if not plain:
         for _ in range(rng.choice((0, 0, 1, 2))):
             shapes.append(_beam(rng, things, x, y, z))
@@ -88,20 +93,6 @@ def _indoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
     high = (x - 0.3, y - 0.3, z - 0.35)
     eyes = (0.9, min(1.7, z - 0.4))
     return Place("indoors", shapes, fixed, low, high, eyes, targets, (0.6, 6.0), z)
-
-
-def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) -> Thing:
-    """Return the shapes of a random object at the point `at`.
-
-    The object stands on the floor; in varied scenes it may float at a random height. size: scale
-    of the object. ceiling: height of the room in metres.
-    """
-    thing = things.draw()
-    pick = rng.random()
-    lift = 0.0
-    if things.style.tilted and pick < 0.3:
-        lift = rng.uniform(0.2, max(ceiling - 2.2 * size, 0.3))
-    return placed(thing, (at[0], at[1], lift), any_angle(rng), size)
 
 
 def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
