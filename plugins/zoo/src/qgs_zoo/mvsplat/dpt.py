@@ -60,7 +60,12 @@ class Scratch(nn.Module):
             self.add_module(f"layer{number}_rn", projected)
             fusion = Fusion(features, coarsest=number == len(channels))
             self.add_module(f"refinenet{number}", fusion)
-        self.output_conv = _to_depth(features) if ends_in_depth else None
+        last: list[nn.Module] = []
+        if ends_in_depth:
+            # The correction is 0 before training.
+            hidden = two_convolutions(features, features // 2, 16, "replicate")
+            last = [*hidden, nn.GELU(), zeroed(nn.Conv2d(16, 1, 1))]
+        self.output_conv = nn.Sequential(*last)
 
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
         """Return a full-size map from maps at 1/2, 1/4, 1/8 and 1/16 of the image size.
@@ -76,16 +81,7 @@ class Scratch(nn.Module):
             size = maps[number - 2].shape[-2:] if number > 1 else full
             path = self.get_submodule(f"refinenet{number}")(path, skip, size)
         assert path is not None
-        return path if self.output_conv is None else self.output_conv(path)
-
-
-def _to_depth(features: int) -> nn.Sequential:
-    """Return layers that predict a correction of depth. The correction is 0 before training."""
-    return nn.Sequential(
-        *two_convolutions(features, features // 2, 16, "replicate"),
-        nn.GELU(),
-        zeroed(nn.Conv2d(16, 1, 1)),
-    )
+        return self.output_conv(path)
 
 
 class DptHead(nn.Module):
