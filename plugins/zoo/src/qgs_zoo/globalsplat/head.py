@@ -134,21 +134,7 @@ class MergingHead(Head):
         geometry, texture: raw channels of candidates, (B, N, C, 14) and (B, N, C, 3 (degree +
         1)^2).
         """
-        gates = geometry[..., -1]
-        candidates = torch.cat([self.bounded(geometry[..., :-1]), texture], -1)
-        # Both levels of a blend are decoded from the same candidates.
-        parts = [
-            self._attributes(merged(candidates, gates, count), share)
-            for count, share in stages(self.config.level)
-        ]
-        return concatenated(parts, 2)
-
-    def bounded(self, raw: Tensor) -> Tensor:
-        """Return candidates (..., 13): position, bounded log scale, rotation, log(1 - opacity).
-
-        raw: raw position, log scale, rotation and opacity logit of the candidates, (..., 13).
-        """
-        place, log_scale, rotation, opacity = raw.split(CHANNELS, -1)
+        place, log_scale, rotation, opacity, gates = geometry.split((*CHANNELS, 1), -1)
         config = self.config
         low = math.log(config.scale_min) - 1
         high = math.log(config.scale_max) + 2
@@ -157,7 +143,13 @@ class MergingHead(Head):
         rotation = rotation + constant([1, 0, 0, 0, 1, 0], rotation)
         # Where Gaussians overlap, logs of transmittance add up, but opacities do not.
         clear = -F.softplus(opacity + config.opacity_bias)
-        return torch.cat([place, log_scale, rotation, clear], -1)
+        candidates = torch.cat([place, log_scale, rotation, clear, texture], -1)
+        # Both levels of a blend are decoded from the same candidates.
+        parts = [
+            self._attributes(merged(candidates, gates[..., 0], count), share)
+            for count, share in stages(config.level)
+        ]
+        return concatenated(parts, 2)
 
     def _attributes(self, x_BNKX: Tensor, share: float) -> GaussianAttributes:
         """Return the attributes of Gaussians from the averaged channels of their candidates.
