@@ -11,7 +11,6 @@ from torch import Tensor
 
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import rotated
-from qgs.geometry.transforms import quat_product, unit
 from qgs.precision import full_precision
 
 SH_DEGREE = 3
@@ -119,12 +118,3 @@ def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
 def camera_quaternions(raw_xyzw: Tensor) -> Tensor:
     """Normalise raw quaternions (..., 4), x y z w. A quaternion of zeros stays zero."""
     return raw_xyzw / (raw_xyzw.norm(dim=-1, keepdim=True) + QUAT_EPS)
-
-
-def world_quaternions(camera_xyzw: Tensor, turn_wxyz: Tensor) -> Tensor:
-    """Convert rotations of Gaussians to unit quaternions (..., 4), w x y z, in the world's frame.
-
-    camera_xyzw: rotations in the camera's frame; zeros mean no rotation. turn_wxyz: rotation from
-    the camera's frame to the world's.
-    """
-    return F.normalize(quat_product(turn_wxyz, unit(camera_xyzw.roll(1, -1))), dim=-1)

@@ -197,7 +197,12 @@ class DepthPredictor(nn.Module):
         cnn = self.backbone(normalized_N3HW)
         x_BVChw = with_positions(cnn.features.unflatten(0, shape))
         x_NChw = self.transformer(x_BVChw, sweep.neighbours).flatten(0, 1)
-        maps = self.vit_maps(normalized_N3HW)
+        # The ViT has patches of 14: the image shrinks to whole patches.
+        grid = (size[0] // PATCH, size[1] // PATCH)
+        small_N3hw = resized(normalized_N3HW, (grid[0] * PATCH, grid[1] * PATCH))
+        tokens = self.pretrained(small_N3hw, self.sizes.blocks)
+        eighth = (size[0] // 8, size[1] // 8)
+        maps = [resized(x_NPC.mT.unflatten(2, grid), eighth) for x_NPC in tokens]
         mono_NChw = maps[-1]
         # The ViT's maps are at 1/8; features for matching may be at 1/4.
         if self.sizes.stride == 4:
@@ -242,16 +247,6 @@ class DepthPredictor(nn.Module):
             inverse, confidence = expected_disparity(self.depth_head[scale](refined), candidates)
             found.append(inverse)
         return found, confidence
-
-    def vit_maps(self, images_N3HW: Tensor) -> list[Tensor]:
-        """Return the tokens of the ViT blocks in `sizes.blocks` as maps (B V, C, H/8, W/8)."""
-        height, width = images_N3HW.shape[-2:]
-        grid = (height // PATCH, width // PATCH)
-        # The ViT has patches of 14: the image shrinks to whole patches.
-        small = resized(images_N3HW, (grid[0] * PATCH, grid[1] * PATCH))
-        tokens = self.pretrained(small, self.sizes.blocks)
-        maps = (x_NPC.mT.unflatten(2, grid) for x_NPC in tokens)
-        return [resized(x, (height // 8, width // 8)) for x in maps]
 
     def beside(
         self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None

@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.contracts import ModelDims
-from qgs.precision import full_precision
+from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs.encoder import imagenet_normalised
 from qgs.types import Views
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS
@@ -159,8 +159,8 @@ class DepthPredictor(nn.Module):
         refined = self.refine_unet(seen, views)
         raw = self.to_gaussians(torch.cat([refined, images_N3HW, full_NDHW], 1))
         change_N1HW, logit_N1HW = self.to_disparity(refined).split(1, 1)
-        log_depth = refined_log_depth(disparity_N1HW, change_N1HW, sweep)
-        return torch.cat([log_depth, logit_N1HW, raw], 1).unflatten(0, (-1, views))
+        fine_N1HW = (disparity_N1HW + at_least_float32(change_N1HW)).clamp(*bounds(sweep))
+        return torch.cat([-fine_N1HW.log(), logit_N1HW, raw], 1).unflatten(0, (-1, views))
 
     def match(self, features_BVDhw: Tensor, sweep: Sweep) -> tuple[Tensor, Tensor]:
         """Return inverse depths and confidences, each (B V, 1, h, w), at 1/4 of the image size.
@@ -190,13 +190,3 @@ def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Te
     # A mean, not the best candidate: it has a gradient and can lie between candidates.
     disparity = (probability * candidates_NDhw).sum(1, keepdim=True)
     return disparity, probability.amax(1, keepdim=True)
-
-
-@full_precision
-def refined_log_depth(disparity_N1HW: Tensor, change_N1HW: Tensor, sweep: Sweep) -> Tensor:
-    """Return logarithms of depths (B V, 1, H, W), clamped to the depths of the sweep.
-
-    disparity: inverse depth. change: correction to add to the inverse depth.
-    """
-    fine = (disparity_N1HW + change_N1HW).clamp(*bounds(sweep))
-    return -fine.log()

@@ -26,6 +26,7 @@ from qgs.contracts import (
     memory_fields,
 )
 from qgs.geometry.harmonics import SH_C0
+from qgs.geometry.transforms import quat_product, unit
 from qgs.precision import full_precision
 from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
 from qgs_zoo.mvsplat.adapter import (
@@ -33,7 +34,6 @@ from qgs_zoo.mvsplat.adapter import (
     camera_quaternions,
     coefficients,
     world_harmonics,
-    world_quaternions,
 )
 from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, quaternions
 
@@ -197,10 +197,12 @@ class PixelHead(Head):
         log_depth, logit, place, scale, rotation = raw_BNC[:, :, None].split(CHANNELS, -1)
         # Harmonics of degrees above 3 are left out, because they are not rendered.
         sh = rearrange(sh_BNC, "b n (x k) -> b n 1 k x", x=3)[..., : coefficients(SH_DEGREE), :]
+        # Zeros mean no rotation in the camera's frame.
+        in_camera = unit(camera_quaternions(rotation).roll(1, -1))
         return GaussianAttributes(
             offsets=torch.cat([place, log_depth], -1),
             scales=self.scales(scale, log_depth, state),
-            quats=world_quaternions(camera_quaternions(rotation), state[TURN][:, :, None]),
+            quats=F.normalize(quat_product(state[TURN][:, :, None], in_camera), dim=-1),
             opacities=self.opacities(logit[..., 0].sigmoid()),
             # Zeros are grey in MVSplat; DepthSplat has already added the colour of the photo.
             colors=0.5 + SH_C0 * sh[..., 0, :],
