@@ -49,7 +49,7 @@ class DecayedSupervision(LayerSupervision):
     config: Config
 
     def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:
-        layers = (*self.config.layers, *rounds)
+        layers = super().weights(rounds)
         each = [self.config.decay**n for n in range(len(layers) - 1, -1, -1)]
         return {layer: weight / sum(each) for layer, weight in zip(layers, each, strict=True)}
 
