@@ -87,9 +87,10 @@ def draw_cameras(
     # paths shrink from try to try, because short ones fit anywhere
     for attempt in range(_TRIES):
         rig = _draw(rng, place, count, varied, 0.7**attempt)
-        fault = _outside(rig.c2w[:, :3, 3], place, world[0])
-        if fault == 0:
-            fault = _view_fault(rig, world)
+        eyes = rig.c2w[:, :3, 3]
+        inside = (eyes >= place.low).all() and (eyes <= place.high).all()
+        clear = inside and clearances(world[0][: place.fixed], eyes).min() > CLEARANCE
+        fault = _view_fault(rig, world) if clear else 100.0
         if fault < least:
             best = rig
             least = fault
@@ -98,15 +99,6 @@ def draw_cameras(
             break
     assert best is not None
     return best if least < 100 else _still(rng, place, world[0], count, best)
-
-
-def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
-    """Return 0 if all camera centres are in the allowed box and not close to fixed shapes.
-
-    Otherwise return the penalty 100. Close means CLEARANCE or less. eyes: camera centres (F, 3).
-    """
-    inside = (eyes >= place.low).all() and (eyes <= place.high).all()
-    return 0.0 if inside and clearances(shapes[: place.fixed], eyes).min() > CLEARANCE else 100.0
 
 
 def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
