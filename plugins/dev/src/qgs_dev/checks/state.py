@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 
+from qgs.checkpoint.tensors import shapes_of
 from qgs.contracts import ComponentConfig
 from qgs_dev.case import Case, seeded
 from qgs_dev.checks.basics import other_generators
@@ -77,7 +78,7 @@ def check_state_dict_keys(case: Case) -> None:
     """Require that the state dict has the names and shapes in `Case.state_dict`, if it is given."""
     if case.state_dict is None:
         return
-    shapes = {name: tuple(x.shape) for name, x in case.build().state_dict().items()}
+    shapes = shapes_of(case.build().state_dict())
     pinned = {name: tuple(shape) for name, shape in case.state_dict.items()}
     moved = pinned.items() ^ shapes.items()
     expect_none(moved, "either expected or present, but not both; saved weights would not load")
