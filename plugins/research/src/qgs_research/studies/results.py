@@ -215,7 +215,7 @@ def _hypothesis_row(results: Results, judgement: Judgement) -> list[str]:
     return [
         judgement.hypothesis.claim,
         column.heading,
-        shown(column, estimate.mean if estimate else None, "+"),
+        shown(column, estimate and estimate.mean, "+"),
         interval_shown(column, estimate),
         judgement.verdict + reason,
         estimate.sample if estimate else "–",

@@ -3,7 +3,6 @@
 import shlex
 import sys
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -95,7 +94,7 @@ def _write_job(
     """
     from qgs.files import write_text
 
-    text = files("qgs_research.studies").joinpath("template", template).read_text(encoding="utf-8")
+    text = (Path(__file__).with_name("template") / template).read_text(encoding="utf-8")
     filled = text.format(
         name=shlex.quote(name),
         log=shlex.quote(str(log)),

@@ -81,11 +81,11 @@ def table_rows(
     for model in scores.models(evaluation):
         score = scores.score(model, metric, evaluation)
         apart = scores.difference(model, metric, evaluation)
-        difference = shown(column, apart.mean if apart else None, "+")
+        difference = shown(column, apart and apart.mean, "+")
         row = [
             model,
-            shown(column, score.mean if score else None),
-            shown(column, score.deviation if score else None),
+            shown(column, score and score.mean),
+            shown(column, score and score.deviation),
             "reference" if model == scores.reference else difference,
             interval_shown(column, apart),
         ]
@@ -93,7 +93,7 @@ def table_rows(
             row.append(shown(column, published.get(model)))
         for name in others:
             other = scores.score(model, name, evaluation)
-            row.append(shown(scores.columns[name], other.mean if other else None))
+            row.append(shown(scores.columns[name], other and other.mean))
         runs = scores.stored[model, evaluation].values()
         rows.append([*row, str(len(runs)), steps_shown(runs)])
     # Baselines come after the models, because they were not trained.
