@@ -51,7 +51,7 @@ def shadow_maps(
         for c2w, side, focal in _views(light, middle, radius):
             lens = np.array([focal, focal, side / 2, side / 2])
             t, code, _ = trace(side, side, 0, 1, shapes, heights, c2w, lens)
-            maps.append((begin, side, focal, c2w[:3]))
+            maps.append((begin, side, focal, c2w))
             depths.append(t.ravel())
             codes.append(code.ravel())
             begin += side * side
@@ -61,17 +61,14 @@ def shadow_maps(
 def _views(
     light: np.ndarray, middle: np.ndarray, radius: float
 ) -> list[tuple[np.ndarray, int, float]]:
-    """Return a tuple for each shadow map of a light: pose c2w, side and focal length in pixels."""
+    """Return a tuple for each shadow map of a light: pose (3, 4), side and focal length, pixels."""
     place = light["place"]
-    c2w = np.tile(np.eye(4), (6, 1, 1))
     if light["lamp"]:
-        c2w[:, :3, :3] = _FACES
-        c2w[:, :3, 3] = place
         # a focal length of half the side is a right angle of view: six of them see everything
-        return [(pose, _LAMP_SIDE, _LAMP_SIDE / 2) for pose in c2w]
+        return [(np.column_stack([face, place]), _LAMP_SIDE, _LAMP_SIDE / 2) for face in _FACES]
     right = np.array([-place[1], place[0], 0.0]) / math.hypot(place[0], place[1])
-    c2w[0, :3] = np.stack([right, np.cross(-place, right), -place, middle + _SUN * place], -1)
-    return [(c2w[0], _SUN_SIDE, _SUN_SIDE / 2 * _SUN / radius)]
+    pose = np.stack([right, np.cross(-place, right), -place, middle + _SUN * place], -1)
+    return [(pose, _SUN_SIDE, _SUN_SIDE / 2 * _SUN / radius)]
 
 
 @inner
