@@ -94,8 +94,7 @@ def camera_path(
     travel = rng.uniform(*TRAVEL)
     back = rng.uniform(WALL + 0.1, 0.25 * across) - across / 2
     middle = rng.uniform(-1, 1) * max(along / 2 - WALL - travel / 2 - 0.1, 0.0)
-    # a single camera stands in the middle, not at the start
-    s = np.linspace(-0.5, 0.5, count) if count > 1 else np.zeros(1)
+    s = np.linspace(-0.5, 0.5, count)
     sway, lift = rng.uniform(-0.12, 0.12, 2)
     phase = rng.uniform(0, math.pi)
     eyes = np.stack(
