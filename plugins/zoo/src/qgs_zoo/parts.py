@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from einops import repeat
+from einops import rearrange
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -44,15 +44,15 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
     left = torch.arange(columns, device=c2w.device).to(c2w) * (width / columns)
     upper = torch.arange(rows, device=c2w.device).to(c2w) * (height / rows)
     fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
-    x_BVRC1 = repeat((left - cx) / fx, "b v c -> b v r c 1", r=rows)
-    y_BVRC1 = repeat((upper - cy) / fy, "b v r -> b v r c 1", c=columns)
+    x_BV1C1 = rearrange((left - cx) / fx, "b v c -> b v 1 c 1")
+    y_BVR11 = rearrange((upper - cy) / fy, "b v r -> b v r 1 1")
     right, down, ahead = (x_BV3[:, :, None, None] for x_BV3 in c2w[..., :3, :3].unbind(-1))
-    corner = x_BVRC1 * right + y_BVRC1 * down + ahead
+    corner = x_BV1C1 * right + y_BVR11 * down + ahead
     # Steps across and down one part.
     across = right * (width / columns / fx)[..., None, None]
     below = down * (height / rows / fy)[..., None, None]
     origin = c2w[:, :, None, None, :3, 3]
-    parts = [x.expand_as(corner) for x in (origin, corner, across, below)]
+    parts = torch.broadcast_tensors(origin, corner, across, below)
     return torch.stack(parts, -2).flatten(1, 3)
 
 

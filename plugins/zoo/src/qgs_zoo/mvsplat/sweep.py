@@ -113,8 +113,8 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
     # Pixel centres are whole numbers here, without the half of rays: published weights expect it.
     x_w = torch.arange(width, device=depth_NDhw.device).to(depth_NDhw)
     y_h1 = torch.arange(height, device=depth_NDhw.device).to(depth_NDhw)[:, None]
-    ray = ((x_w - cx) / fx).expand(-1, height, -1), ((y_h1 - cy) / fy).expand(-1, -1, width)
-    ray_Nhw3 = torch.stack([*ray, torch.ones_like(ray[0])], -1)
+    ray = torch.broadcast_tensors((x_w - cx) / fx, (y_h1 - cy) / fy, torch.ones_like(fx))
+    ray_Nhw3 = torch.stack(ray, -1)
     turned_Nhw3 = torch.einsum("nij,nhwj->nhwi", pose_N44[:, :3, :3], ray_Nhw3)
     point = turned_Nhw3[:, None] * depth_NDhw[..., None] + pose_N44[:, None, None, None, :3, 3]
     x, y, depth = point.unbind(-1)

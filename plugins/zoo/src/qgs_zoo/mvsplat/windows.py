@@ -34,9 +34,8 @@ def positions(width: int, rows: int, columns: int, device: torch.device) -> Tens
         angle_NC = places[:, None] * frequency_C
         return torch.where(index_C % 2 == 0, angle_NC.sin(), angle_NC.cos())
 
-    y = embedded(rows)[:, None].expand(rows, columns, half)
-    x = embedded(columns)[None].expand(rows, columns, half)
-    return torch.cat([y, x], -1).permute(2, 0, 1)
+    both = torch.broadcast_tensors(embedded(rows)[:, None], embedded(columns))
+    return torch.cat(both, -1).permute(2, 0, 1)
 
 
 def with_positions(x_BVCHW: Tensor) -> Tensor:
