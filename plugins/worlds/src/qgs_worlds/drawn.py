@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -13,9 +13,7 @@ from torch import Tensor
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.scenes import LazyScenes, LazySource
 from qgs.types import Cameras
-
-if TYPE_CHECKING:
-    from qgs_worlds.caster.tables import Room, World
+from qgs_worlds.caster.tables import Room, World
 
 ImageCache = dict[tuple[str, int], np.ndarray]
 """Images (H, W, 3) uint8 by scene name and frame. A full cache takes no new images."""
@@ -63,7 +61,7 @@ class DrawnScene(Scene):
 
     @property
     @abstractmethod
-    def tables(self) -> "World | Room":
+    def tables(self) -> World | Room:
         """The shapes, textures and lights of the scene, as tables for the ray caster."""
 
     @cached_property

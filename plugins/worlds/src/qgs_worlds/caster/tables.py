@@ -98,6 +98,10 @@ class World(NamedTuple):
     shadows: Shadows
 
 
+Size = tuple[float, float, float]
+"""Size of a room along x, y and z, in metres."""
+
+
 class Room(NamedTuple):
     """Furnished room for the ray caster.
 
@@ -109,6 +113,6 @@ class Room(NamedTuple):
     shapes: np.ndarray
     heights: np.ndarray
     textures: np.ndarray
-    size: tuple[float, float, float]
+    size: Size
     lights: np.ndarray
     floor: np.ndarray

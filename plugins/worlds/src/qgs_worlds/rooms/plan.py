@@ -7,7 +7,7 @@ import numpy as np
 
 from qgs_worlds.caster.interiors import blurred, darkened_floor
 from qgs_worlds.caster.shapes import Point, Shape
-from qgs_worlds.caster.tables import LIGHT, Room
+from qgs_worlds.caster.tables import LIGHT, Room, Size
 from qgs_worlds.rooms.furniture import (
     AGAINST_WALLS,
     CENTRAL,
@@ -28,7 +28,6 @@ _GAP = 0.05
 # Rooms have no height fields.
 NO_HEIGHTS = np.zeros((1, 2, 2), np.float32)
 
-Size = tuple[float, float, float]
 # Corners of a piece that fits at every place where another piece fits.
 _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 

@@ -6,7 +6,7 @@ The compiled kernels are imported when the first room is generated, because load
 import math
 from functools import cached_property
 from random import Random
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -15,11 +15,8 @@ from qgs.contracts.data import Split
 from qgs.contracts.settings import ascending
 from qgs_worlds.caster.lens import lens, look_along
 from qgs_worlds.caster.shapes import about_z
+from qgs_worlds.caster.tables import Room, Size
 from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
-
-if TYPE_CHECKING:
-    from qgs_worlds.caster.tables import Room
-
 
 # metres above the floor
 EYE = (1.25, 1.65)
@@ -53,13 +50,13 @@ class RoomScene(DrawnScene):
         # drawn first, so that it does not depend on the number of draws for the path
         self._plan_seed = int(rng.integers(1 << 62))
         sizes = rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
-        self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]
+        self.size: Size = tuple(map(float, sizes))  # type: ignore[assignment]
         self.c2w = camera_path(rng, self.size, config.views_per_scene)
         size = config.image_size
         self.lens = lens(rng.uniform(*config.fov), size[1], size)
 
     @cached_property
-    def tables(self) -> "Room":
+    def tables(self) -> Room:
         """The walls, furniture, textures and lights of the room, as tables for the ray caster."""
         from qgs_worlds.rooms.plan import furnish
 
@@ -80,9 +77,7 @@ class RoomsSource(DrawnSource):
     scene = RoomScene
 
 
-def camera_path(
-    rng: np.random.Generator, size: tuple[float, float, float], count: int
-) -> np.ndarray:
+def camera_path(rng: np.random.Generator, size: Size, count: int) -> np.ndarray:
     """Return poses c2w (count, 4, 4) on a random path, with views across a room of `size` metres.
 
     Camera axes follow OpenCV. The path leads along a wall, in a random direction.
