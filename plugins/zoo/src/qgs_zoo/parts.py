@@ -70,7 +70,7 @@ def quaternions(rotations: Tensor) -> Tensor:
     ]  # fmt: skip
     rows = torch.stack(outer, -1).unflatten(-1, (4, 4))
     longest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
-    row = rows.gather(-2, longest.expand(*longest.shape[:-1], 4)).squeeze(-2)
+    row = torch.take_along_dim(rows, longest, -2).squeeze(-2)
     return F.normalize(row, dim=-1)
 
 
