@@ -55,7 +55,15 @@ class VggtFeatures(PatchEncoder):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.aggregator = _aggregator_class()()
+        try:
+            aggregator: Any = import_module(MODULE).Aggregator
+        except ImportError as error:
+            raise MissingExtraError(
+                "the encoder c3g/vggt_features needs VGGT's code, which has its own licence: "
+                "pip install git+https://github.com/facebookresearch/vggt; or use "
+                "another encoder, such as qgs/multiview_vit"
+            ) from error
+        self.aggregator = aggregator()
         # With the width of VGGT there is no layer, so that tokens stay unchanged.
         own = dims.width == WIDTH
         self.proj = nn.Identity() if own else nn.Linear(WIDTH, dims.width)
@@ -81,14 +89,3 @@ class VggtFeatures(PatchEncoder):
         # The file holds all of VGGT.
         own = {n.removeprefix(PREFIX): x for n, x in weights.items() if n.startswith(PREFIX)}
         self.aggregator.load_state_dict(own)
-
-
-def _aggregator_class() -> Any:
-    try:
-        return import_module(MODULE).Aggregator
-    except ImportError as error:
-        raise MissingExtraError(
-            "the encoder c3g/vggt_features needs VGGT's code, which has its own licence: "
-            "pip install git+https://github.com/facebookresearch/vggt; or use "
-            "another encoder, such as qgs/multiview_vit"
-        ) from error
