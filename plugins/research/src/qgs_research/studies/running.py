@@ -54,9 +54,7 @@ def run_study(
     stopped = None
     if workers:
         runs = plan.runs if only is None else [plan.runs[only]]
-        failed, stopped = train_missing(
-            plan, runs, workers=workers, threads=threads, device=device, console=console
-        )
+        failed, stopped = train_missing(plan, runs, workers, threads, device, console)
     results = Results(plan)
     if results.columns:
         table = write_files(results)
@@ -72,7 +70,6 @@ def run_study(
 def train_missing(
     plan: Plan,
     runs: Sequence[Run],
-    *,
     workers: int,
     threads: int | None,
     device: str,
