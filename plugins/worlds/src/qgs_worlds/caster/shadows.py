@@ -66,7 +66,7 @@ def _views(
     if light["lamp"]:
         # a focal length of half the side is a right angle of view: six of them see everything
         return [(np.column_stack([face, place]), _LAMP_SIDE, _LAMP_SIDE / 2) for face in _FACES]
-    right = np.array([-place[1], place[0], 0.0]) / math.hypot(place[0], place[1])
+    right = np.array([-place[1], place[0], 0.0]) / math.hypot(*place[:2])
     pose = np.stack([right, np.cross(-place, right), -place, middle + _SUN * place], -1)
     return [(pose, _SUN_SIDE, _SUN_SIDE / 2 * _SUN / radius)]
 

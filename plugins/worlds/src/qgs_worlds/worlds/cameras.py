@@ -82,6 +82,7 @@ def draw_cameras(
     The cameras are the best of a few random sets and keep the distance CLEARANCE from fixed shapes.
     The caller must remove movable shapes that are nearer.
     """
+    fixed = world[0][: place.fixed]
     best = None
     least = math.inf
     # paths shrink from try to try, because short ones fit anywhere
@@ -89,7 +90,7 @@ def draw_cameras(
         rig = _draw(rng, place, count, varied, 0.7**attempt)
         eyes = rig.c2w[:, :3, 3]
         inside = (eyes >= place.low).all() and (eyes <= place.high).all()
-        clear = inside and clearances(world[0][: place.fixed], eyes).min() > CLEARANCE
+        clear = inside and clearances(fixed, eyes).min() > CLEARANCE
         fault = _view_fault(rig, world) if clear else 100.0
         if fault < least:
             best = rig
@@ -98,7 +99,14 @@ def draw_cameras(
         if least <= 0.3:
             break
     assert best is not None
-    return best if least < 100 else _still(rng, place, world[0], count, best)
+    if least < 100:
+        return best
+    # any point is better than one inside a wall: the one of 64 that is farthest from fixed shapes
+    points = rng.uniform(place.low, place.high, (64, 3))
+    base = points[clearances(fixed, points).min(1).argmax()]
+    eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
+    c2w = _look_at(eyes, np.array(place.targets[0]), np.zeros(count))
+    return best._replace(c2w=c2w, motion="still")
 
 
 def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
@@ -110,19 +118,6 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
     close = float((t < max(0.25, 0.25 * rig.distance)).mean(1).max())
     sky = float((t == np.inf).mean(1).max())
     return max(close, sky - 0.3, 2.0 if near < CLEARANCE else 0.0)
-
-
-def _still(rng: Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
-    """Return cameras within about 1 cm of one point; used if all random paths fail.
-
-    The point is the one of 64 random points that is farthest from fixed shapes.
-    """
-    # any point is better than one inside a wall
-    points = rng.uniform(place.low, place.high, (64, 3))
-    base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
-    eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
-    target = np.array(place.targets[0])
-    return Rig(_look_at(eyes, target, np.zeros(count)), rig.fov, rig.distance, "still")
 
 
 def _draw(rng: Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
@@ -202,7 +197,7 @@ def _orbit(rng: Generator, path: Path) -> Motion:
     """
     base, target, length, s, _ = path
     offset = base - target
-    flat = max(math.hypot(offset[0], offset[1]), 0.2)
+    flat = max(math.hypot(*offset[:2]), 0.2)
     # less than half of a circle; otherwise views share too little
     angles = s * min(length / flat, 2.4)
     nearer = 1 + 0.2 * rng.normal() * s

@@ -6,6 +6,7 @@ from random import Random
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.casting import cast
@@ -101,8 +102,8 @@ def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np
     top of `place`, without shadows. Lamps may be inside objects.
     """
     if not varied:
-        lamp = (1.0, (0.3, 0.2, place.top - 0.3), np.full(3, 1.2), 0)
-        return np.array([lamp], s.LIGHT), _air(rng, np.full(3, 0.5), np.full(3, 0.35), 0.5)
+        lamp = (1.0, (0.3, 0.2, place.top - 0.3), 1.2, 0)
+        return np.array([lamp], s.LIGHT), _air(rng, 0.5, 0.35, 0.5)
     outdoors = place.kind == "outdoors"
     sunny = rng.random() < _SUNNY[place.kind]
     tint = _tinted(rng, 0.25)
@@ -131,7 +132,7 @@ def _lamp(rng: Random, place: Place, shadows: bool) -> Light:
     return 1.0, (x, y, z), spread(rng, 0.6, 4) * _tinted(rng, 0.4), int(shadows)
 
 
-def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) -> np.ndarray:
+def _air(rng: Random, above: ArrayLike, below: ArrayLike, occlusion: float) -> np.ndarray:
     air = np.zeros(1, s.AIR)
     blue = np.array([0.45, 0.7, 1.15]) if rng.random() < 0.7 else _tinted(rng, 0.3)
     bright = spread(rng, 0.6, 2.2)
