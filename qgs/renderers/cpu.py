@@ -95,16 +95,17 @@ class _Splat(torch.autograd.Function):
 
         def blend(scene: int, view: int, stripe: _Part) -> None:
             image = scene, view
-            look = opacities[scene], colors[scene, view % colors.shape[1]]
+            look = orders[image], opacities[scene], colors[scene, view % colors.shape[1]]
             seen = out[image]
             kernels.blend_unit(
                 rows[image], *look, stripe[1], blending, seen, seen, rows[image], False
             )
 
-        # First all projections: every stripe of an image sorts all of its splats.
         in_threads(project, product(range(batch), chunks))
+        by_depth = splats[..., 5].argsort(stable=True)
+        orders = by_depth.numpy()
         in_threads(blend, product(range(batch), range(views), stripes))
-        ctx.save_for_backward(*tensors, splats, sums)
+        ctx.save_for_backward(*tensors, splats, by_depth, sums)
         return sums
 
     @staticmethod
@@ -114,7 +115,7 @@ class _Splat(torch.autograd.Function):
         from qgs.kernels.projection import CAMERA_GRADIENTS, project_backward_unit
 
         saved = ctx.saved_tensors
-        colors, means, scales, quats, opacities, c2w, lenses, rows, sums = _arrays(*saved)
+        colors, means, scales, quats, opacities, c2w, lenses, rows, orders, sums = _arrays(*saved)
         batch, views, count, _ = rows.shape
         projection, blending, chunks, stripes = ctx.plan
         # Each stripe sums its own gradients, in an order that does not depend on threads.
@@ -128,7 +129,7 @@ class _Splat(torch.autograd.Function):
 
         def blend(scene: int, view: int, stripe: _Part) -> None:
             image = scene, view
-            look = opacities[scene], colors[scene, view % colors.shape[1]]
+            look = orders[image], opacities[scene], colors[scene, view % colors.shape[1]]
             part, tile_rows = stripe
             kernels.blend_unit(
                 rows[image], *look, tile_rows, blending, sums[image], given[image],

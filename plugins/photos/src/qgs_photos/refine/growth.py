@@ -57,6 +57,7 @@ class FreeGaussians:
                 for name, value in self.values.items()
             ],
             eps=1e-15,
+            fused=True,
         )
         self.active = None if gaussians.sh is None else gaussians.sh.shape[-2]
 
