@@ -15,7 +15,7 @@ from walk import cloud
 
 import qgs
 from qgs.reconstruction.result import reconstruct_sample
-from qgs.reconstruction.scene_formats import load_ply, save_splat
+from qgs.reconstruction.scene_formats import load_ply, save_ply
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_a_scene_is_shown_with_photos_that_are_still_there(tmp_path):
     photos = noisy_photos(tmp_path / "my photos", 4)
     scene = tmp_path / "scene"
     scene.mkdir()
-    save_splat(cloud(5), scene / "scene.splat")
+    save_ply(cloud(5), scene / "scene.ply")
     command = shlex.join(["qgs", "scene", str(photos), "--size", "16x16"])
     names = [f"images/{frame}.png" for frame in (0, 2)]
     record = {"command": command, "refined_on": names}

@@ -39,8 +39,8 @@ from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 
 PLY = "gaussians.ply"
-SPLAT = "scene.splat"
-"""File of Gaussians that `qgs scene --out FOLDER` writes, beside scene.ply."""
+MADE = "scene.ply"
+"""File of Gaussians that `qgs scene --out FOLDER` writes."""
 _SCENES = (".ply", ".splat", ".spz", ".sog", ".ksplat")
 # Photos that are shown beside a scene of `qgs scene`.
 PHOTOS = 12
@@ -149,7 +149,7 @@ def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
     """
     path = Path(name).expanduser()
     finished = is_finished(path)
-    made = (path / SPLAT).is_file()
+    made = (path / MADE).is_file()
     if not (made or finished or path.suffix.lower() in _SCENES):
         if options.get("photos") is None and holds_photos(path):
             options["photos"] = name
@@ -251,8 +251,7 @@ def open_made(folder: Path) -> Source:
 
     If the photos are gone, a note says so. Raises the errors of `load_ply`.
     """
-    # one colour from all sides, as the viewer shows it; scene.ply may have harmonics
-    gaussians, _ = about_origin(load_ply(folder / SPLAT))
+    gaussians, _ = about_origin(load_ply(folder / MADE))
     notes = []
     views = None
     try:

@@ -24,6 +24,7 @@ from qgs.files import refuse_existing, write_text
 from qgs.geometry.poses import look_at_depth
 from qgs.types import Gaussians, Views
 from qgs_viewer.drawing import FRUSTUM, Choice, Drawing, distance_to
+from qgs_viewer.harmonics import harmonics_script
 from qgs_viewer.query_scene import NEUTRAL, Background, QueryScene
 
 # Vertical angle of the viewer's window, radians.
@@ -32,17 +33,18 @@ FIELD_OF_VIEW = 0.95
 
 @contextmanager
 def quiet_server(
-    host: str = "127.0.0.1", port: int = 0, label: str | None = None
+    host: str = "127.0.0.1", port: int = 0, label: str | None = None, head: str = ""
 ) -> Iterator[viser.ViserServer]:
     """Run a viser server inside the block, without the lines that viser prints.
 
     port: the first port to try; if it is taken, the next free port is used. 0 takes any free port.
-    label: title of the page. Only pages of this server may connect to it (see `foreign`).
+    label: title of the page. head: HTML for the beginning of the page's head. Only pages of this
+    server may connect to it (see `foreign`).
     """
     # a message that is none ends its connection, which is no news
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     serve = sockets.serve
-    sockets.serve = partial(_guarded, serve, host)  # viser has no option for this
+    sockets.serve = partial(_guarded, serve, host, head)  # viser has no option for this
     try:
         # viser prints a box of addresses, whatever it is asked
         with redirect_stdout(io.StringIO()):
@@ -80,17 +82,28 @@ def foreign(headers: Mapping[str, str], host: str) -> bool:
     return False
 
 
-def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options: Any) -> Any:
+def _guarded(
+    serve: Any, host: str, head: str, *where: Any, process_request: Any, **options: Any
+) -> Any:
     """Call `serve` so that the server answers requests that are `foreign` with status 403.
 
-    serve: the function `websockets.asyncio.server.serve`. host: address of the server.
+    serve: the function `websockets.asyncio.server.serve`. host: address of the server. head: see
+    `quiet_server`.
     """
 
     def checked(connection: Any, request: Any) -> Any:
         if foreign(request.headers, host):
             text = "Open the address that qgs view printed.\n"
             return connection.respond(http.HTTPStatus.FORBIDDEN, text)
-        return process_request(connection, request)
+        if head:
+            # compressed text would have no place for it
+            request.headers.pop("Accept-Encoding", None)
+        answer = process_request(connection, request)
+        if head and answer is not None:
+            answer.body = with_head(answer.body.decode(), head).encode()
+            answer.headers.pop("Content-Length", None)
+            answer.headers["Content-Length"] = str(len(answer.body))
+        return answer
 
     return serve(*where, process_request=checked, **options)
 
@@ -146,16 +159,24 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
 def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
     """Return an HTML page that shows `scene` in 3D; a reader can turn the scene and record a video.
 
-    The page takes 0.8 MB plus 40 bytes for each Gaussian. choice: what is shown; by default all
+    The page takes 0.8 MB plus 40 bytes for each Gaussian, with harmonics 56 to 104. choice: what is shown; by default all
     Gaussians in their own colours, and the anchors after the last layer.
     """
     with quiet_server() as server:
         stand(server, scene)
         Drawing(server.scene).put(scene, choice or Choice(layer=scene.depth))
         page = server.get_scene_serializer().as_html()
-    head = files("qgs_viewer") / "template" / "head.html"
-    # before viser's code, which reads what it changes
-    return page.replace("<head>", f"<head>{head.read_text(encoding='utf-8')}", 1)
+    file = files("qgs_viewer") / "template" / "head.html"
+    head = file.read_text(encoding="utf-8")
+    # a picked query has colours of its own
+    if choice is None or choice.query is None:
+        head += harmonics_script(scene)
+    return with_head(page, head)
+
+
+def with_head(page: str, head: str) -> str:
+    """Return a page of viser with `head` before viser's code, which reads what `head` changes."""
+    return page.replace("<head>", f"<head>{head}", 1)
 
 
 def write_page(scene: QueryScene, query: int | None, file: Path, console: Console) -> None:

@@ -9,7 +9,6 @@ from torch import Tensor
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians
-from qgs.wording import warn_once
 
 # Blending weight on a clicked ray below which a Gaussian is not hit.
 LEAST_WEIGHT = 0.02
@@ -77,14 +76,8 @@ class Splats:
 def splats(gaussians: Gaussians, placement: Placement) -> Splats:
     """Return the Gaussians (1, G) of one scene, placed in the viewer's world.
 
-    Spherical harmonics above degree 0 are left out, with a warning, so the colours do not depend on
-    the viewing direction.
+    Spherical harmonics above degree 0 are left out, see `harmonics_script`.
     """
-    if gaussians.sh is not None:
-        warn_once(
-            "the viewer shows these Gaussians with one colour from all directions: it leaves out "
-            "spherical harmonics above degree 0"
-        )
     rotated = placement.vectors(quat_to_matrix(gaussians.quats[0]))
     axes_G33 = rotated * gaussians.scales[0].detach().cpu().double()[:, None, :]
     return Splats(

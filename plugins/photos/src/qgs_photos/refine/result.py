@@ -78,11 +78,11 @@ def write_scene(
     start of the command, for the total time in metrics.json.
     """
     refined = result.refined
-    # neither .splat files nor the page show harmonics
-    shown = plain(refined.gaussians, refined.cameras)
     # all files or none: a scene without its scores is none
     with replacing_entries(out, "scene.ply") as fresh:
         save_ply(result.in_photos_world(refined.gaussians), fresh / "scene.ply")
+        # .splat files have no harmonics
+        shown = plain(refined.gaussians, refined.cameras)
         save_splat(result.in_photos_world(shown), fresh / "scene.splat")
         result = result.read_back(fresh / "scene.ply")
         record = scores(result)
@@ -93,7 +93,7 @@ def write_scene(
             views = replace(result.views, cameras=refined.cameras)
             every = max(len(result.photos.frames) // _ON_PAGE, 1)
             few = views.select(slice(None, None, every))
-            write_text(fresh / "index.html", page(shown, few, (0, 0, 0)))
+            write_text(fresh / "index.html", page(refined.gaussians, few, (0, 0, 0)))
         record["total_seconds"] = round(perf_counter() - began, 1)
         write_text(fresh / "metrics.json", json.dumps(record, indent=1))
         names = sorted(entry.name for entry in fresh.iterdir())
