@@ -5,7 +5,6 @@ import shutil
 import struct
 import sys
 from dataclasses import replace
-from functools import partial
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -16,18 +15,13 @@ from photo_formats import photo_set, synthetic, write_colmap, write_nerfstudio
 from PIL import Image
 from plyfile import PlyData
 from qgs_photos.refine import scene
+from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.initial import from_points, photos_start, photos_world, sparse_points
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.result import page_writer
 from qgs_photos.refine.scene import faults_of_given_poses
-from qgs_photos.refine.scene_photos import (
-    TIMED,
-    ScenePhotos,
-    affordable,
-    judged_frames,
-    sized,
-)
-from tables import must_refuse, names_in, read_json, rows, text_console
+from qgs_photos.refine.scene_photos import ScenePhotos, judged_frames, sized
+from tables import must_not_find, must_refuse, names_in, read_json, rows, text_console
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
 from torch.testing import assert_close
@@ -91,6 +85,18 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     assert float(psnr) == pytest.approx(record["mean"]["psnr"], abs=0.01)
 
 
+def test_an_earlier_scene_is_optimised_further(photos, tmp_path):
+    few = "--holdout 4 --seconds 0.3 --degree 0"
+    _, before = made(f"scene {photos} {few} --size 32x48 --gaussians 300", tmp_path / "a")
+    going_on = f"scene {photos} --from {tmp_path}/a"
+    _, record = made(f"{going_on} {few}", tmp_path / "b")
+    assert (record["optimised"], record["gaussians"]) == (300, before["gaussians"])
+    assert f" --from {tmp_path}/a --size 32x48 --gaussians 300 " in record["command"]
+    words = f"{going_on} --holdout 3 --out {tmp_path}/c".split()
+    must_refuse("other photos", done, *words)
+    must_not_find("scene.ply", done, "scene", photos, "--from", photos, "--out", tmp_path / "c")
+
+
 def test_poses_that_came_with_the_photos_are_looked_at(taken, photos_of_scene, tmp_path):
     assert faults_of_given_poses(photos_of_scene) == []
     c2w = taken.c2w.copy()
@@ -118,7 +124,7 @@ def test_a_model_makes_the_start(photos, tmp_path):
 
 
 def test_an_interrupt_before_the_optimisation_says_what_is_kept(photos, tmp_path, monkeypatch):
-    monkeypatch.setattr(scene, "chosen_initialisation", MagicMock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(scene, "chosen_start", MagicMock(side_effect=KeyboardInterrupt))
     result = run_qgs("scene", photos, "--out", tmp_path / "out")
     assert "out is not written" in result.output
     assert result.exit_code == 130
@@ -160,13 +166,19 @@ def test_a_split_of_the_photos_own_is_judged_first():
 def test_more_time_buys_larger_photos_and_more_gaussians(photos_of_scene):
     assert sized(photos_of_scene.small, 128) == (32, 48)  # photos are never enlarged
     photos_of_scene.small.stored_size = lambda frame: (720, 1280)
-    chosen = partial(affordable, 0.01, (128, 128), photos_of_scene)
-    given = [chosen(seconds, Options()) for seconds in (1, 120, 1200, 1e9)]
-    assert given == sorted(given)
-    sizes = [size for size, _ in given]
-    assert sizes[::3] == [(96, 171), (720, 1280)]
-    assert len({*sizes}) == 4
-    assert chosen(1, Options(size=(90, 160), gaussians=77)) == ((90, 160), 77)
+    budget = Budget(0.01, (128, 128), photos_of_scene, Options())
+    given = [*map(budget.affordable, (1, 120, 1200, 1e9))]
+    assert given == sorted({*given})
+    assert given[::3] == [(96, 171), (720, 1280)]
+    assert budget.count(given[0]) < budget.count(given[1])
+    fixed = replace(budget, options=Options(size=(90, 160), gaussians=77))
+    assert (fixed.affordable(1), fixed.count((9, 9))) == ((90, 160), 77)
+
+    told, advice = budget.sentences(9, 1)
+    assert re.match("poses .* 9 s; 1 s .* 69 steps on photos of 96 x 171 .* twice as many", told)
+    lacking = re.search(r"small; (\S+) minutes more would give 128 ", advice)[1]
+    assert min(budget.affordable(5 + 60 * float(lacking))) == 128
+    assert "the time would give photos" in next(budget.sentences(9, 600))
 
 
 def test_points_of_colmap_are_part_of_the_start(taken, photos_of_scene, photos, tmp_path):

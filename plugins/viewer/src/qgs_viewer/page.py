@@ -1,5 +1,6 @@
 """Show scenes in the browser: viser servers, first viewpoints, HTML pages of scenes."""
 
+import base64
 import http
 import io
 import ipaddress
@@ -21,10 +22,10 @@ import websockets.asyncio.server as sockets
 from rich.console import Console
 
 from qgs.files import refuse_existing, write_text
+from qgs.geometry.harmonics import rotated
 from qgs.geometry.poses import look_at_depth
 from qgs.types import Gaussians, Views
 from qgs_viewer.drawing import FRUSTUM, Choice, Drawing, distance_to
-from qgs_viewer.harmonics import harmonics_script
 from qgs_viewer.query_scene import NEUTRAL, Background, QueryScene
 
 # Vertical angle of the viewer's window, radians.
@@ -101,8 +102,8 @@ def _guarded(
         answer = process_request(connection, request)
         if head and answer is not None:
             answer.body = with_head(answer.body.decode(), head).encode()
+            # the page ends where the connection does
             answer.headers.pop("Content-Length", None)
-            answer.headers["Content-Length"] = str(len(answer.body))
         return answer
 
     return serve(*where, process_request=checked, **options)
@@ -159,19 +160,45 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
 def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
     """Return an HTML page that shows `scene` in 3D; a reader can turn the scene and record a video.
 
-    The page takes 0.8 MB plus 40 bytes for each Gaussian, with harmonics 56 to 104. choice: what is shown; by default all
-    Gaussians in their own colours, and the anchors after the last layer.
+    The page takes 0.8 MB plus 40 bytes for each Gaussian, with harmonics 56 to 104. choice: what is
+    shown; by default all Gaussians in their own colours, and the anchors after the last layer.
     """
     with quiet_server() as server:
         stand(server, scene)
         Drawing(server.scene).put(scene, choice or Choice(layer=scene.depth))
         page = server.get_scene_serializer().as_html()
-    file = files("qgs_viewer") / "template" / "head.html"
-    head = file.read_text(encoding="utf-8")
+    head = template("head.html")
     # a picked query has colours of its own
     if choice is None or choice.query is None:
         head += harmonics_script(scene)
     return with_head(page, head)
+
+
+def template(name: str) -> str:
+    """Return the text of the file `name` in the folder `template`."""
+    file = files("qgs_viewer") / "template" / name
+    return file.read_text(encoding="utf-8")
+
+
+def harmonics_script(scene: QueryScene) -> str:
+    """Return scripts that add the spherical harmonics of `scene` to its colours in a page.
+
+    The scripts must stand before viser's. They take 4 bytes for each coefficient of each Gaussian,
+    and as much for its colour. Returns "" if the Gaussians have no harmonics.
+    """
+    gaussians = scene.gaussians
+    if gaussians.sh is None:
+        return ""
+    sh = rotated(gaussians.sh[0].cpu(), scene.placement.rotation)
+    colors = gaussians.colors[0, :, None].cpu()
+    # viser's colours are from 0 to 1, which those beside harmonics may leave
+    values = torch.cat([colors - colors.clamp(0, 1), sh], 1)
+    most = float(values.abs().max()) + 1e-6
+    # most coefficients are far smaller than the largest: 8 bits of their roots are closer
+    roots = values.sign() * (values.abs() / most).sqrt()
+    data = base64.b64encode((127 * roots + 128).round().byte().numpy().tobytes()).decode()
+    content = f"{{most: {most}, count: {values.shape[1]}, data: '{data}'}}"
+    return f"<script>window.harmonics = {content};</script>{template('harmonics.html')}"
 
 
 def with_head(page: str, head: str) -> str:

@@ -15,11 +15,9 @@ import viser
 from rich.console import Console
 
 from qgs.terminal import print_lines
-from qgs.wording import warn_once
 from qgs_viewer.drawing import Choice, Drawing, Others, painted
-from qgs_viewer.harmonics import harmonics_script
 from qgs_viewer.opening import FixedSource, Source
-from qgs_viewer.page import quiet_server, stand
+from qgs_viewer.page import harmonics_script, quiet_server, stand
 from qgs_viewer.placement import Splats, hit
 from qgs_viewer.queries import PARTS, attention_pictures_of, sheet
 from qgs_viewer.query_scene import QueryScene
@@ -213,11 +211,6 @@ def serve(
     head = harmonics_script(source.fixed) if isinstance(source, FixedSource) else ""
     with quiet_server(host, port, source.title, head) as server:
         panel = Panel(server, source)
-        if not head and panel.scene.gaussians.sh is not None:
-            warn_once(
-                "the viewer shows these Gaussians with one colour from all directions: to see "
-                "spherical harmonics above degree 0, write a page with --html"
-            )
         panel.scene.refuse_missing(query)
         if query is not None:
             panel.pick(query)

@@ -35,6 +35,14 @@ Model: TypeAlias = Annotated[
         "estimated from the photos. Default: a shipped model for fewer than four photos, else none."
     ),
 ]
+From: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "--from",
+        help="Scene to optimise further: a folder that qgs scene wrote from the same photos. "
+        "Default: none; with it, --size and --gaussians are as in that scene.",
+    ),
+]
 PhotoSize: TypeAlias = Annotated[
     str | None,
     typer.Option(
@@ -90,6 +98,7 @@ def scene(
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("scene"),
     minutes: Minutes = 5.0,
     model: Model = None,
+    earlier: From = None,
     frames: Frames = None,
     scale: Scale = None,
     size: PhotoSize = None,
@@ -125,6 +134,7 @@ def scene(
 
     options = Options(
         model=model,
+        earlier=earlier,
         frames=frames,
         scale=scale,
         size=pixels,

@@ -21,8 +21,9 @@ from qgs.recipe.registry import load_usable_plugins
 from qgs.reconstruction.reconstruct import reconstruct
 from qgs.types import Gaussians, Views
 from qgs_photos.datasets.colmap import Colmap, read_lines
+from qgs_photos.refine.budget import TIMED
 from qgs_photos.refine.options import NONE, Options
-from qgs_photos.refine.scene_photos import TIMED, ScenePhotos
+from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.refine.sweeping import balls, swept
 
 ENOUGH = 4
@@ -37,15 +38,15 @@ _FIXED = struct.Struct("<Q3d3BdQ")
 
 @dataclass(frozen=True)
 class Initialisation:
-    """Start of the optimisation: a model's Gaussians, or only the world frame of future Gaussians.
+    """Start of the optimisation: given Gaussians, or only the world frame of future Gaussians.
 
-    model: name of the model, or "none". world: reference pose (4, 4) and scale of the world of the
-    Gaussians, see `own_world`. gaussians: (1, G) of the model; None if Gaussians are to be placed
-    from the photos. frames: names of the model's input photos, separated by commas; None without a
-    model.
+    model: name of the model, or "none"; None if an earlier scene gives the Gaussians. world:
+    reference pose (4, 4) and scale of the world of the Gaussians, see `own_world`. gaussians: of
+    the model or scene, (1, G); None if Gaussians are to be placed from the photos. frames: names of
+    the model's input photos, separated by commas; None without a model.
     """
 
-    model: str
+    model: str | None
     world: tuple[Tensor, Tensor]
     gaussians: Gaussians | None = None
     frames: str | None = None

@@ -2,6 +2,7 @@
 
 import shlex
 from dataclasses import dataclass
+from pathlib import Path
 
 from qgs.reconstruction.scenes import Size
 from qgs_photos.refine.refining import NO_EXTRAS, Extras
@@ -14,14 +15,16 @@ NONE = "none"
 class Options:
     """Options of `qgs scene`; None lets the command choose.
 
-    model: name of the model that makes the first Gaussians, or NONE. frames: input photos of the
-    model, separated by commas. scale: factor on camera positions for the model. size: (H, W) of the
-    photos in pixels. gaussians: number of Gaussians. seconds: time of the optimisation alone.
+    model: name of the model that makes the first Gaussians, or NONE. earlier: folder of a scene
+    with the first Gaussians, in place of a model. frames: input photos of the model, separated by
+    commas. scale: factor on camera positions for the model. size: (H, W) of the photos in pixels.
+    gaussians: number of Gaussians. seconds: time of the optimisation alone.
     holdout: N to hold out every Nth photo, or NONE. scene: name of the scene if there are several.
     extras: further quantities to optimise. masks: treat pixels outside masks as background.
     """
 
     model: str | None = None
+    earlier: Path | None = None
     frames: str | None = None
     scale: float | None = None
     size: Size | None = None
@@ -42,6 +45,7 @@ class Options:
             "--out": out,
             "--scene": self.scene,
             "--model": self.model,
+            "--from": self.earlier,
             "--frames": self.frames,
             "--scale": None if self.scale is None else f"{self.scale:.5g}",
             "--size": f"{height}x{width}",

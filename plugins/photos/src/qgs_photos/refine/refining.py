@@ -104,6 +104,7 @@ def refine(
     renderer: nn.Module | None = None,
     console: Console | None = None,
     extras: Extras = NO_EXTRAS,
+    begin: float = 0.0,
 ) -> RefinedScene:
     """Optimise `gaussians` (1, G) on the photos `views` (1, V) of their scene.
 
@@ -115,6 +116,8 @@ def refine(
     number of Gaussians at the end, reached in the first part of the time; None keeps the given
     number. swept: fraction of new Gaussians at the start, from 0 to 1. renderer: by default
     `qgs/auto`. console: shows progress; None shows none. extras: further quantities to optimise.
+    begin: part of the schedule to leave out at its start, from 0 to 1, for Gaussians that were
+    optimised before; the schedule sets learning rates, resolution and number of Gaussians.
 
     Raises ValueError for more than one scene, no photo, no time, or Gaussians that are not finite.
     """
@@ -124,7 +127,7 @@ def refine(
     stopping = stop_requests(console is None)
     progress = TrainingProgress(console or Console(quiet=True))
     with progress, stopping as stop, torch.enable_grad():
-        run = _Run(gaussians, views, seconds, wanted, renderer, swept, extras)
+        run = _Run(gaussians, views, seconds, wanted, renderer, swept, extras, begin)
         run.until_spent(progress, stop)
         return RefinedScene(
             gaussians=map_tensors(Tensor.detach, run.free.gaussians()),
@@ -168,17 +171,19 @@ class _Run:
         renderer: nn.Module,
         swept: float,
         extras: Extras,
+        begin: float = 0.0,
     ) -> None:
         began = perf_counter()
         self.renderer = renderer
         self.wanted = wanted
         self.seconds = seconds
+        self.begin = begin
         self.generator = torch.Generator().manual_seed(0)
         side = min(views.cameras.size)
         self.levels = [
             (shrunk(views, part), end)
             for part, end in _LEVELS
-            if part == 1 or side // part >= _LEAST_SIDE
+            if part == 1 or (side // part >= _LEAST_SIDE and end > begin)
         ]
         self.start = min(wanted, gaussians.count)
         coarsest, _ = self.levels[0]
@@ -217,7 +222,7 @@ class _Run:
 
         Returns the loss and the PSNR before the step.
         """
-        used = min(self.spent / self.seconds, 1.0)
+        used = min(self.begin + (1 - self.begin) * self.spent / self.seconds, 1.0)
         for group in self.free.optimizer.param_groups:
             last = _LAST_OF_MEANS if group["name"] == "means" else _LAST
             group["lr"] = self.rates[group["name"]] * last**used

@@ -40,12 +40,14 @@ PageWriter = Callable[[Gaussians, Views, tuple[float, float, float]], str]
 class Result:
     """An optimised scene with its photos.
 
-    command: command line that makes the scene again. world: reference pose (4, 4) and scale of the
-    world of the Gaussians, see `own_world`. views: the V photos of the optimisation, (1, V).
-    judged: the H held-out photos on which the scene is scored, (1, H).
+    command: command line that makes the scene again. optimised: number of Gaussians that were
+    optimised; others, which come before them, are surroundings. world: reference pose (4, 4) and
+    scale of the world of the Gaussians, see `own_world`. views: the V photos of the optimisation,
+    (1, V). judged: the H held-out photos on which the scene is scored, (1, H).
     """
 
     command: str
+    optimised: int
     world: tuple[Tensor, Tensor]
     refined: RefinedScene
     photos: ScenePhotos
@@ -143,7 +145,10 @@ def scores(result: Result) -> dict[str, Any]:
         "steps": refined.steps,
         "seconds": round(refined.seconds, 1),
         "stopped_by": refined.stopped_by,
+        "optimised": result.optimised,
+        "size": result.views.cameras.size,
         "refined_on": [*map(name_of, result.photos.frames)],
+        "camera_centres": result.photos.centres,
         "mean": mean,
         "held_out": rows,
     }

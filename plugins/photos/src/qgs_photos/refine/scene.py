@@ -19,24 +19,28 @@ from qgs.terminal import print_lines
 from qgs.types import Gaussians, Views
 from qgs_photos.datatools.check import faults_of_poses
 from qgs_photos.datatools.findings import Finding
-from qgs_photos.refine.initial import Initialisation, chosen_initialisation, photos_start
+from qgs_photos.refine.budget import TIMED, Budget
+from qgs_photos.refine.earlier import chosen_start
+from qgs_photos.refine.initial import Initialisation, photos_start
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import refine, seconds_of_step
 from qgs_photos.refine.result import Result, page_writer, write_scene
-from qgs_photos.refine.scene_photos import TIMED, ScenePhotos, affordable
+from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
 
-END = 4.0
-"""Seconds reserved for scores and files at the end."""
-PART_OF_END = 0.03
-"""Fraction of the total time that is reserved for scores and files, on top of END seconds."""
 # Of the time for the optimisation, however long all else took.
 _LEAST_PART = 0.1
 # Photos that given poses are judged by, a second each.
 _JUDGING = 4
+END = 4.0
+"""Seconds reserved for scores and files at the end."""
+PART_OF_END = 0.03
+"""Fraction of the total time that is reserved for scores and files, on top of END seconds."""
 SWEEP = 0.12
 """Fraction of the optimisation's time to spend on finding depths of pixels."""
+BEGIN = 0.5
+"""Part of the schedule that is left out if an earlier scene is optimised further."""
 
 
 def make_scene(
@@ -54,32 +58,31 @@ def make_scene(
         return options.seconds or max(began + seconds - end - perf_counter(), _LEAST_PART * seconds)
 
     photos = ScenePhotos(path, options)
+    opened = perf_counter() - began
     with console.status("choosing a size for the time"):
         print_lines(console, map(str, faults_of_given_poses(photos)[:1]))
-        start = chosen_initialisation(photos, options)
+        start, options = chosen_start(photos, options)
         small = views_in(start.world, photos.small, photos.frames).to(options.device)
         # What masks leave out is empty, and black in viewers.
         color = (0.0, 0.0, 0.0) if options.masks else edge_color(small)
         renderer = AutoRenderer(AutoRenderer.Config(background=color))
         few, seconds_of_pixel = timed_sweep(small)
-        # on this machine, with these options: exposure and harmonics cost time too
+        # exposure and harmonics cost time too
         step, compiling = seconds_of_step(few, small, renderer, options.extras)
         # once for each version of qgs: that time would be missing in the scene
         began += compiling
-        size, count = affordable(step, small.cameras.size, photos, left(), options)
+        plan = Budget(step, small.cameras.size, photos, options)
+        size = plan.affordable(left())
+        count = plan.count(size)
         every = views_of(photos, start.world, size, options)
     budget = left()
     chosen = replace(options, size=size, gaussians=count, seconds=budget)
     command = with_start(chosen, start).command(path, str(out))
-    plan = f"{budget:.0f} s of optimisation, on photos of {size[0]} x {size[1]} pixels"
-    times = f"{perf_counter() - began:.0f} s so far; {plan}; about {end:.0f} s for files"
     # before the optimisation: an interrupted one can be repeated
-    print_lines(console, [command, times])
-    gaussians = start.gaussians
-    if gaussians is None:
-        most = int(SWEEP * budget / seconds_of_pixel)
-        with console.status("placing Gaussians at pixels"):
-            gaussians = photos_start(photos.small, start.world, small, count, most)
+    print_lines(console, [command, *plan.sentences(opened, budget)])
+    most = int(SWEEP * budget / seconds_of_pixel)
+    with console.status("placing Gaussians at pixels"):
+        gaussians = start.gaussians or photos_start(photos.small, start.world, small, count, most)
     views = every.select(slice(len(photos.frames)))
     refined = refine(
         gaussians,
@@ -87,15 +90,17 @@ def make_scene(
         left(),
         count=count,
         # a model's Gaussians leave holes that pixels fill; the others are at pixels already
-        swept=0.0 if start.gaussians is None else 0.5,
+        swept=0.5 if start.frames else 0.0,
         renderer=renderer,
         console=console,
         extras=options.extras,
+        begin=BEGIN if options.earlier else 0.0,
     )
+    optimised = refined.gaussians.count
     if not options.masks:
         refined = replace(refined, gaussians=surrounded(refined.gaussians, every, color))
-    judged = every.select(slice(len(photos.frames), None))
-    result = Result(command, start.world, refined, photos, views, judged)
+    held_out = every.select(slice(len(photos.frames), None))
+    result = Result(command, optimised, start.world, refined, photos, views, held_out)
     with console.status("scoring held-out photos and writing files"):
         write_scene(result, out, page, began, console)
 
