@@ -10,73 +10,69 @@ from torch import Tensor
 
 from qgs.tokengs import MlpFeedForward
 
+sound = MlpFeedForward.forward
 
-def register(
-    name: str, check: str, seen: str, forward: Callable[[Any, Callable[..., Tensor], Tensor], Any]
-) -> None:
-    """forward: of the component, the sound forward pass, and features (B, N, D)."""
 
-    def forward_of(self: Any, features: Tensor) -> Any:
-        return forward(self, lambda x: MlpFeedForward.forward(self, x), features)
-
-    mutant(check, seen)(type(name, (MlpFeedForward,), {"forward": forward_of}))
+def register(name: str, check: str, seen: str, forward: Callable[[Any, Tensor], Any]) -> None:
+    """forward: of the component and features (B, N, D)."""
+    mutant(check, seen)(type(name, (MlpFeedForward,), {"forward": forward}))
 
 
 register(
     "ForgetsToReturn",
     "runs",
     "component returns NoneType, not Tensor",
-    lambda self, mlp, x: None,
+    lambda self, x: None,
 )
 register(
     "DetachesASummand", "gradients_match_differences", "in evaluation: Jacobian",
-    lambda self, mlp, x: mlp(x) + x.square().detach()
+    lambda self, x: sound(self, x) + x.square().detach()
 )  # fmt: skip
 register(  # the same numbers in both modes
     "DetachesASummandInTraining", "gradients_match_differences", "in training: Jacobian",
-    lambda self, mlp, x: mlp(x) + self.training * (x.square().detach() - x.square())
+    lambda self, x: sound(self, x) + self.training * (x.square().detach() - x.square())
 )  # fmt: skip
 register(
     "DividesByLength", "zeros_stay_finite", "output: not finite in evaluation, with zeros",
-    lambda self, mlp, x: mlp(x / x.norm(dim=-1, keepdim=True))
+    lambda self, x: sound(self, x / x.norm(dim=-1, keepdim=True))
 )  # fmt: skip
 register(
     "Exponentiates", "large_numbers_stay_finite", "in evaluation, with inputs times 1e4",
-    lambda self, mlp, x: mlp(x.exp())
+    lambda self, x: sound(self, x.exp())
 )  # fmt: skip
 register(
     "CentresOnTheBatch", "batch_independence", "scene 0 has a gradient",
-    lambda self, mlp, x: mlp(x - x.mean(0, keepdim=True))
+    lambda self, x: sound(self, x - x.mean(0, keepdim=True))
 )  # fmt: skip
 register(
     "ReturnsItsInput", "outputs_share_no_memory", "shares memory with `features`",
-    lambda self, mlp, x: x.view_as(x)
+    lambda self, x: x.view_as(x)
 )  # fmt: skip
 register(
     "AddsNoise", "eval_repeats_bitwise", "a second pass on the same inputs differs, output",
-    lambda self, mlp, x: mlp(x) + 0.01 * torch.randn_like(x)
+    lambda self, x: sound(self, x) + 0.01 * torch.randn_like(x)
 )  # fmt: skip
 register(
     "DropsByPythonsRandom", "training_draws_from_torch", "numpy's or random's",
-    lambda self, mlp, x: mlp(x) * (random.random() if self.training else 1)
+    lambda self, x: sound(self, x) * (random.random() if self.training else 1)
 )  # fmt: skip
 register(
     "StaysOnCpu", "construction", "device",
-    lambda self, mlp, x: mlp(x) * torch.ones(x.shape[-1])
+    lambda self, x: sound(self, x) * torch.ones(x.shape[-1])
 )  # fmt: skip
 register(
     "CancelsDigits", "autocast_is_close", "`output` is off by",
-    lambda self, mlp, x: mlp((x + 300) - 300)
+    lambda self, x: sound(self, (x + 300) - 300)
 )  # fmt: skip
 register(
     "GivesFloat32", "float64_stays_float64", "`output` is 2x6x32 float32",
-    lambda self, mlp, x: mlp(x).float()
+    lambda self, x: sound(self, x).float()
 )  # fmt: skip
 register(
     "LoopsOverQueries", "compiles", "3 new graphs are compiled",
-    lambda self, mlp, x: torch.stack([self.mlp(self.norm(each)) for each in x.unbind(1)], 1)
+    lambda self, x: torch.stack([self.mlp(self.norm(each)) for each in x.unbind(1)], 1)
 )  # fmt: skip
 register(
     "DetachesWhenCompiled", "compiles", "features: has a gradient only",
-    lambda self, mlp, x: mlp(x.detach() if torch.compiler.is_compiling() else x)
+    lambda self, x: sound(self, x.detach() if torch.compiler.is_compiling() else x)
 )  # fmt: skip

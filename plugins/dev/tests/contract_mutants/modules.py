@@ -1,7 +1,5 @@
 """Components that are built, kept, saved or differentiated wrongly, whatever their slot."""
 
-from dataclasses import replace
-
 import torch
 from contract_mutants.mutant import mutant
 from contract_mutants.slots import ChangedSquares
@@ -248,4 +246,4 @@ class DividesByBaseline(ChangedEncoder):
     def given(self, views):
         eyes = views.cameras.c2w[..., :3, 3]
         baseline = (eyes - eyes[:, :1]).norm(dim=-1).sum(1)
-        return replace(views, images=views.images / baseline[:, None, None, None, None])
+        return views.replace(images=views.images / baseline[:, None, None, None, None])

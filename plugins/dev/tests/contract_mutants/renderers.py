@@ -1,6 +1,5 @@
 """Renderers with a wrong background, alpha, depth or gradient."""
 
-from dataclasses import replace
 from typing import Any
 
 from contract_mutants.mutant import mutant
@@ -27,11 +26,14 @@ class ChangedResult:
 class ChangedRenderer(ChangedResult, TorchRenderer):
     """A sound renderer, whose inputs or output mutants change."""
 
-    def given(self, gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-        return gaussians, cameras
+    def drawn(self, gaussians: Gaussians) -> Gaussians:
+        return gaussians
+
+    def seen_by(self, cameras: Cameras) -> Cameras:
+        return cameras
 
     def forward(self, gaussians, cameras, background=None):
-        return super().forward(*self.given(gaussians, cameras), background)
+        return super().forward(self.drawn(gaussians), self.seen_by(cameras), background)
 
 
 @mutant("no_gaussians_give_the_background", "not the background")
@@ -43,7 +45,7 @@ class HasItsOwnBackground(TorchRenderer):
 @mutant("rendering_is_over_the_background", "the weight of the background is not")
 class SquaresAlpha(ChangedRenderer):
     def result(self, out):
-        return replace(out, alpha=out.alpha.square())
+        return out.replace(alpha=out.alpha.square())
 
 
 @mutant("depth_is_expected", "depth is not the expected z")
@@ -51,65 +53,65 @@ class WeighsDepthByAlpha(ChangedRenderer):
     """Gives sum(w z), as if every pixel were opaque."""
 
     def result(self, out):
-        return replace(out, depth=out.alpha * out.depth)
+        return out.replace(depth=out.alpha * out.depth)
 
 
 @mutant(HARMONICS, "with 15 coefficients, view 0 has other colours")
 class IgnoresTheThirdDegree(ChangedRenderer):
-    def given(self, gaussians, cameras):
+    def drawn(self, gaussians):
         sh = gaussians.sh
-        return replace(gaussians, sh=sh if sh is None else sh[..., :8, :]), cameras
+        return gaussians.replace(sh=sh if sh is None else sh[..., :8, :])
 
 
 @mutant(HARMONICS, "coefficients of zero change the image")
 class DarkensWithHarmonics(ChangedRenderer):
     """Halves colours that do not depend on the direction where there are coefficients."""
 
-    def given(self, gaussians, cameras):
+    def drawn(self, gaussians):
         if gaussians.sh is None or gaussians.sh.any():
-            return gaussians, cameras
-        return replace(gaussians, colors=gaussians.colors / 2), cameras
+            return gaussians
+        return gaussians.replace(colors=gaussians.colors / 2)
 
 
 @mutant(FEATURES, "the rendering has no features")
 class DropsFeatures(ChangedRenderer):
     def result(self, out):
-        return replace(out, features=None)
+        return out.replace(features=None)
 
 
 @mutant(FEATURES, "features change the colours")
 class PaintsWithFeatures(ChangedRenderer):
-    def given(self, gaussians, cameras):
+    def drawn(self, gaussians):
         if gaussians.features is None:
-            return gaussians, cameras
-        return replace(gaussians, colors=gaussians.colors + gaussians.features[..., :3]), cameras
+            return gaussians
+        return gaussians.replace(colors=gaussians.colors + gaussians.features[..., :3])
 
 
 @mutant(GAUSSIANS, "`gaussians.means`")
 @mutant(CAMERAS, "`cameras.c2w`")
 class DetachesDepth(ChangedRenderer):
     def result(self, out):
-        return replace(out, depth=out.depth.detach())
+        return out.replace(depth=out.depth.detach())
 
 
 @mutant(GAUSSIANS, "gaussians.colors")
 class DoublesAGradient(ChangedRenderer):
-    def given(self, gaussians, cameras):
+    def drawn(self, gaussians):
         colors = 2 * gaussians.colors - gaussians.colors.detach()
-        return replace(gaussians, colors=colors), cameras
+        return gaussians.replace(colors=colors)
 
 
 @mutant(CAMERAS, "and gets none")
 class DetachesIntrinsicsSilently(ChangedRenderer):
     camera_gradients = ("c2w",)
 
-    def given(self, gaussians, cameras):
-        return gaussians, replace(cameras, intrinsics=cameras.intrinsics.detach())
+    def seen_by(self, cameras):
+        return cameras.replace(intrinsics=cameras.intrinsics.detach())
 
 
 @mutant(CAMERAS, "gradient is refused")
 class RefusesWhatItDeclares(ChangedRenderer):
-    def given(self, gaussians, cameras):
+    def seen_by(self, cameras):
         if cameras.intrinsics.requires_grad:
             raise ValueError("there is no gradient of intrinsics; detach them")
-        return gaussians, cameras
+        return cameras

@@ -1,6 +1,5 @@
 """Components that keep the contract in ways that a check could take for a fault."""
 
-from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
@@ -80,7 +79,7 @@ class SeesFar(Extended, ChangedEncoder):
 
     def given(self, views):
         seen = self.stem(views.images.flatten(0, 1)).unflatten(0, views.images.shape[:2])
-        return replace(views, images=seen)
+        return views.replace(images=seen)
 
 
 class StridedConvolutions(Extended, PatchEncoder):

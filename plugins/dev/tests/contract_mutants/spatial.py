@@ -1,13 +1,11 @@
 """Components that read or write other fields, lose digits, or know an order or the world frame."""
 
-from dataclasses import replace
-
 import torch
 from contract_mutants.mutant import mutant
-from contract_mutants.renderers import ChangedRenderer
 from torch import Tensor, nn
 
 from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, Loss, Refinement, memory_fields
+from qgs.renderers import TorchRenderer
 from qgs.tokengs import (
     ContentCrossAttention,
     ContentSelfAttention,
@@ -17,7 +15,7 @@ from qgs.tokengs import (
     MlpFeedForward,
     NoRefinement,
 )
-from qgs.types import GaussianAttributes, QueryState
+from qgs.types import QueryState
 
 CHECK = "reads_are_declared"
 
@@ -141,7 +139,7 @@ class DecodesInHalf(GaussianHead):
     def activate(self, raw):
         good = super().activate(raw)
         opacities = torch.sigmoid(raw[..., -1] + self.config.opacity_bias).to(good.scales)
-        return GaussianAttributes(good.offsets, good.scales, good.quats, opacities, good.colors)
+        return good.replace(opacities=opacities)
 
 
 class BiasedAttention(ContentCrossAttention):
@@ -212,9 +210,10 @@ class DeclaresAnOrder(ContentCrossAttention):
 
 
 @mutant("world_frame_makes_no_difference", "in a moved world, rgb")
-class DarkensByHeight(ChangedRenderer):
+class DarkensByHeight(TorchRenderer):
     """Above the first camera, along the world's y axis: no shift of the world changes it."""
 
-    def given(self, gaussians, cameras):
+    def forward(self, gaussians, cameras, background=None):
         height = gaussians.means[..., 1:2] - cameras.c2w[:, :1, 1, 3:]
-        return replace(gaussians, colors=gaussians.colors * height.sigmoid()), cameras
+        darker = gaussians.replace(colors=gaussians.colors * height.sigmoid())
+        return super().forward(darker, cameras, background)
