@@ -6,10 +6,13 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from numpy.testing import assert_allclose
 from rich.console import Console
 from torch.testing import assert_close
 
 assert_equal = partial(assert_close, rtol=0, atol=0)
+assert_near = partial(assert_allclose, rtol=1e-6)
+"""Of a tensor and numbers."""
 
 
 def must_refuse(match, function, *given, kind=ValueError, **options):

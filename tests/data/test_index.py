@@ -2,11 +2,10 @@
 
 from unittest.mock import Mock
 
-import pytest
 import torch
 from line_scenes import Line, Lines, plan_of, samples_of
 from photo_formats import opened, synthetic, write_nerfstudio
-from tables import must_refuse, rows, write_json
+from tables import assert_near, must_refuse, rows, write_json
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.evaluate.plan import read_index
@@ -56,7 +55,7 @@ def test_samples_are_those_of_the_index_in_its_order(tmp_path):
     first, second = samples_of(source, VIEWS, indexed(tmp_path, index, scenes=1))
     assert (first.scene, second.scene) == ("three", "one")
     assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))
-    assert first.targets.images[0, :, 0, 0, 0].tolist() == pytest.approx([0.02, 0.03, 0.02])
+    assert_near(first.targets.images[0, :, 0, 0, 0], [0.02, 0.03, 0.02])
     assert first.inputs.cameras.c2w[0, 0].tolist() == torch.eye(4).tolist()
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from line_scenes import DOWN, Line, Lines, drawn, judged_samples, samples_of, values
 from odd_views import odd_views
-from tables import assert_equal, must_refuse
+from tables import assert_equal, assert_near, must_refuse
 from torch.testing import assert_close
 from walk import arc
 
@@ -70,9 +70,9 @@ def test_normalised_poses():
 
     constant = made(scale_factor=0.4)
     assert_equal(constant[0], torch.eye(4))
-    assert constant[1:, 0, 3].tolist() == pytest.approx([4 * 0.5 * 0.4, 2 * 0.5 * 0.4])
+    assert_near(constant[1:, 0, 3], [4 * 0.5 * 0.4, 2 * 0.5 * 0.4])
     config = {"scale": "distance", "scale_factor": 1.0, "frame": "mean_cam"}
-    assert made(**config)[:2, 0, 3].tolist() == pytest.approx([-0.5, 0.5])
+    assert_near(made(**config)[:2, 0, 3], [-0.5, 0.5])
     must_refuse("one point", sample, Line(5, step=0.0), **config)
     assert_equal(made(scale_factor=1.0, frame="given"), scene.cameras.c2w[[2, 6, 4]])
 
@@ -92,7 +92,7 @@ def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_pixel():
 
 def test_masks_follow_their_frames_into_mirrors_and_batches():
     plain, flipped = (sample(MaskedLine(6), targets=(3, 2), mirror=m) for m in (False, True))
-    assert plain.targets.masks[0, :, 0, 5, 0].tolist() == pytest.approx([0.03, 0.02])
+    assert_near(plain.targets.masks[0, :, 0, 5, 0], [0.03, 0.02])
     assert_close(flipped.targets.masks, plain.targets.masks.flip(-1))
     bare = sample(Line(6), targets=(3, 2))
     assert collate([bare, bare]).inputs.masks is None

@@ -10,7 +10,7 @@ from qgs_viewer.placement import Placement
 from qgs_viewer.queries import attention_pictures_of
 from qgs_viewer.query_scene import QueryScene
 from small import BY_DISTANCE, KINDS, model_scenes_of, source_of
-from tables import assert_equal
+from tables import assert_equal, assert_near
 from torch.testing import assert_close
 from walk import SIDE, arc, cloud, pinhole
 
@@ -56,7 +56,7 @@ def test_lines_end_on_the_patches_that_are_read_most():
     place = tokens // (rows * columns), torch.arange(5)
     pixels = to_pixels(seen, views.intrinsics[0])[place]
     assert_close(pixels, (patches + 0.5).double() * SIDE / columns, rtol=0, atol=1e-3)
-    assert seen[place][:, 2].tolist() == pytest.approx([0.4] * 5)
+    assert_near(seen[place][:, 2], [0.4] * 5)
 
 
 def test_other_inputs_leave_the_scene_where_it_is():

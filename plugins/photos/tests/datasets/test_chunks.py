@@ -11,7 +11,7 @@ from PIL import Image
 from planted import save
 from qgs_photos.datasets.chunk_files import load_chunk
 from qgs_photos.datasets.chunks import ChunksSource
-from tables import assert_equal, must_not_find, must_refuse, write_json
+from tables import assert_equal, assert_near, must_not_find, must_refuse, write_json
 from upath import UPath
 
 
@@ -70,11 +70,11 @@ def test_frames_and_cameras(tmp_path):
     assert len(scene) == 7
     c2w = scene.cameras.c2w[5]
     assert c2w.dtype == torch.float64
-    assert c2w[:3, 3].tolist() == pytest.approx([5, 2, 3])
+    assert_near(c2w[:3, 3], [5, 2, 3])
     assert c2w[:3, 0].tolist() == [0, 1, 0]  # the camera's x axis
     # 64 x 36 cropped to 36 x 36, 14 pixels off the left, then scaled by 16 / 36
     wanted = np.array([0.5 * 64, 0.9 * 36, 0.45 * 64 - 14, 0.55 * 36]) * 16 / 36
-    assert scene.cameras.intrinsics[0].tolist() == pytest.approx(wanted.tolist(), rel=1e-6)
+    assert_near(scene.cameras.intrinsics[0], wanted)
     pixels = scene.images([6, 2])[:, :, 5, 5].mul(255).round()
     assert pixels.tolist() == [[60, 50, 200], [20, 50, 200]]
     assert scene.frame_name(3) == "3000"
@@ -145,8 +145,8 @@ def test_masks_names_sizes_and_backgrounds(tmp_path):
     assert masks[0, 0, [0, 15], 3].tolist() == [0, 1]
     assert_equal(masks[1], torch.ones(1, 16, 16))
     assert scene.frame_name(0) == "a/0.jpg"
-    assert scene.cameras.intrinsics[1].tolist() == pytest.approx([8, 14.4, 7.2, 8.8])
-    assert scene.images([0])[0, :, 0, 0].tolist() == pytest.approx([0.2, 0.4, 0.6])
+    assert_near(scene.cameras.intrinsics[1], [8, 14.4, 7.2, 8.8])
+    assert_near(scene.images([0])[0, :, 0, 0], [0.2, 0.4, 0.6])
 
 
 def changed(row, column, value):

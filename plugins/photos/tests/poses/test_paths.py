@@ -11,7 +11,7 @@ from photo_formats import noisy_photos, row_of_frames
 from PIL import Image, ImageSequence
 from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, seen_depth, write_film
 from qgs_photos.poses.paths import path_of, read_path, walk
-from tables import must_refuse, write_json
+from tables import assert_near, must_refuse, write_json
 from training_runs import tiny
 from walk import along_x, cloud, pinhole
 from walked import frames
@@ -99,7 +99,7 @@ def test_size_length_and_angle_of_view():
     assert path.size == (480, 720)
     path = cameras_of(scene, "spiral", (100, 200), 5, 60)
     focal = 50 / math.tan(math.radians(30))
-    assert path.intrinsics[0, 0].tolist() == pytest.approx([focal, focal, 100, 50])
+    assert_near(path.intrinsics[0, 0], [focal, focal, 100, 50])
 
 
 def test_a_film_shows_the_pictures(tmp_path):
