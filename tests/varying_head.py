@@ -1,7 +1,5 @@
 """A head whose Gaussians have colours that depend on the direction, and features."""
 
-from dataclasses import replace
-
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -26,4 +24,4 @@ class VaryingHead(nn.Module):
         normed = F.layer_norm(state.features, state.features.shape[-1:])
         raw = self.linear(normed).unflatten(-1, (self.head.gaussians_per_query, -1))
         sh, features = raw.split([3 * HARMONICS, FEATURES], -1)
-        return replace(self.head(state), sh=sh.unflatten(-1, (HARMONICS, 3)), features=features)
+        return self.head(state).replace(sh=sh.unflatten(-1, (HARMONICS, 3)), features=features)

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -208,7 +206,7 @@ def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol()
 
 def test_times_of_photos_are_kept():
     plain = sample(Line(9)).inputs
-    timed = replace(plain, times=torch.rand(1, 2), target_time=torch.rand(1, 1))
+    timed = plain.replace(times=torch.rand(1, 2), target_time=torch.rand(1, 1))
     both = stack_views([mirrored_views(timed), timed])
     for name in ("times", "target_time"):
         assert_equal(getattr(both, name), getattr(timed, name).repeat(2, 1))

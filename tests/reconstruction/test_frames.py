@@ -1,7 +1,5 @@
 """Which photos are inputs, which are compared with, and which are held out."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from photo_formats import noisy_photos
@@ -21,7 +19,7 @@ def photos(tmp_path_factory):
 
 def chosen(photos, inputs, times=range(9), held_out=(), gap=(3, 20)):
     """Input and compared frames of photos taken at `times`."""
-    scene = GivenScene(replace(photos, times=torch.tensor([[*times]])))
+    scene = GivenScene(photos.replace(times=torch.tensor([[*times]])))
     scene.held_out = held_out
     return choose_frames(scene, ViewsConfig(gap=gap), inputs, None, None)
 

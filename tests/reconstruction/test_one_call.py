@@ -1,7 +1,5 @@
 """`qgs.reconstruct` and `qgs.read_photos`; a model given views in another world warns."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 import yaml
@@ -44,7 +42,7 @@ def far(views):
     c2w[0, 1, 0, 3] = 1
     c2w = POSE @ c2w
     c2w[..., :3, 3] *= 100
-    return replace(views, cameras=replace(views.cameras, c2w=c2w))
+    return views.replace(cameras=views.cameras.replace(c2w=c2w))
 
 
 def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):

@@ -1,7 +1,6 @@
 """Files of Gaussians: PLY as other programs write and read it, .splat, a format of a plug-in."""
 
 import os
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from qgs.reconstruction.scene_formats import PROPERTIES, load_ply, save_gaussian
 
 
 def harmonic(number, harmonics):
-    return replace(cloud(number), sh=torch.randn(1, number, harmonics, 3))
+    return cloud(number).replace(sh=torch.randn(1, number, harmonics, 3))
 
 
 def saved(path, gaussians):
@@ -48,7 +47,7 @@ def test_the_file_is_that_of_the_3dgs_release(tmp_path):
     names += [f"f_rest_{index}" for index in range(45)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     given = harmonic(50, 8)[0]
-    for gaussians in (given, replace(given, sh=None)):
+    for gaussians in (given, given.replace(sh=None)):
         rest = torch.zeros(50, 3, 15)
         if gaussians.sh is not None:
             rest[..., :8] = gaussians.sh.mT
@@ -173,7 +172,7 @@ def test_other_files_are_refused_by_name(tmp_path):
     chunks = np.zeros(1, [("min_x", "<f4")])
     some = cloud(3)
     whole = saved(tmp_path / "whole.ply", some).read_bytes()
-    still = saved(tmp_path / "still.ply", replace(some, quats=some.quats * 0)).read_bytes()
+    still = saved(tmp_path / "still.ply", some.replace(quats=some.quats * 0)).read_bytes()
     faces = b"element face 100000000\nproperty list uint float v\nend_header"
     for name, content in {
         "compressed.ply": ply(vertex=points, chunk=chunks),

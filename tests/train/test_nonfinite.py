@@ -1,6 +1,5 @@
 """Steps that are not finite: which tensor was first."""
 
-from dataclasses import replace
 from functools import partial
 from itertools import count
 from types import SimpleNamespace
@@ -86,9 +85,9 @@ def test_a_module_is_named_by_its_output_and_the_gradient_of_it(step, monkeypatc
     model = step.objective.model
     layer = model.decoder[1]
     across = "output of model.decoder.1.cross_attention"
-    blank = lambda r: replace(r, depth=r.depth * NAN)  # noqa: E731
-    bent = lambda r: replace(r, rgb=poisoned(1 * r.rgb))  # noqa: E731
-    scaled = lambda a: replace(a, scales=a.scales * INF)  # noqa: E731
+    blank = lambda r: r.replace(depth=r.depth * NAN)  # noqa: E731
+    bent = lambda r: r.replace(rgb=poisoned(1 * r.rgb))  # noqa: E731
+    scaled = lambda a: a.replace(scales=a.scales * INF)  # noqa: E731
     for module, call, spoil, tensor, batch in (
         (layer.cross_attention, 1, poisoned, f"gradient of the {across}", 0),
         (layer.self_attention, 2, lambda x: x * INF, "output of model.decoder.1.self_attention", 1),

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -54,7 +53,7 @@ def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(model
     means = centers.repeat_interleave(4, 0) + 0.01 * torch.randn(28, 3)
     scales = sizes[None, :, None].expand(1, 28, 3)
     opacities = torch.full((1, 28), 0.8)
-    scene = replace(cloud(28), means=means[None], scales=scales, opacities=opacities)
+    scene = cloud(28).replace(means=means[None], scales=scales, opacities=opacities)
     weights = queries.rendered_weights(model, scene, cameras).view(7, 4).sum(1)
     assert weights[5:].min() > weights[:5].max()
     drawn = queries.notable_queries(model, scene, cameras, 5)

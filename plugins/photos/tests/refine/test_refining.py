@@ -3,7 +3,6 @@
 import math
 import os
 import signal
-from dataclasses import replace
 from functools import partial
 from itertools import count
 
@@ -60,7 +59,7 @@ def photos(views, side=24, number=60):
 
 @torch.no_grad()
 def mean_psnr(gaussians, views):
-    rgb = RENDERER(replace(gaussians, features=None), views.cameras).rgb
+    rgb = RENDERER(gaussians.replace(features=None), views.cameras).rgb
     return float(psnr(rgb[0], views.images[0]).mean())
 
 
@@ -108,7 +107,7 @@ def test_there_are_as_many_as_wanted(scene):
 def test_harmonics_are_refined_and_features_kept(scene):
     """New Gaussians start with none of both, copies with those of their parents."""
     marks = torch.arange(1.0, 31)[None, :, None]
-    start = replace(cloud(30), sh=torch.zeros(1, 30, 8, 3), features=marks)
+    start = cloud(30).replace(sh=torch.zeros(1, 30, 8, 3), features=marks)
     result = refine(start, scene[0], 60, count=50).gaussians
     assert result.sh.shape == (1, 50, 8, 3)
     assert result.sh.abs().max() > 1e-3
@@ -127,7 +126,7 @@ def test_an_interrupt_keeps_what_there_is(scene, clock):
 def test_a_coarser_level_shows_the_same_scene():
     fine = photos(3, 64, 20)
     masks = fine.images[:, :, :1]
-    given = replace(fine, masks=masks, times=torch.rand(1, 3), target_time=torch.rand(1, 1))
+    given = fine.replace(masks=masks, times=torch.rand(1, 3), target_time=torch.rand(1, 1))
     coarse = shrunk(given, 2)
     assert coarse.images.shape[-2:] == (32, 32)
     assert_equal(coarse.masks, coarse.images[:, :, :1])
@@ -155,7 +154,7 @@ def test_unusable_input_is_refused():
 
 def test_colors_beside_harmonics_may_have_any_value():
     colors = torch.linspace(-0.7, 1.6, 60).reshape(1, 20, 3)
-    given = free(replace(cloud(20), colors=colors, sh=torch.zeros(1, 20, 3, 3)))
+    given = free(cloud(20).replace(colors=colors, sh=torch.zeros(1, 20, 3, 3)))
     given.grow(24, generator())
     assert_equal(given.gaussians().colors[:, :20], colors)
     given.gaussians().colors.sum().backward()
@@ -166,7 +165,7 @@ def test_colors_beside_harmonics_may_have_any_value():
 def test_growth_leaves_the_rendering_as_it_is():
     """Also of fog, Gaussians that are all faint, of which many copies are made at once."""
     fog = 0.01 + 0.05 * torch.rand(1, 200)
-    given = free(replace(cloud(200), opacities=fog))
+    given = free(cloud(200).replace(opacities=fog))
     cameras = ring(7)
     before = Views(RENDERER(given.gaussians(), cameras).rgb.detach(), cameras)
     given.grow(400, generator())
@@ -185,7 +184,7 @@ def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay():
     wrong[0, 2, :3, 3] += 0.04 * wrong[0, 2, :3, 0]  # a fiftieth of the distance
 
     def posed(c2w):
-        return replace(true, cameras=replace(true.cameras, c2w=c2w))
+        return true.replace(cameras=true.cameras.replace(c2w=c2w))
 
     def found(seconds, *adjust):
         return refined(posed(wrong), seconds, adjust=adjust).cameras.c2w
@@ -203,7 +202,7 @@ def test_a_darker_photo_leaves_the_gaussians_alone():
     true = photos(3)
     dark = true.images * torch.tensor([1.0, 0.6, 1])[:, None, None, None]
     plain, adjusted = (
-        refined(replace(true, images=dark), 120, adjust=adjust).gaussians
+        refined(true.replace(images=dark), 120, adjust=adjust).gaussians
         for adjust in ((), ("exposure",))
     )
     assert mean_psnr(adjusted, true) > mean_psnr(plain, true) + 0.5
@@ -225,7 +224,7 @@ def test_harmonics_grow_with_time():
     assert seen == sorted(seen)
     assert {*seen} == {0, 3, 8}
     # a start with harmonics of its own keeps them all
-    given = replace(cloud(30), sh=torch.zeros(1, 30, 3, 3))
+    given = cloud(30).replace(sh=torch.zeros(1, 30, 3, 3))
     assert watched(given, 5) == given.sh.shape
 
 
@@ -233,7 +232,7 @@ def test_what_masks_leave_out_is_black():
     views = photos(2)
     masks = torch.zeros(1, 2, 1, 24, 24)
     masks[..., :12] = 1
-    found = masked(replace(views, masks=masks)).images
+    found = masked(views.replace(masks=masks)).images
     assert_equal(found[..., :12], views.images[..., :12])
     assert not found[..., 12:].any()
     must_refuse("--masks", masked, views)
@@ -248,13 +247,13 @@ def test_surroundings_hide_what_is_behind_them():
     black, white = (render(found, views.cameras, torch.full((3,), level)) for level in (0.0, 1.0))
     assert black.alpha.min() > 0.99
     assert torch.allclose(black.rgb, white.rgb, 0, 0.01)
-    empty = surrounded(replace(cloud(60), opacities=torch.zeros(1, 60)), views, color)
+    empty = surrounded(cloud(60).replace(opacities=torch.zeros(1, 60)), views, color)
     seen = render(empty, views.cameras, torch.zeros(3))
     assert torch.allclose(seen.rgb[0, 0, :, 12, 12], torch.tensor(color), 0, 0.01)
 
 
 def coloured():
-    return replace(cloud(60), sh=0.3 * torch.randn(1, 60, 3, 3))
+    return cloud(60).replace(sh=0.3 * torch.randn(1, 60, 3, 3))
 
 
 def test_one_photo_is_rendered_as_with_harmonics():
@@ -263,7 +262,7 @@ def test_one_photo_is_rendered_as_with_harmonics():
     found = plain(gaussians, cameras)
     assert found.sh is None
     full, same, flat = (
-        RENDERER(g, cameras).rgb for g in (gaussians, found, replace(gaussians, sh=None))
+        RENDERER(g, cameras).rgb for g in (gaussians, found, gaussians.replace(sh=None))
     )
     assert torch.allclose(same, full, 0, 1e-4)
     assert (flat - full).abs().max() > 0.05
@@ -275,7 +274,7 @@ def test_photos_that_do_not_show_a_gaussian_do_not_count():
     away = cameras.c2w.clone()
     away[:, 1, :3, [0, 2]] *= -1
     one = plain(gaussians, cameras[:, :1]).colors
-    alike = (plain(gaussians, replace(cameras, c2w=away)).colors - one).abs().amax(-1) < 1e-5
+    alike = (plain(gaussians, cameras.replace(c2w=away)).colors - one).abs().amax(-1) < 1e-5
     assert alike.float().mean() > 0.95  # but for those that no photo shows
     assert not torch.allclose(plain(gaussians, cameras).colors, one, atol=0.01)
 
