@@ -43,14 +43,14 @@ def photo_set(folder, images, c2w, intrinsics, name="{}.png"):
     return PhotoSet(files, c2w, intrinsics, images[0].shape[:2])
 
 
-def synthetic(folder, count=6, size=(30, 40), seed=0, suffix="png"):
+def synthetic(folder, count=6, size=(30, 40), seed=0):
     """Photos of noise at random poses."""
     rng = np.random.default_rng(seed)
     images = rng.integers(0, 256, (count, *size, 3), dtype=np.uint8)
     c2w = np.tile(np.eye(4), (count, 1, 1))
     c2w[:, :3, :3] = Rotation.random(count, rng).as_matrix()
     c2w[:, :3, 3] = rng.normal(size=(count, 3)) * 5
-    return photo_set(folder, images, c2w, (50.0, 52.0, 19.0, 16.0), f"view_{{:03d}}.{suffix}")
+    return photo_set(folder, images, c2w, (50.0, 52.0, 19.0, 16.0), "view_{:03d}.png")
 
 
 def opened(path, size=(30, 40), source=PhotosSource, **options):
@@ -185,9 +185,9 @@ def write_llff(folder, photos):
     """Rows of (down, right, back, centre, (h, w, f)) as a (3, 5) matrix, then near and far."""
     copied(photos, folder / "images")
     right, down, ahead, centre = (photos.c2w[:, :3, i] for i in range(4))
-    hwf = np.tile([*photos.size, photos.intrinsics[0]], (len(photos.files), 1))
+    hwf = [[*photos.size, photos.intrinsics[0]]] * len(photos.files)
     matrix = np.stack([down, right, -ahead, centre, hwf], -1)
-    bounds = np.tile([0.5, 20.0], (len(photos.files), 1))
+    bounds = [[0.5, 20.0]] * len(photos.files)
     np.save(folder / "poses_bounds.npy", np.hstack([matrix.reshape(-1, 15), bounds]))
     return folder
 

@@ -72,8 +72,8 @@ def test_rows_and_images_must_agree(tmp_path, photos):
 
 def test_files_that_are_no_rows_are_told(tmp_path, photos):
     file = write_llff(tmp_path, photos) / "poses_bounds.npy"
-    objects = np.array([[None] * 17])
-    narrow = np.tile([1.0] * 16 + [0.5], (6, 1))
+    objects = [[None] * 17]
+    narrow = [[1.0] * 16 + [0.5]] * 6
     for content in (np.zeros((3, 15)), objects, narrow, b"hello"):
         file.write_bytes(content) if isinstance(content, bytes) else np.save(file, content)
         must_refuse(r"poses_bounds\.npy", read, tmp_path)

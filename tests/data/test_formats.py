@@ -37,7 +37,7 @@ def _warnings_are_told_again():
 def assert_same(read, photos):
     assert read.cameras.c2w.dtype == torch.float64
     assert_allclose(read.cameras.c2w, photos.c2w, rtol=0, atol=1e-9)
-    expected = np.tile(photos.intrinsics, (len(photos.files), 1))
+    expected = [photos.intrinsics] * len(photos.files)
     assert_allclose(read.cameras.intrinsics, expected, rtol=0, atol=1e-9)
     for i, file in enumerate(photos.files):
         assert Path(read.frame_name(i)).stem == file.stem

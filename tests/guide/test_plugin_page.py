@@ -58,8 +58,8 @@ def test_the_source_keeps_its_contract(package, tmp_path):
         folder.mkdir()
         for frame in range(9):
             Image.effect_noise((40, 24), 9 * frame).save(folder / f"{frame}.png")
-        np.save(folder / "poses.npy", np.tile(np.eye(4), (9, 1, 1)))
-        np.save(folder / "lens.npy", np.array([30.0, 30.0, 20.0, 12.0]))
+        np.save(folder / "poses.npy", [np.eye(4)] * 9)
+        np.save(folder / "lens.npy", [30.0, 30.0, 20.0, 12.0])
     assert not contract_failures(Case(package.ScanSource.Config(path=str(tmp_path))))
 
 

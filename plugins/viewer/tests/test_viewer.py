@@ -68,7 +68,7 @@ def test_a_query_is_picked_and_followed_through_the_layers(server, panel):
         support = panel.scene.support(layer)
         assert ball.position == pytest.approx(support.centers[0, 3].numpy(), abs=1e-4)
         # the unit ball, scaled, turned and moved, has the semi-axes of the support as columns
-        axes = SO3(np.array(ball.wxyz)).as_matrix() * np.array(ball.scale)
+        axes = SO3(np.array(ball.wxyz)).as_matrix() * ball.scale
         assert axes == pytest.approx(support.axes[0, 3].numpy(), abs=1e-4)
     assert nodes(panel) == BASE | {"anchors", "support"}
     assert not any(picture.visible for picture in panel.pictures.values())

@@ -90,7 +90,7 @@ def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera):
     points = torch.tensor([[0.0, 0.0], [0.3, -0.2], [-0.5, 0.4], [0.01, 0.6]]).double()
     expected = lens.img_from_cam(np.column_stack([points, np.ones(4)]))
     bent = of_text.lens.distorted(points).numpy()
-    focal = np.array([lens.focal_length_x, lens.focal_length_y])
+    focal = lens.focal_length_x, lens.focal_length_y
     assert_allclose(bent * focal + [41, 29], expected, atol=1e-9)
 
 

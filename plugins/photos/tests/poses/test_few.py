@@ -20,7 +20,7 @@ from qgs.data.photos import read_listing
 
 SIZE = (640, 480)
 FOCAL = 700.0
-MOTION = np.array([-1.2, 0.1, 0.3])
+MOTION = (-1.2, 0.1, 0.3)
 
 
 def turned(degrees):
@@ -98,11 +98,11 @@ def test_two_views_give_pose_focal_length_and_points(found, focals):
 @pytest.mark.parametrize(
     ("pixels", "reason"),
     [
-        (seen_twice(8, np.zeros(3)), "turn on the spot"),
-        (seen_twice(0, np.zeros(3)), "turn on the spot"),
-        (seen_twice(8, np.array([-1, 0, 0]), wrong=0.97), "enough matches"),
-        (seen_twice(8, np.array([-1, 0, 0]), depths=(6, 6)), "one flat thing"),
-        (seen_twice(12, MOTION) * np.array([[[1]], [[0.6]]]), "different lenses"),
+        (seen_twice(8, 0), "turn on the spot"),
+        (seen_twice(0, 0), "turn on the spot"),
+        (seen_twice(8, (-1, 0, 0), wrong=0.97), "enough matches"),
+        (seen_twice(8, (-1, 0, 0), depths=(6, 6)), "one flat thing"),
+        (seen_twice(12, MOTION) * [[[1]], [[0.6]]], "different lenses"),
     ],
 )
 def test_two_photos_without_a_pose_are_refused(found, pixels, reason):
