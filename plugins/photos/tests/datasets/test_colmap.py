@@ -120,18 +120,18 @@ COUNTS = {"images.bin": b"\1", "cameras.bin": b"\0"}
 """Fewer than there are."""
 UNKNOWN_CAMERA = struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)
 BROKEN = """
-cameras.txt: 7 PINHOLE 4_0 30 50 52 19 16/
-cameras.txt: 7 PINHOLE 40 30 50 52 19 16/7 PINHOLE 40 30 50 52 19 16/
-cameras.txt: 7 FISHEYE624 40 30 1/
-images.txt: 1 1 0 0 0 0 0 1 a.png//
-images.txt: 1 1 0 0 0 0 0 1 7 a.png//1 1 0 0 0 0 0 1 7 a.png//
-images.txt: # Number of images: 3/1 1 0 0 0 0 0 1 7 view_000.png//2 1 0 0 0 0 0 1 7 view_001.png//
-images.txt: 1 1 0 0 0 0 0 1 7 view_000.png/1 2 3/2 1 0 0 0 0 0 1 7 view_001.png/1 2 3/3 1 0/
-images.txt: 1 1 0 0 0 0 0 1 7 view_000.png//2 1 0 0 0 0 0 1 7 view_001.png//3 .6 .8/
-images.txt: 1 1 0 0 0 zero 0 1 7 a.png//
-images.txt: 1 0 0 0 0 0 0 1 7 a.png//
-images.txt: 1 1 0 0 0 1_000 0 1 7 a.png//
-images.txt: 1 1 0 0 0 0 0 1 8 a.png//
+cameras.txt | 7 PINHOLE 4_0 30 50 52 19 16/
+cameras.txt | 7 PINHOLE 40 30 50 52 19 16/7 PINHOLE 40 30 50 52 19 16/
+cameras.txt | 7 FISHEYE624 40 30 1/
+images.txt | 1 1 0 0 0 0 0 1 a.png//
+images.txt | 1 1 0 0 0 0 0 1 7 a.png//1 1 0 0 0 0 0 1 7 a.png//
+images.txt | # Number of images: 3/1 1 0 0 0 0 0 1 7 view_000.png//2 1 0 0 0 0 0 1 7 view_001.png//
+images.txt | 1 1 0 0 0 0 0 1 7 view_000.png/1 2 3/2 1 0 0 0 0 0 1 7 view_001.png/1 2 3/3 1 0/
+images.txt | 1 1 0 0 0 0 0 1 7 view_000.png//2 1 0 0 0 0 0 1 7 view_001.png//3 .6 .8/
+images.txt | 1 1 0 0 0 zero 0 1 7 a.png//
+images.txt | 1 0 0 0 0 0 0 1 7 a.png//
+images.txt | 1 1 0 0 0 1_000 0 1 7 a.png//
+images.txt | 1 1 0 0 0 0 0 1 8 a.png//
 """
 """Lines of a file, each ended by a slash.
 
@@ -145,9 +145,7 @@ def test_broken_models_are_told(tmp_path, photos):
     folders = {kind: write_colmap(tmp_path / kind, photos, kind) for kind in KINDS}
     whole = folders["binary"] / "sparse/0"
     broken = [("cameras.bin", UNKNOWN_CAMERA)]
-    for line in BROKEN.strip().splitlines():
-        name, lines = line.split(": ", 1)
-        broken.append((name, lines.replace("/", "\n").encode()))
+    broken += [(name, lines.replace("/", "\n").encode()) for name, lines in rows(BROKEN)]
     broken += [(n, (whole / n).read_bytes()[:kept]) for n, parts in CUT.items() for kept in parts]
     broken += [(n, count + (whole / n).read_bytes()[1:]) for n, count in COUNTS.items()]
     for name, content in broken:

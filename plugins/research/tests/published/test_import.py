@@ -1,6 +1,5 @@
 """Published weights become checkpoints: every tensor accounted for, or nothing is written."""
 
-import os
 from unittest.mock import Mock
 
 import torch
@@ -11,7 +10,7 @@ from qgs_research.published.importing import import_weights
 from qgs_research.published.layouts import PublishedError, fitting_recipe, names_of
 from qgs_research.published.tokengs import TOKENGS, TOKENGS_2026_6
 from safetensors.torch import load_file, save_file
-from tables import assert_equal, must_refuse
+from tables import assert_equal, must_refuse, names_in
 
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
@@ -152,7 +151,7 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path):
         broken[3, 5] = value
         for tokens in (broken, broken.nan_to_num(0, 0).long()):
             must_refuse("gs_tokens", imported, tmp_path, TOKENGS_A | {"gs_tokens": tokens})
-    assert os.listdir(tmp_path) == ["w.safetensors"]
+    assert names_in(tmp_path) == {"w.safetensors"}
 
 
 def test_nothing_is_overwritten(tmp_path):
@@ -166,7 +165,7 @@ def test_no_checkpoint_stays_without_its_recipe(tmp_path, monkeypatch):
     full = Mock(side_effect=OSError("no space left"))
     monkeypatch.setattr("qgs_research.published.importing.write_text", full)
     must_refuse("no space left", imported, tmp_path, TOKENGS_A, kind=OSError)
-    assert os.listdir(tmp_path) == ["w.safetensors"]
+    assert names_in(tmp_path) == {"w.safetensors"}
 
 
 def test_one_prefix_of_all_names_is_removed(tmp_path):

@@ -9,6 +9,7 @@ from qgs_dev.inputs import inputs_of
 from qgs_research.published.mvsplat import DEPTHSPLAT, MVSPLAT
 from qgs_research.published.weight_layout import LayoutError
 from qgs_zoo.mvsplat import DecayedSupervision, DepthError, DepthSplatEncoder
+from tables import rows
 
 from qgs.contracts import MetricInput
 from qgs.recipe import resolve
@@ -95,7 +96,7 @@ def test_the_published_models(name):
     recipe = resolve(f"{name}.yaml")
     model = recipe.build_model("meta")
     state = model.state_dict()
-    sizes = dict(line.split() for line in PUBLISHED[name].strip().splitlines())
+    sizes = dict(rows(PUBLISHED[name], None))
     assert len(state) == int(sizes.pop("tensors"))
     assert sum(x.numel() for x in state.values()) == int(sizes.pop("all"))
     released = getattr(model.encoder, "network", model.encoder)
