@@ -25,10 +25,12 @@ def test_settings_search_where_nothing_is_known():
 
 def test_further_photos_lie_between_and_are_not_compared_with():
     walk = Walk()
-    assert scale.further_photos(walk, (0, 4), (2,)) == (1, 3)
-    walk.held_out = (1, 2)
-    assert scale.further_photos(walk, (0, 4), ()) == (3, 5)
-    assert scale.further_photos(walk, (0, 4), (3, 5)) == ()
+    for walk.held_out, compared, further in (
+        ((), (2,), (1, 3)),
+        ((1, 2), (), (3, 5)),
+        ((1, 2), (3, 5), ()),
+    ):
+        assert scale.further_photos(walk, (0, 4), compared) == further
 
 
 def searched(*frames):
