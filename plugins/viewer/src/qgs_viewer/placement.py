@@ -8,7 +8,7 @@ from torch import Tensor
 
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.precision import full_precision
-from qgs.types import Cameras, Gaussians
+from qgs.types import Cameras, Gaussians, Size
 
 # Blending weight on a clicked ray below which a Gaussian is not hit.
 LEAST_WEIGHT = 0.02
@@ -130,13 +130,13 @@ def on_photo(cameras: Cameras, pixels: Tensor, depth: float | Tensor) -> Tensor:
     return local @ cameras.c2w[:, :3, :3].to(local).mT + cameras.c2w[:, None, :3, 3].to(local)
 
 
-def corners(size: tuple[int, int]) -> Tensor:
+def corners(size: Size) -> Tensor:
     """Return the corners (4, 2) of a picture in pixels (x, y), clockwise from (0, 0)."""
     height, width = size
     return torch.tensor([[0, 0], [width, 0], [width, height], [0, height]]).double()
 
 
-def patch_centers(grid: tuple[int, int, int], size: tuple[int, int]) -> Tensor:
+def patch_centers(grid: tuple[int, int, int], size: Size) -> Tensor:
     """Return the centres of all patches of one photo in pixels (x, y): (rows * columns, 2).
 
     grid: numbers of photos, of patch rows and of patch columns. size: (H, W) of a photo in pixels.

@@ -66,9 +66,7 @@ def sources(format: str = "auto") -> dict[str, type[Component]]:
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}
 
 
-def opened_source(
-    path: str, options: Sequence[str], image_size: tuple[int, int] | None
-) -> SceneSource:
+def opened_source(path: str, options: Sequence[str], image_size: Size | None) -> SceneSource:
     """Return the source of the scenes at `path`.
 
     path: data set or recipe. options: settings of the source, as KEY=VALUE.

@@ -20,7 +20,7 @@ from qgs.files import replacing
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians
+from qgs.types import Cameras, Gaussians, Size
 from qgs_photos.poses.paths import KINDS, focal_length, path_of, read_path
 from qgs_photos.record import GAUSSIANS, has_record, read_record
 from qgs_photos.viewing import VIEWER, in_own_world
@@ -104,7 +104,7 @@ def _write_webp(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
 
 
 def cameras_of(
-    scene: FilmScene, path: str, size: tuple[int, int] | None, frames: int, fov: float | None
+    scene: FilmScene, path: str, size: Size | None, frames: int, fov: float | None
 ) -> Cameras:
     """Return the cameras (1, T) of a camera path of T frames.
 
@@ -121,14 +121,14 @@ def cameras_of(
     return in_world(scene.world, Cameras(c2w, intrinsics, size))[None]
 
 
-def _film_size(photos: tuple[int, int]) -> tuple[int, int]:
+def _film_size(photos: Size) -> Size:
     """Return even (H, W) of a video of `photos` (H, W); the shorter side is at least _HEIGHT."""
     factor = max(_HEIGHT / min(photos), 1.0)
     height, width = (round(side * factor / 2) * 2 for side in photos)
     return height, width
 
 
-def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
+def lenses(path: Cameras, size: Size, fov: float | None) -> Tensor:
     """Return intrinsics (1, T, 4) for pictures of `size` (H, W), with centred principal points.
 
     fov: vertical angle of view in degrees; None keeps the angle of `path` along the shorter side.

@@ -16,7 +16,7 @@ from qgs.data.photos.nerfstudio import read_transforms
 from qgs.data.photos.reader import PhotoFrame, pose_problems
 from qgs.geometry.poses import look_at, mean_camera
 from qgs.reconstruction.saving import SWAY, orbit
-from qgs.types import Cameras
+from qgs.types import Cameras, Size
 
 KINDS = ("orbit", "spiral", "walk")
 # Signs of a pose's columns.
@@ -65,7 +65,7 @@ def walk(c2w: Tensor, frames: int) -> Tensor:
     return look_at(centre, forward, down)
 
 
-def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Tensor, Tensor]:
+def read_path(file: Path, size: Size, fov: float | None) -> tuple[Tensor, Tensor]:
     """Read a camera path: camera-to-world (T, 4, 4), OpenCV axes, and intrinsics (T, 4), float64.
 
     file: a camera path of nerfstudio's viewer, or a transforms file. size: (H, W) of the video, for
@@ -93,13 +93,13 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
     return torch.from_numpy(poses), torch.tensor(lenses, dtype=torch.float64)
 
 
-def _keyframe(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[np.ndarray, float]:
+def _keyframe(entry: Mapping[str, Any], size: Size) -> tuple[np.ndarray, float]:
     """Return the OpenCV camera-to-world pose (4, 4) and fy in pixels of nerfstudio's keyframe."""
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
     return pose * _OPENGL, focal_length(float(entry.get("fov") or 50.0), size[0])
 
 
-def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]:
+def _photo(frame: PhotoFrame, size: Size) -> tuple[np.ndarray, float]:
     """Return the pose (4, 4) of a photo of a transforms file, and its fy in pixels of `size`."""
     if frame.problems or frame.size is None:
         raise ValueError(
