@@ -3,7 +3,6 @@
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from typing import Any
 
 import torch
@@ -27,7 +26,7 @@ from qgs.metrics.images import Psnr, psnr
 from qgs_viewer.curves import curves_figure
 from qgs_viewer.drawing import Choice
 from qgs_viewer.look import enlarged
-from qgs_viewer.page import scene_html
+from qgs_viewer.page import scene_html, template
 from qgs_viewer.queries import (
     PARTS,
     DrawnQuery,
@@ -78,8 +77,7 @@ class Section:
     @property
     def words(self) -> Mapping[str, str]:
         """Texts of the section: `title`, `text`, and `empty`, which says why it has no pictures."""
-        file = files("qgs_viewer") / "template" / "sections.toml"
-        return tomllib.loads(file.read_text(encoding="utf-8"))[self.name]
+        return tomllib.loads(template("sections.toml"))[self.name]
 
 
 @dataclass(frozen=True)
