@@ -24,10 +24,10 @@ CPU = torch.device("cpu")
 
 def test_bilinear_features_are_those_of_torch():
     maps = torch.randn(2, 72, 5).double()
-    place = torch.rand(2, 50, 2).double()
+    place = torch.rand(50, 2).double()
     view = torch.randint(3, (50,))
     images = maps.unflatten(1, GRID)[:, view].movedim(-1, 2).flatten(0, 1)
-    at = 2 * place.view(100, 1, 1, 2) - 1
+    at = 2 * place.repeat(2, 1)[:, None, None] - 1
     expected = F.grid_sample(images, at, padding_mode="border", align_corners=False)
     assert_close(sampled(maps, GRID, view, place), expected.view(2, 50, 5))
 
@@ -88,7 +88,7 @@ def within(pixels, at, side):
 def test_colours_are_means_of_squares():
     images = torch.rand(2, 3, 3, 16, 24).double()
     for x, y, side in ((15, 7, 2), (23, 15, 2), (1, 1, 2), (8.4, 8, 3), (14.7, 6.4, 3)):
-        place = torch.tensor([x / 24, y / 16]).double().expand(2, 3, 2)
+        place = torch.tensor([x / 24, y / 16]).double().expand(3, 2)
         found = colors_at(images, side, torch.arange(3), place)
         shares = within(16, y, side)[:, None] * within(24, x, side) / side**2
         assert_close(found, (images * shares).sum((-1, -2)), rtol=0, atol=1e-6)
@@ -121,7 +121,7 @@ def test_differences_are_those_of_each_sample_alone():
     c2w[0, 1, 0, 3] = 0.2
     ramps = torch.tensor([0.01, 0.02])[:, None, None, None] * (torch.arange(32) + 0.5)
     given = Views(ramps.double().expand(1, 2, 3, *WALL_SIZE), photos().cameras.replace(c2w=c2w))
-    place = torch.full((1, 2, 2), 0.5).double()
+    place = torch.full((2, 2), 0.5).double()
     error, _ = mismatch(given, torch.tensor([0, 1]), place, DEPTHS, 5.0, 3)
     at = 16 + 5 * cells(9, 3, place)[:, 0]
     shift = 30 * 0.2 / DEPTHS[:, None]
@@ -130,7 +130,7 @@ def test_differences_are_those_of_each_sample_alone():
 
 
 def test_depths_that_no_other_photo_sees_do_not_count():
-    corner = torch.tensor([[[0.02, 0.5]]]).double()  # the second camera stands right
+    corner = torch.tensor([[0.02, 0.5]]).double()  # the second camera stands right
     error, seen = mismatch(photos(), FIRST, corner, DEPTHS[:2] / 2, 2.0, 2)
     assert not seen.any()
     assert not error.any()

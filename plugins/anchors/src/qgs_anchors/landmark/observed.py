@@ -187,8 +187,7 @@ class ObservedQueries(Queries):
             # Several tokens of a tile start one query, so that it knows more than the centre.
             middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
             view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
-            place_BX2 = place_X2.expand(len(memory.features), -1, -1)
-            x_BXD = sampled(memory.features, memory.grid, view_X, place_BX2) + self.slots
+            x_BXD = sampled(memory.features, memory.grid, view_X, place_X2) + self.slots
             x_BND, nearness_BN1 = self._joined(*self._swept(x_BXD, views, view_X, place_X2))
         return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_N2, share_2))
 
@@ -210,10 +209,9 @@ class ObservedQueries(Queries):
         if self.config.sweep is None:
             return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
         nearness_D = torch.linspace(0, 1, self.config.sweep, device=x_BND.device)
-        place_BN2 = place_N2.expand(len(x_BND), -1, -1)
         side = self.config.window * side_of(len(view_N), views.cameras.shape[1], views.cameras.size)
         error_BND, seen_BND = mismatch(
-            views, view_N, place_BN2, self._depth(nearness_D), side, SAMPLES
+            views, view_N, place_N2, self._depth(nearness_D), side, SAMPLES
         )
         # These logits of depths are high where the photos agree.
         match_BND = -self.sharpness.exp() * torch.where(seen_BND, error_BND, self.unseen)
@@ -256,8 +254,7 @@ class ObservedQueries(Queries):
         config = self.config
         cameras = views.cameras
         z_BN1 = self._depth(nearness_BN1)
-        place_BN2 = place_N2.expand(len(z_BN1), -1, -1)
-        origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_BN2)
+        origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_N2)
         height, width = cameras.size
         side = side_of(len(view_N), cameras.shape[1], cameras.size)
         # A footprint of s pixels is s z / f wide at depth z.
@@ -281,9 +278,8 @@ class ObservedQueries(Queries):
         if config.cells is None:
             return anchors
         view_X, place_X2 = _divided(view_N, place_N2, share_2 * cells(config.cells, rows, share_2))
-        place_BX2 = place_X2.expand(len(z_BN1), -1, -1)
         # The colour of a cell is the mean over its area, which its Gaussian covers.
-        colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_BX2)
+        colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_X2)
         return anchors | {COLORS: colors.unflatten(1, (-1, config.cells))}
 
     def support(self, state: QueryState) -> SpatialSupport:

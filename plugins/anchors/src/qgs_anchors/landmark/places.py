@@ -140,7 +140,7 @@ def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
 
 
 def sampled(
-    maps_BMC: Tensor, grid: tuple[int, int, int], view_N: Tensor, place_BN2: Tensor
+    maps_BMC: Tensor, grid: tuple[int, int, int], view_N: Tensor, place_N2: Tensor
 ) -> Tensor:
     """Sample patch values at N points of photos, bilinearly between patch centres: (B, N, C).
 
@@ -148,22 +148,23 @@ def sampled(
     of the patches of `grid` (V, rows, columns). view: index (N,) of the photo of each point.
     """
     maps_BVChw = maps_BMC.unflatten(1, grid).movedim(-1, 2)
-    return bilinear(maps_BVChw, view_N, place_BN2[:, :, None])[..., 0].mT
+    return bilinear(maps_BVChw, view_N, place_N2[:, None])[..., 0].mT
 
 
-def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
+def bilinear(maps_BVCHW: Tensor, view_N: Tensor, places: Tensor) -> Tensor:
     """Sample the maps of photos bilinearly at N groups of X points, as (B, C, N, X).
 
-    maps: one map for each photo. view: index (N,) of the photo of each group. place: points (B, N,
-    X, 2), x and y from 0 to 1. Points outside a map get the values at its nearest edge.
+    maps: one map for each photo. view: index (N,) of the photo of each group. places: points (N, X,
+    2) of all scenes, or (B, N, X, 2), x and y from 0 to 1. Points outside a map get the values at
+    its nearest edge.
     """
     _, photos, _, height, width = maps_BVCHW.shape
     # All maps are stacked below each other: places stay half a pixel inside their own map.
-    edge_2 = constant([0.5 / width, 0.5 / height], place_BNX2)
-    x_BNX, y_BNX = place_BNX2.maximum(edge_2).minimum(1 - edge_2).unbind(-1)
-    y_BNX = (y_BNX + view_N[:, None]) / photos
+    edge_2 = constant([0.5 / width, 0.5 / height], places)
+    x_NX, y_NX = places.maximum(edge_2).minimum(1 - edge_2).unbind(-1)
+    y_NX = (y_NX + view_N[:, None]) / photos
     column = maps_BVCHW.transpose(1, 2).flatten(2, 3)
-    grid = torch.stack([x_BNX, y_BNX], -1)
+    grid = torch.stack([x_NX, y_NX], -1).expand(len(column), *places.shape[-3:])
     # Half precision is too coarse for places, and float64 features keep their precision.
     kind = torch.promote_types(column.dtype, grid.dtype)
     found = F.grid_sample(column.to(kind), 2 * grid.to(kind) - 1, align_corners=False)
@@ -171,20 +172,20 @@ def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
 
 
 @full_precision
-def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tensor) -> Tensor:
+def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_N2: Tensor) -> Tensor:
     """Return mean RGB (B, N, 3) over squares of `side` pixels around points of photos.
 
     There is one sample per pixel, so the mean is exact if the side is a whole number. Beyond an
     edge of the photo, the pixels of the edge are repeated.
     """
     height, width = images_BV3HW.shape[-2:]
-    place_BN2 = place_BN2.to(images_BV3HW)
+    place_N2 = place_N2.to(images_BV3HW)
     samples = max(1, math.ceil(side - EPS))
-    step_P2 = side * cells(samples**2, samples, place_BN2) / constant([width, height], place_BN2)
-    return bilinear(images_BV3HW, view_N, place_BN2[:, :, None] + step_P2).mean(-1).mT
+    step_P2 = side * cells(samples**2, samples, place_N2) / constant([width, height], place_N2)
+    return bilinear(images_BV3HW, view_N, place_N2[:, None] + step_P2).mean(-1).mT
 
 
-def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor, Tensor]:
+def rays_at(cameras: Cameras, view_N: Tensor, place_N2: Tensor) -> tuple[Tensor, Tensor]:
     """Return world-frame origins and directions, each (B, N, 3), of rays through points of photos.
 
     Directions have z = 1 in the frame of their camera.
@@ -192,7 +193,7 @@ def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor
     height, width = cameras.size
     c2w_BN44 = cameras.c2w[:, view_N]
     lens_BN4 = cameras.intrinsics[:, view_N]
-    pixel_BN2 = place_BN2.to(lens_BN4) * constant([width, height], lens_BN4)
-    slope_BN2 = (pixel_BN2 - lens_BN4[..., 2:]) / lens_BN4[..., :2]
+    pixel_N2 = place_N2.to(lens_BN4) * constant([width, height], lens_BN4)
+    slope_BN2 = (pixel_N2 - lens_BN4[..., 2:]) / lens_BN4[..., :2]
     local_BN3 = F.pad(slope_BN2, (0, 1), value=1.0)
     return c2w_BN44[..., :3, 3], torch.einsum("bnij,bnj->bni", c2w_BN44[..., :3, :3], local_BN3)

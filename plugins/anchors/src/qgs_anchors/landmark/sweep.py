@@ -16,7 +16,7 @@ LEAST_DEPTH = 1e-3
 
 @full_precision
 def mismatch(
-    views: Views, view_N: Tensor, place_BN2: Tensor, depth_D: Tensor, side: float, points: int
+    views: Views, view_N: Tensor, place_N2: Tensor, depth_D: Tensor, side: float, points: int
 ) -> tuple[Tensor, Tensor]:
     """Compare windows around points of photos with the other photos, at D depths.
 
@@ -27,18 +27,18 @@ def mismatch(
     True. Cameras and photos get gradients.
     """
     height, width = views.cameras.size
-    place_BN2 = place_BN2.to(views.images)
+    place_N2 = place_N2.to(views.images)
     # A window, not a pixel: a single colour matches too many places.
-    step_P2 = side * cells(points**2, points, place_BN2) / constant([width, height], place_BN2)
-    place_BNP2 = place_BN2[:, :, None] + step_P2
-    color_B3NP = bilinear(views.images, view_N, place_BNP2)
+    step_P2 = side * cells(points**2, points, place_N2) / constant([width, height], place_N2)
+    place_NP2 = place_N2[:, None] + step_P2
+    color_B3NP = bilinear(views.images, view_N, place_NP2)
     # All other photos at once: torch.compile would make a graph for each length of a loop.
     photos = views.cameras.shape[1]
     count = len(view_N)
     other_X = (view_N + torch.arange(1, photos, device=view_N.device)[:, None]).flatten() % photos
     view_X = view_N.repeat(photos - 1)
-    place_BXP2 = place_BNP2.repeat(1, photos - 1, 1, 1)
-    at_BXDP2, seen_BXDP = reprojected(views.cameras, view_X, other_X, place_BXP2, depth_D)
+    place_XP2 = place_NP2.repeat(photos - 1, 1, 1)
+    at_BXDP2, seen_BXDP = reprojected(views.cameras, view_X, other_X, place_XP2, depth_D)
     found_B3XDP = bilinear(views.images, other_X, at_BXDP2.flatten(2, 3))
     found_B3ANDP = found_B3XDP.unflatten(3, (-1, points**2)).unflatten(2, (photos - 1, count))
     # Samples outside of the other photo do not count.
@@ -52,7 +52,7 @@ def mismatch(
 
 
 def reprojected(
-    cameras: Cameras, view_N: Tensor, other_N: Tensor, place_BNP2: Tensor, depth_D: Tensor
+    cameras: Cameras, view_N: Tensor, other_N: Tensor, place_NP2: Tensor, depth_D: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Project P points of a photo, each at D depths, into a second photo, for N pairs of photos.
 
@@ -61,9 +61,9 @@ def reprojected(
     (B, N, D, P, 2), and whether each is in front of the camera and inside the photo.
     """
     height, width = cameras.size
-    points = place_BNP2.shape[2]
+    points = place_NP2.shape[1]
     view_X = view_N.repeat_interleave(points)
-    origin_BX3, direction_BX3 = rays_at(cameras, view_X, place_BNP2.flatten(1, 2))
+    origin_BX3, direction_BX3 = rays_at(cameras, view_X, place_NP2.flatten(0, 1))
     origin_BN3 = origin_BX3[:, ::points]
     direction_BNP3 = direction_BX3.unflatten(1, (-1, points))
     c2w_BN44 = cameras.c2w[:, other_N]
