@@ -255,7 +255,6 @@ class ObservedQueries(Queries):
         cameras = views.cameras
         z_BN1 = self._depth(nearness_BN1)
         origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_N2)
-        height, width = cameras.size
         side = side_of(len(view_N), cameras.shape[1], cameras.size)
         # A footprint of s pixels is s z / f wide at depth z.
         focal_BN1 = cameras.intrinsics[:, view_N, :2].mean(-1, keepdim=True)
@@ -266,7 +265,7 @@ class ObservedQueries(Queries):
             fill = rows_in_square if square else rows_in_tile
             rows = fill(config.cells)
         shape_3 = F.pad(
-            share_2.to(z_BN1) * constant([width, height], z_BN1) / side, (0, 1), value=rows
+            share_2.to(z_BN1) * constant(cameras.size[::-1], z_BN1) / side, (0, 1), value=rows
         )
         anchors = {
             # The direction has z = 1 in the camera, so z is a depth, not a distance.

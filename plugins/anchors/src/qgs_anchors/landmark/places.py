@@ -85,7 +85,7 @@ def spread(
 
 def _square(count: int, views: int, size: Size, like: Tensor) -> Tensor:
     """Return the side `side_of` of a square as fractions (2,) of a photo's width and height."""
-    return side_of(count, views, size) / constant([size[1], size[0]], like)
+    return side_of(count, views, size) / constant(size[::-1], like)
 
 
 def side_of(count: int, views: int, size: Size) -> float:
@@ -178,11 +178,16 @@ def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_N2: Tenso
     There is one sample per pixel, so the mean is exact if the side is a whole number. Beyond an
     edge of the photo, the pixels of the edge are repeated.
     """
+    places_NP2 = window(place_N2, images_BV3HW, side, max(1, math.ceil(side - EPS)))
+    return bilinear(images_BV3HW, view_N, places_NP2).mean(-1).mT
+
+
+def window(place_N2: Tensor, images_BV3HW: Tensor, side: float, samples: int) -> Tensor:
+    """Return P = samples * samples points (N, P, 2) of squares of `side` pixels around N points."""
     height, width = images_BV3HW.shape[-2:]
     place_N2 = place_N2.to(images_BV3HW)
-    samples = max(1, math.ceil(side - EPS))
     step_P2 = side * cells(samples**2, samples, place_N2) / constant([width, height], place_N2)
-    return bilinear(images_BV3HW, view_N, place_N2[:, None] + step_P2).mean(-1).mT
+    return place_N2[:, None] + step_P2
 
 
 def rays_at(cameras: Cameras, view_N: Tensor, place_N2: Tensor) -> tuple[Tensor, Tensor]:
@@ -190,10 +195,9 @@ def rays_at(cameras: Cameras, view_N: Tensor, place_N2: Tensor) -> tuple[Tensor,
 
     Directions have z = 1 in the frame of their camera.
     """
-    height, width = cameras.size
     c2w_BN44 = cameras.c2w[:, view_N]
     lens_BN4 = cameras.intrinsics[:, view_N]
-    pixel_N2 = place_N2.to(lens_BN4) * constant([width, height], lens_BN4)
+    pixel_N2 = place_N2.to(lens_BN4) * constant(cameras.size[::-1], lens_BN4)
     slope_BN2 = (pixel_N2 - lens_BN4[..., 2:]) / lens_BN4[..., :2]
     local_BN3 = F.pad(slope_BN2, (0, 1), value=1.0)
     return c2w_BN44[..., :3, 3], torch.einsum("bnij,bnj->bni", c2w_BN44[..., :3, :3], local_BN3)

@@ -6,7 +6,7 @@ from torch import Tensor
 from qgs.geometry.constants import constant
 from qgs.precision import full_precision
 from qgs.types import Cameras, Views
-from qgs_anchors.landmark.places import bilinear, cells, rays_at
+from qgs_anchors.landmark.places import bilinear, rays_at, window
 
 LEAST_SEEN = 0.5
 """Smallest share of a window's samples that another photo must see to count in `mismatch`."""
@@ -26,11 +26,8 @@ def mismatch(
     that depth. If no photo does, the difference is 0 and the bool False; otherwise the bool is
     True. Cameras and photos get gradients.
     """
-    height, width = views.cameras.size
-    place_N2 = place_N2.to(views.images)
     # A window, not a pixel: a single colour matches too many places.
-    step_P2 = side * cells(points**2, points, place_N2) / constant([width, height], place_N2)
-    place_NP2 = place_N2[:, None] + step_P2
+    place_NP2 = window(place_N2, views.images, side, points)
     color_B3NP = bilinear(views.images, view_N, place_NP2)
     # All other photos at once: torch.compile would make a graph for each length of a loop.
     photos = views.cameras.shape[1]
@@ -60,7 +57,6 @@ def reprojected(
     points, divided by the photo's width and height. Returns positions in the second photo
     (B, N, D, P, 2), and whether each is in front of the camera and inside the photo.
     """
-    height, width = cameras.size
     points = place_NP2.shape[1]
     view_X = view_N.repeat_interleave(points)
     origin_BX3, direction_BX3 = rays_at(cameras, view_X, place_NP2.flatten(0, 1))
@@ -76,7 +72,7 @@ def reprojected(
     ahead_BNDP = local[..., 2] * depth_D[:, None] > LEAST_DEPTH
     slope = local[..., :2] / local[..., 2:].clamp_min(LEAST_DEPTH / depth_D.max())
     focal_BN2, middle_BN2 = lens_BN4[:, :, None, None].split(2, -1)
-    place_BNDP2 = (slope * focal_BN2 + middle_BN2) / constant([width, height], slope)
+    place_BNDP2 = (slope * focal_BN2 + middle_BN2) / constant(cameras.size[::-1], slope)
     # Outside of a photo, sampling would return colours of its edge.
     inside_BNDP = ((place_BNDP2 > 0) & (place_BNDP2 < 1)).all(-1)
     return place_BNDP2, ahead_BNDP & inside_BNDP
