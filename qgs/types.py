@@ -23,6 +23,8 @@ from qgs.containers import TensorContainer, check_shapes, concatenated, map_tens
 
 Size: TypeAlias = tuple[int, int]
 """Height and width in pixels."""
+World: TypeAlias = tuple[Tensor, Tensor]
+"""Reference pose (4, 4) and 0-d scale of a coordinate frame, see `qgs.data.samples.own_world`."""
 
 
 def _check_unit_images(views: Any) -> None:

@@ -26,7 +26,7 @@ from qgs.geometry.poses import (
     relative_to,
     scaled,
 )
-from qgs.types import Cameras, Views
+from qgs.types import Cameras, Views, World
 from qgs.wording import listed, numbered, warn_once
 
 
@@ -43,7 +43,7 @@ class Sample:
     targets: Views
     input_frames: Frames
     target_frames: Frames
-    world: tuple[Tensor, Tensor]
+    world: World
     names: Mapping[int, str] = field(default_factory=dict)
 
     def short_label(self, frame: int) -> str:
@@ -140,9 +140,7 @@ def with_noise(
     return replace(cameras, c2w=off)
 
 
-def views_in(
-    world: tuple[Tensor, Tensor], scene: Scene, frames: Frames, depths: bool = False
-) -> Views:
+def views_in(world: World, scene: Scene, frames: Frames, depths: bool = False) -> Views:
     """Read F frames as float32 views (1, F) in the coordinate frame `world`, from `own_world`.
 
     Times are scaled to [0, 1]. depths: read depth maps if the scene has them.
@@ -162,7 +160,7 @@ def views_in(
     )
 
 
-def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Cameras:
+def cameras_in(world: World, scene: Scene, frames: Frames) -> Cameras:
     """Return cameras (1, F) of F frames in the coordinate frame `world`, from `own_world`.
 
     No image is decoded.
@@ -170,7 +168,7 @@ def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Ca
     return in_world(world, scene.cameras[list(frames)])[None]
 
 
-def in_world(world: tuple[Tensor, Tensor], cameras: Cameras) -> Cameras:
+def in_world(world: World, cameras: Cameras) -> Cameras:
     """Return a scene's cameras, (V,) or (B, V), as float32 in the coordinate frame `world`.
 
     world: the result of `own_world`.
@@ -187,7 +185,7 @@ def from_0_to_1(times: Tensor) -> Tensor:
     return (times - first) / (last - first) if last > first else torch.zeros_like(times)
 
 
-def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[Tensor, Tensor]:
+def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> World:
     """Return the model's coordinate frame for given inputs: reference pose (4, 4) and 0-d scale.
 
     A point p in this frame is the point reference @ (p / scale) of the scene. With `scale: auto`,

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians
+from qgs.types import Cameras, Gaussians, World
 
 GAUSSIANS = "gaussians.ply"
 CAMERAS = "cameras.json"
@@ -34,7 +33,7 @@ class Record:
     scene: str
     model: str
     tuning: Mapping[str, Any] | None
-    world: tuple[Tensor, Tensor]
+    world: World
     inputs: tuple[int, ...]
     compared: tuple[int, ...]
     photos: Mapping[int, str]

@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.models import CHECKPOINT
@@ -33,7 +32,7 @@ from qgs.reconstruction.scenes import (
     named_scene,
     read_photos,
 )
-from qgs.types import Cameras, Views
+from qgs.types import Cameras, Views, World
 from qgs.wording import listed, one_line
 from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
@@ -95,7 +94,7 @@ class ModelSource:
         return [*map(self.scene.label, range(len(self.scene)))]
 
     @cached_property
-    def world(self) -> tuple[Tensor, Tensor]:
+    def world(self) -> World:
         """World of the reconstruction from `frames`, which is that of the viewer.
 
         All later reconstructions are moved into this world.

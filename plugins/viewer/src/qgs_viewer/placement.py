@@ -8,7 +8,7 @@ from torch import Tensor
 
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.precision import full_precision
-from qgs.types import Cameras, Gaussians, Size
+from qgs.types import Cameras, Gaussians, Size, World
 
 # Blending weight on a clicked ray below which a Gaussian is not hit.
 LEAST_WEIGHT = 0.02
@@ -25,7 +25,7 @@ class Placement:
     scale: float
 
     @staticmethod
-    def between(world: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> "Placement":
+    def between(world: World, other: World) -> "Placement":
         """Return the transform from the world of one reconstruction into the world of another.
 
         world, other: pose and scale of the first and the second world, as `own_world` returns them.

@@ -20,7 +20,7 @@ from qgs.files import replacing
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Size
+from qgs.types import Cameras, Gaussians, Size, World
 from qgs_photos.poses.paths import KINDS, focal_length, path_of, read_path
 from qgs_photos.record import GAUSSIANS, has_record, read_record
 from qgs_photos.viewing import VIEWER, in_own_world
@@ -42,7 +42,7 @@ class FilmScene(NamedTuple):
     gaussians: Gaussians
     cameras: Cameras
     renderer: Renderer
-    world: tuple[Tensor, Tensor]
+    world: World
 
 
 def film(scene: FilmScene, path: Cameras, file: Path, rate: int, console: Console) -> None:

@@ -19,7 +19,7 @@ from qgs.data.samples import own_world
 from qgs.paths import read_file
 from qgs.recipe.registry import load_usable_plugins
 from qgs.reconstruction.reconstruct import reconstruct
-from qgs.types import Gaussians, Views
+from qgs.types import Gaussians, Views, World
 from qgs_photos.datasets.colmap import Colmap, read_lines
 from qgs_photos.refine.budget import TIMED
 from qgs_photos.refine.options import NONE, Options
@@ -47,7 +47,7 @@ class Initialisation:
     """
 
     model: str | None
-    world: tuple[Tensor, Tensor]
+    world: World
     gaussians: Gaussians | None = None
     frames: str | None = None
 
@@ -98,7 +98,7 @@ def shipped_model() -> str:
     return min(names, key=lambda name: (not name.startswith("worlds/"), name))
 
 
-def photos_world(photos: ScenePhotos) -> tuple[Tensor, Tensor]:
+def photos_world(photos: ScenePhotos) -> World:
     """Return the world frame of the first camera, scaled so that the scene's depth is about 1.
 
     The result is the pose (4, 4) of this camera in the photos' world, and the scale: a point p of
@@ -109,9 +109,7 @@ def photos_world(photos: ScenePhotos) -> tuple[Tensor, Tensor]:
     return own_world(photos.small, photos.frames[:1], views)
 
 
-def photos_start(
-    scene: Scene, world: tuple[Tensor, Tensor], views: Views, count: int, most: int
-) -> Gaussians:
+def photos_start(scene: Scene, world: World, views: Views, count: int, most: int) -> Gaussians:
     """Return Gaussians (1, G) at COLMAP's points, if the scene has any, and at pixels of photos.
 
     world: reference pose (4, 4) and scale of the Gaussians' world, see `own_world`. views: photos
@@ -173,9 +171,7 @@ def _binary(file: UPath) -> list[list[float]]:
 
 
 @torch.no_grad()
-def from_points(
-    points: tuple[Tensor, Tensor], world: tuple[Tensor, Tensor], most: int
-) -> Gaussians:
+def from_points(points: tuple[Tensor, Tensor], world: World, most: int) -> Gaussians:
     """Return Gaussians (1, G) at points, each as large as the mean distance to its neighbours.
 
     points: positions and colours, see `sparse_points`. world: reference pose (4, 4) and scale of

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from torch import Tensor
 
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
@@ -22,7 +21,7 @@ from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.reconstruction.scene_formats import load_ply, save_ply, save_splat
 from qgs.terminal import print_lines
-from qgs.types import Cameras, Gaussians, Rendering, Views
+from qgs.types import Cameras, Gaussians, Rendering, Views, World
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.viewing import VIEWER, in_own_world
@@ -48,7 +47,7 @@ class Result:
 
     command: str
     optimised: int
-    world: tuple[Tensor, Tensor]
+    world: World
     refined: RefinedScene
     photos: ScenePhotos
     views: Views

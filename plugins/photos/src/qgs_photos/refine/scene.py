@@ -7,7 +7,6 @@ from time import perf_counter
 
 import torch
 from rich.console import Console
-from torch import Tensor
 
 from qgs.data.photos.finding import is_inside
 from qgs.data.photos.source import PhotoScene
@@ -16,7 +15,7 @@ from qgs.paths import opened_path
 from qgs.reconstruction.scenes import Size
 from qgs.renderers import AutoRenderer
 from qgs.terminal import print_lines
-from qgs.types import Gaussians, Views
+from qgs.types import Gaussians, Views, World
 from qgs_photos.datatools.check import faults_of_poses
 from qgs_photos.datatools.findings import Finding
 from qgs_photos.refine.budget import TIMED, Budget
@@ -105,9 +104,7 @@ def make_scene(
         write_scene(result, out, page, began, console)
 
 
-def views_of(
-    photos: ScenePhotos, world: tuple[Tensor, Tensor], size: Size, options: Options
-) -> Views:
+def views_of(photos: ScenePhotos, world: World, size: Size, options: Options) -> Views:
     """Return the photos of size (H, W) for the optimisation, then the held-out photos: (1, V)."""
     frames = (*photos.frames, *photos.held_out)
     views = views_in(world, photos.at(size), frames).to(options.device)
