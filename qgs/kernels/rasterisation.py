@@ -258,12 +258,6 @@ def _edge(dx, xx, xy, yy, t):
 
 
 @kernel
-def _store_sums(state, sums, y0, x0, rows, columns):
-    blocks = state.reshape(TILE, 8, TILE)[:rows, 1 : 1 + SUMS, :columns]
-    sums[:, y0 : y0 + rows, x0 : x0 + columns] = blocks.transpose(1, 0, 2)
-
-
-@kernel
 def blend_unit(splats, order, opacities, colors, tile_rows, options, sums, slopes, out, backward):
     """Blend all G splats (G, 9) of one image in the tile rows [tile_rows[0], tile_rows[1]).
 
@@ -316,4 +310,5 @@ def blend_unit(splats, order, opacities, colors, tile_rows, options, sums, slope
                 if backward:
                     _add_gradients(totals, dx0, xx, xy, yy, opacities[g], out[g])
             if not backward:
-                _store_sums(state, sums, y0, x0, rows, columns)
+                blocks = state.reshape(TILE, 8, TILE)[:rows, 1 : 1 + SUMS, :columns]
+                sums[:, y0 : y0 + rows, x0 : x0 + columns] = blocks.transpose(1, 0, 2)

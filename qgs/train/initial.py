@@ -48,11 +48,14 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     for part in ("encoder", "feedback", "head"):
         adapted = getattr(model, part).adapted(inside(f"{part}.", learned))
         weights |= {f"{part}.{name}": values.cpu() for name, values in adapted.items()}
-    own = _comparable(unique_tensors(model), model.queries.count)
-    if found := differing_tensors(_comparable(weights, count), own):
+    own = unique_tensors(model)
+    # Feedback of another kind is left out.
+    weights = {n: t for n, t in weights.items() if n in own or not n.startswith("feedback.")}
+    comparable = _comparable(own, model.queries.count)
+    if found := differing_tensors(_comparable(weights, count), comparable):
         first = (
             f"init_from: {path} does not fit this recipe. Only the number of queries, the patch "
-            "size (to a multiple), sizes that the head can adapt, and new feedback may differ:"
+            "size (to a multiple), sizes that the head can adapt, and the feedback may differ:"
         )
         trained = "options of the checkpoint's recipe that differ:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
@@ -61,11 +64,12 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     weights |= {_QUERIES + name: values for name, values in resized.items()}
     load_weights(model, weights, path)
     before = shapes_of(learned)
+    after = shapes_of(weights)
     changes = [
-        f"{name}: {before.get(name, 'none')} -> {shape}"
+        f"{name}: {before.get(name, 'none')} -> {after.get(name, 'none')}"
         + (_KEPT if name.startswith(_QUERIES) and name in before else "")
-        for name, shape in shapes_of(weights).items()
-        if shape != before.get(name)
+        for name in before | after
+        if before.get(name) != after.get(name)
     ]
     return [f"weights start from {path}", *changes, *(f"trained with {o}" for o in options)]
 

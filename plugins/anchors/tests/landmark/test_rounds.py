@@ -182,8 +182,11 @@ def test_rounds_start_from_rounds_of_their_kind(tmp_path):
     given = built(), tmp_path / "rounds.safetensors"
     more, _ = started(*given, "model.feedback.rounds=3")
     assert_equal(more.state_dict(), given[0].state_dict())
-    for other in (NO_ROUNDS, "model.feedback.cells=1"):
-        must_refuse(r"feedback\.embedding\.weight", started, *given, other, kind=CheckpointError)
+    other = "model.feedback.cells=1"
+    must_refuse(r"feedback\.embedding\.weight", started, *given, other, kind=CheckpointError)
+    for other in (NO_ROUNDS, "model.feedback={type: landmark/gradient}"):
+        _, said = started(*given, other)
+        assert "feedback.kv_proj.bias: (64,) -> none" in said
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus", "landmark"])

@@ -90,7 +90,9 @@ def test_an_earlier_scene_is_optimised_further(photos, tmp_path):
     _, before = made(f"scene {photos} {few} --size 32x48 --gaussians 300", tmp_path / "a")
     going_on = f"scene {photos} --from {tmp_path}/a"
     _, record = made(f"{going_on} {few}", tmp_path / "b")
-    assert (record["optimised"], record["gaussians"]) == (300, before["gaussians"])
+    assert record["optimised"] == 300
+    # Surroundings are made anew, at another distance.
+    assert record["gaussians"] == pytest.approx(before["gaussians"], abs=20)
     assert f" --from {tmp_path}/a --size 32x48 --gaussians 300 " in record["command"]
     words = f"{going_on} --holdout 3 --out {tmp_path}/c".split()
     must_refuse("other photos", done, *words)
