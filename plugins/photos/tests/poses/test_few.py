@@ -184,7 +184,11 @@ def test_learned_features_give_poses_where_the_photos_have_them(images, shots, t
 
 
 @pytest.mark.usefixtures("learning")
-def test_learned_features_connect_photos_or_sift_does(walk, tmp_path, monkeypatch):
+def test_learned_features_connect_photos(walk, tmp_path):
     remarks_on_all(walk, tmp_path / "made")
+
+
+@pytest.mark.usefixtures("learning")
+def test_sift_connects_photos_where_learned_features_do_not(walk, tmp_path, monkeypatch):
     monkeypatch.setattr(learned, "learn", Mock(side_effect=RefusedError(NO_MATCHES)))
-    assert "ALIKED" not in remarks_on_all(walk, tmp_path / "again")
+    assert "ALIKED" not in remarks_on_all(walk, tmp_path / "made")
