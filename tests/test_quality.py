@@ -11,11 +11,11 @@ TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 491_100},
-    "qgs": {"tokens": 99_800, "parallel": 1, "why": 3},
-    "plugins": {"tokens": 204_000, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 163_900, "parallel": 1},
-    "tools": {"tokens": 19_200, "parallel": 1},
+    "all": {"tokens": 491_090},
+    "qgs": {"tokens": 99_790, "parallel": 1, "why": 3},
+    "plugins": {"tokens": 203_970, "parallel": 1, "why": 3.5},
+    "tests": {"tokens": 163_880, "parallel": 1},
+    "tools": {"tokens": 19_100, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,
 comments that say why at least. They only get stricter: a change that adds removes as much."""

@@ -294,7 +294,8 @@ def blend_unit(splats, order, opacities, colors, tile_rows, options, sums, slope
                 xx, xy, yy = splat[2], splat[3], splat[4]
                 look = opacities[g], colors[g, 0], colors[g, 1], colors[g, 2], splat[5]
                 quadratic = -HALF * LOG2_E * xx
-                totals[:] = ZERO
+                if backward:
+                    totals[:] = ZERO
                 for row in range(first, last + 1):
                     if not live[row]:
                         continue

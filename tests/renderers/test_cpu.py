@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from qgs.containers import concatenated, named_tensors
 from qgs.contracts import RendererConfig
 from qgs.kernels import kernel
-from qgs.renderers import CpuRenderer
+from qgs.renderers import CpuRenderer, TorchRenderer
 
 RENDER = CpuRenderer(RendererConfig())
 
@@ -71,3 +71,9 @@ def test_kernels_are_compiled_where_they_cannot_be_kept(monkeypatch):
 
     monkeypatch.setattr("numba.njit", njit)
     assert isinstance(kernel(abs), Mock)
+
+
+def test_needles_lose_no_row_of_the_tiles_that_they_cross():
+    given = make_scene(count=150, size=(70, 90), scale=torch.tensor([0.6, 0.002, 0.002]))
+    expected = TorchRenderer(RendererConfig())(*given).rgb
+    assert_close(RENDER(*given).rgb, expected, rtol=0, atol=2e-4)

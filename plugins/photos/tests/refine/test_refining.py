@@ -138,18 +138,15 @@ def test_a_coarser_level_shows_the_same_scene():
 def test_unusable_input_is_refused():
     views = photos(2)
     four = cloud(4)
-
-    def refined(gaussians=four, given=views, seconds=1, wanted=4):
-        refine(gaussians, given, seconds, count=wanted)
-
+    usable = {"gaussians": four, "views": views, "seconds": 1, "count": 4}
     for word, wrong in (
         ("2 scenes", {"gaussians": map_tensors(lambda x: x.expand(2, *x.shape[1:]), four)}),
         ("NaN or infinite", {"gaussians": map_tensors(lambda x: x * math.nan, four)}),
-        ("0 photos", {"given": views.select([])}),
+        ("0 photos", {"views": views.select([])}),
         ("0 seconds", {"seconds": 0}),
-        ("count=0", {"wanted": 0}),
+        ("count=0", {"count": 0}),
     ):
-        must_refuse(word, partial(refined, **wrong))
+        must_refuse(word, partial(refine, **(usable | wrong)))
 
 
 def test_colors_beside_harmonics_may_have_any_value():
@@ -158,6 +155,8 @@ def test_colors_beside_harmonics_may_have_any_value():
     given.grow(24, generator())
     grown = given.gaussians().colors.clone()
     assert_equal(grown.unique(dim=1), colors)
+    whole = torch.cat([given.values["means"], grown[0]], 1).tolist()
+    assert all(row in whole for row in torch.cat([cloud(20).means, colors], 2)[0].tolist())
     grown.sum().backward()
     given.optimizer.step()
     assert (given.gaussians().colors < grown).all()

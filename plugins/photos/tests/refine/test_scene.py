@@ -13,16 +13,16 @@ import torch
 from commands import done, run_qgs
 from photo_formats import photo_set, synthetic, write_colmap, write_nerfstudio
 from PIL import Image
-from plyfile import PlyData
 from qgs_photos.refine import scene
 from qgs_photos.refine.budget import TIMED, Budget
+from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.initial import from_points, photos_start, photos_world, sparse_points
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.result import page_writer
 from qgs_photos.refine.scene import faults_of_given_poses
 from qgs_photos.refine.scene_photos import ScenePhotos, judged_frames, sized
 from tables import must_not_find, must_refuse, names_in, read_json, rows, text_console
-from test_refining import RENDERER
+from test_refining import mean_psnr
 from textured_room import INTRINSICS, walk
 from torch.testing import assert_close
 from training_runs import tiny
@@ -64,11 +64,11 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     again = tmp_path / "again"
     few = "--minutes 0.003 --size 32x48 --gaussians 300"
     output, record = made(f"scene {photos} {few}", out)
-    names = {"scene.ply", "scene.splat", "index.html", "metrics.json", "held_out.png"}
-    assert names_in(out) == names
+    files = "scene.ply scene.splat index.html metrics.json held_out.png"
+    assert names_in(out) == {*files.split()}
     assert [row["photo"] for row in record["held_out"]] == ["images/4.png"]
     assert record["refined_on"] == [f"images/{number}.png" for number in range(9) if number != 4]
-    assert record["gaussians"] == len(PlyData.read(out / "scene.ply")["vertex"]) > 300
+    assert record["gaussians"] == qgs.load_ply(out / "scene.ply").count > 300
     assert record["mean"]["alpha"] > 0.99
     is_worse = record["mean"]["psnr"] < record["mean"]["nearest_input"]
     assert is_worse == ("worse than the nearest photo" in output)
@@ -80,23 +80,27 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     assert record["command"].replace(f" --out {again}", "") == f"qgs {command}"
 
     views = qgs.read_photos(photos).select([4])
-    rgb = RENDERER(qgs.load_ply(again / "scene.ply"), views.cameras).rgb
-    psnr = -10 * (rgb - views.images).square().mean().log10()
-    assert float(psnr) == pytest.approx(record["mean"]["psnr"], abs=0.01)
+    psnr = mean_psnr(qgs.load_ply(again / "scene.ply"), views)
+    assert psnr == pytest.approx(record["mean"]["psnr"], abs=0.01)
 
 
 def test_an_earlier_scene_is_optimised_further(photos, tmp_path):
     few = "--holdout 4 --seconds 0.3 --degree 0"
-    _, before = made(f"scene {photos} {few} --size 32x48 --gaussians 300", tmp_path / "a")
-    going_on = f"scene {photos} --from {tmp_path}/a"
+    earlier = tmp_path / "a"
+    made(f"scene {photos} {few} --size 32x48 --gaussians 300", earlier)
+    options = Options(earlier=earlier, holdout="4")
+    start, _ = chosen_start(ScenePhotos(str(photos), options), options)
+    ours = moved(start.gaussians, start.world[0], 1 / float(start.world[1]))
+    assert_close(ours.means, qgs.load_ply(earlier / "scene.ply").means[:, -300:])
+    going_on = f"scene {photos} --from {earlier}"
     _, record = made(f"{going_on} {few}", tmp_path / "b")
     assert record["optimised"] == 300
-    # Surroundings are made anew, at another distance.
-    assert record["gaussians"] == pytest.approx(before["gaussians"], abs=20)
-    assert f" --from {tmp_path}/a --size 32x48 --gaussians 300 " in record["command"]
+    assert f" --from {earlier} --size 32x48 --gaussians 300 " in record["command"]
     words = f"{going_on} --holdout 3 --out {tmp_path}/c".split()
     must_refuse("other photos", done, *words)
     must_not_find("scene.ply", done, "scene", photos, "--from", photos, "--out", tmp_path / "c")
+    (earlier / "metrics.json").write_text("[]")
+    must_refuse("make the scene again", done, *words)
 
 
 def test_poses_that_came_with_the_photos_are_looked_at(taken, photos_of_scene, tmp_path):
@@ -141,6 +145,7 @@ def test_without_the_viewer_there_is_no_page(monkeypatch):
 
 SENSELESS = """
 --model none --scale 0.4 | --scale need a model
+--model none --from scene | replaces a model
 --minutes 0 | --minutes
 --seconds inf | --seconds
 --holdout 1 | --holdout
@@ -158,11 +163,13 @@ def test_options_that_cannot_be_used_are_refused(photos, tmp_path):
 
 
 def test_a_split_of_the_photos_own_is_judged_first():
-    cases = (((), "8", (4, 12)), ((), "3", (1, 4, 7, 10, 13, 16, 19)), ((0, 5), "8", (0, 5)))
-    for own, holdout, judged in cases:
-        scene = MagicMock(held_out=own, __len__=lambda self: 20)
-        assert judged_frames(scene, holdout) == judged
-        assert judged_frames(scene, NONE) == ()
+    scene = MagicMock(held_out=(), __len__=lambda self: 20)
+    assert judged_frames(scene, "8") == (4, 12)
+    assert judged_frames(scene, "3") == (1, 4, 7, 10, 13, 16, 19)
+    assert judged_frames(scene, NONE) == ()
+    scene.held_out = (0, 5)
+    assert judged_frames(scene, "8") == (0, 5)
+    assert judged_frames(scene, NONE) == ()
 
 
 def test_more_time_buys_larger_photos_and_more_gaussians(photos_of_scene):
@@ -176,11 +183,11 @@ def test_more_time_buys_larger_photos_and_more_gaussians(photos_of_scene):
     fixed = replace(budget, options=Options(size=(90, 160), gaussians=77))
     assert (fixed.affordable(1), fixed.count((9, 9))) == ((90, 160), 77)
 
-    told, advice = budget.sentences(9, 1)
-    assert re.match("poses .* 9 s; 1 s .* 69 steps on photos of 96 x 171 .* twice as many", told)
+    told, advice = budget.sentences(given[0], 9, 1)
+    assert re.match("poses .* 9 s; 1 s .* 43 steps on photos of 96 x 171 .* twice as many", told)
     lacking = re.search(r"small; (\S+) minutes more would give 128 ", advice)[1]
     assert min(budget.affordable(5 + 60 * float(lacking))) == 128
-    assert "the time would give photos" in next(budget.sentences(9, 600))
+    assert "the time would give photos" in next(budget.sentences(given[1], 9, 600))
 
 
 def test_points_of_colmap_are_part_of_the_start(taken, photos_of_scene, photos, tmp_path):

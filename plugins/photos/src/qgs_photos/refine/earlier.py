@@ -1,14 +1,25 @@
 """Go on from a scene that `qgs scene` wrote."""
 
-import json
 from dataclasses import replace
+
+from pydantic import BaseModel, PositiveInt, ValidationError
 
 from qgs.containers import map_tensors
 from qgs.reconstruction.scene_formats import load_ply
+from qgs.types import Size
 from qgs_photos.refine.initial import Initialisation, chosen_initialisation, photos_world
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.viewing import in_own_world
+
+
+class _Record(BaseModel):
+    """What metrics.json says of a scene, as `qgs_photos.refine.result` writes it."""
+
+    command: str
+    optimised: PositiveInt
+    size: Size
+    camera_centres: list[list[float]]
 
 
 def chosen_start(photos: ScenePhotos, options: Options) -> tuple[Initialisation, Options]:
@@ -16,26 +27,35 @@ def chosen_start(photos: ScenePhotos, options: Options) -> tuple[Initialisation,
 
     Surroundings of that scene are left out, since they are made anew. The options are returned with
     the photo size and the number of Gaussians of that scene, unless they have their own. Raises
-    FileNotFoundError if the folder is no scene, ValueError if the scene was made from other photos,
-    other poses, or with other photos held out, and the errors of `chosen_initialisation`.
+    FileNotFoundError if the folder is no scene, ValueError for options of a model, for a file that
+    is not as `qgs scene` writes it, for a scene that was made from other photos, other poses, or
+    with other photos held out, and the errors of `chosen_initialisation`.
     """
     folder = options.earlier
     if folder is None:
         return chosen_initialisation(photos, options), options
+    if options.model or options.frames or options.scale:
+        raise ValueError("--from replaces a model: leave out --model, --frames and --scale")
     file = folder / "scene.ply"
     if not file.is_file():
         raise FileNotFoundError(f"{file} does not exist: give a folder that `qgs scene` wrote")
-    record = json.loads((folder / "metrics.json").read_bytes())
-    if record.get("camera_centres") != photos.centres:
+    try:
+        record = _Record.model_validate_json((folder / "metrics.json").read_bytes())
+    except ValidationError as error:
+        raise ValueError(
+            f"{folder / 'metrics.json'} is not as this version of `qgs scene` writes it: make the "
+            "scene again"
+        ) from error
+    if record.camera_centres != photos.centres:
         raise ValueError(
             f"{folder} was made from other photos than {photos.path}, with other poses, or with "
-            f"other photos held out: give what its command names, {record['command']}"
+            f"other photos held out: give what its command names, {record.command}"
         )
     world = photos_world(photos)
     every = in_own_world(world, load_ply(file)).to(options.device)
     # surroundings come first
-    gaussians = map_tensors(lambda part: part[:, -record["optimised"] :], every)
+    gaussians = map_tensors(lambda part: part[:, -record.optimised :], every)
     count = options.gaussians or gaussians.count
-    size = options.size or tuple(record["size"])
+    size = options.size or record.size
     start = Initialisation(None, world, gaussians)
     return start, replace(options, size=size, gaussians=count)

@@ -158,10 +158,10 @@ def along_curve(points: Tensor) -> Tensor:
 
     Each coordinate is replaced by its rank in 1,024 steps, so that far points do no harm.
     """
-    ranks_N3 = points.argsort(0).argsort(0) * 1024 // len(points)
+    ranks_N3 = points.argsort(dim=0, stable=True).argsort(dim=0) * 1024 // len(points)
     bits_N3B = ranks_N3[..., None] >> torch.arange(10, device=points.device) & 1
     places_3B = torch.arange(30, device=points.device).view(10, 3).T
-    return (bits_N3B << places_3B).sum((1, 2)).argsort()
+    return (bits_N3B << places_3B).sum((1, 2)).argsort(stable=True)
 
 
 def _with_copies(values: Tensor, dead: Tensor, copies: Tensor) -> Tensor:

@@ -78,7 +78,7 @@ def make_scene(
     chosen = replace(options, size=size, gaussians=count, seconds=budget)
     command = with_start(chosen, start).command(path, str(out))
     # before the optimisation: an interrupted one can be repeated
-    print_lines(console, [command, *plan.sentences(opened, budget)])
+    print_lines(console, [command, *plan.sentences(size, opened, budget)])
     most = int(SWEEP * budget / seconds_of_pixel)
     with console.status("placing Gaussians at pixels"):
         gaussians = start.gaussians or photos_start(photos.small, start.world, small, count, most)
