@@ -14,7 +14,7 @@ from qgs_photos.viewing import in_own_world
 
 
 class _Record(BaseModel):
-    """What metrics.json says of a scene, as `qgs_photos.refine.result` writes it."""
+    """Entries of metrics.json that are read, as `qgs_photos.refine.result` writes them."""
 
     command: str
     optimised: PositiveInt
