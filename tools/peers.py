@@ -34,10 +34,11 @@ def main(programs: Path, seconds: float, scenes: list[Path]) -> None:
         "| scene | program | seconds | KiB | steps | Gaussians | PSNR, dB | SSIM |\n"
         "|---|---|--:|--:|--:|--:|--:|--:|"
     )
+    commands = yaml.safe_load(programs.read_text())
     for scene in scenes:
         views = split(scene)
         height, width = views.cameras.size
-        for name, command in yaml.safe_load(programs.read_text()).items():
+        for name, command in commands.items():
             out = scene / "peers" / name
             given = (
                 f"photos={scene}/peers out={out} size={height}x{width} minutes={seconds / 60}\n"

@@ -54,8 +54,7 @@ class Budget:
         if self.options.size:
             return self.options.size
         available = available_bytes()
-        first, *larger = (sized(self.photos.small, side) for side in SIZES)
-        best = first
+        best, *larger = (sized(self.photos.small, side) for side in SIZES)
         for size in larger:
             memory = 3 * math.prod(size) * len(self.photos.frames) * _BYTES
             # sizes ascend: the first that takes too long ends the search

@@ -28,14 +28,14 @@ from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
 
-# Of the time for the optimisation, however long all else took.
-_LEAST_PART = 0.1
-# Photos that given poses are judged by, a second each.
-_JUDGING = 4
 END = 4.0
 """Seconds reserved for scores and files at the end."""
 PART_OF_END = 0.03
 """Fraction of the total time that is reserved for scores and files, on top of END seconds."""
+# Of the time for the optimisation, however long all else took.
+_LEAST_PART = 0.1
+# Photos that given poses are judged by, a second each.
+_JUDGING = 4
 SWEEP = 0.12
 """Fraction of the optimisation's time to spend on finding depths of pixels."""
 BEGIN = 0.5
