@@ -17,7 +17,6 @@ import json
 import subprocess
 from pathlib import Path
 
-import pycolmap
 import typer
 import yaml
 from qgs_photos.viewing import VIEWER
@@ -58,6 +57,9 @@ def main(programs: Path, seconds: float, scenes: list[Path]) -> None:
 
 def split(scene: Path) -> Views:
     """Write a COLMAP model without held-out photos into peers/; return these photos, (1, H)."""
+    # Only after torch: with pycolmap 4.2 first, zlib breaks the memory.
+    import pycolmap
+
     model = pycolmap.Reconstruction(scene / "sparse")
     images = sorted(model.images.values(), key=lambda image: image.name)
     held_out = held_out_frames(len(images), HOLDOUT)
