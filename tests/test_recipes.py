@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 import yaml
 from published.files import read_golden
-from published.models import recipe_of
+from published.splats import model_of
 from qgs_research.studies.plan import composed, differences, planned
 from qgs_research.studies.study import read_study
 from size import ROOT
@@ -128,7 +128,7 @@ def as_published(file, wanted):
     kept = {f"has {wanted} parameters, not {count:,}": f"{count:,}" == wanted}
     if golden := file.startswith("ablations/") and ABLATIONS.get(Path(file).stem):
         released = read_golden(ROOT / f"tests/golden/locus_{golden}_a.safetensors")
-        theirs = structure(resolve(recipe_of(released)).tree["model"])
+        theirs = structure(model_of(released).recipe["model"])
         kept["is the released variant"] = structure(recipe(file).tree["model"]) == theirs
     return kept
 

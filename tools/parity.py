@@ -2,11 +2,11 @@
 
     python tools/parity.py FILE…
 
-For a file of a model, the model is built from the options in the file's metadata, loaded with the
-file's weights, and called with its photos. For a file of losses, the loss components are called
-with its tensors. All tensors of the file except inputs, weights and crops of a data loader are
-compared. The exit code is 1 if a tensor differs by more than rtol 1e-4 + atol 5e-5, or cannot be
-computed.
+For a file of a model, the model is built to fit the file's weights, with options in the metadata
+that these do not determine, and called with the file's photos. For a file of losses, the loss
+components are called with its tensors. All tensors of the file except inputs, weights and crops of
+a data loader are compared. The exit code is 1 if a tensor differs by more than rtol 1e-4 +
+atol 5e-5, or cannot be computed.
 """
 
 import sys

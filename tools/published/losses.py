@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from qgs_dev.vocabulary import scene
@@ -12,7 +13,6 @@ from qgs_locus.visibility import AnchorVisibility
 from torch import Tensor
 
 from published.files import EXPECTED, GoldenFile, Tensors
-from published.recipes import Options
 from qgs.contracts import Loss
 from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
@@ -24,6 +24,8 @@ SSIM_WEIGHTS = {"nossim": 0.0, "refssim": 0.2}
 CLAMPS = {"noclamp": None, "clamp1": 1.0, "clamp0p25": 0.25}
 """Thresholds of the visibility loss, by their names in the golden file."""
 
+Options = dict[str, Any]
+"""Published options by name."""
 Given = tuple[LayerPrediction, Rendering, Views]
 """Inputs of a loss: prediction, rendering and true views of B scenes."""
 

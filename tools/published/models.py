@@ -1,4 +1,4 @@
-"""Model of a golden file: built from the published options, with the weights in the file.
+"""Tensors of a golden file of a model, which is built to fit the weights in the file.
 
 Names of tensors: tokens.l and anchor_*.l are the state after l layers; other names that end in .i
 are inside layer i, counted from 0.
@@ -12,26 +12,17 @@ from qgs_locus.anchors import AnchoredQueries
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.self_attention import AnchorAwareSelfAttention
-from qgs_research.published.layouts import names_of
-from qgs_research.published.weight_layout import real_ratio
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck, time_features
 from torch import Tensor
 
 from published.files import GoldenFile, Tensors
-from published.recipes import Options, Tree, locusgs_recipe, tokengs_recipe
-from published.splats import Recorder, cases_tensors
+from published.splats import Recorder, cases_tensors, model_of
 from published.sweeps import sweep_tensors
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import QueryGaussianModel
-from qgs.recipe import resolve
 from qgs.tokengs import CrossSelfMlp
 from qgs.tokengs.encoder import PatchViT, imagenet_normalised
 from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
-
-RECIPES: Mapping[str, Callable[[Options], Tree]] = {
-    "tokengs": tokengs_recipe,
-    "locusgs": locusgs_recipe,
-}
 
 COMPUTED: Mapping[str, Callable[[GoldenFile], Tensors]] = {
     "mvsplat": sweep_tensors,
@@ -43,26 +34,14 @@ COMPUTED: Mapping[str, Callable[[GoldenFile], Tensors]] = {
 
 TIMES = ("times", "target_time")
 TUNED = "tuned_latents"
-LAST_NORM = "enc_dec_backbone.encoder_norm."
-READ_NORM = "enc_dec_backbone.multiscale_norms.0."
-DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
 
 
 @torch.no_grad()
 def golden_tensors(golden: GoldenFile) -> Tensors:
-    """Compute all tensors that a golden file may hold, by its model on its photos and cameras.
-
-    Raises ValueError for options that no recipe can express.
-    """
+    """Compute all tensors that a golden file may hold, by its model on its photos and cameras."""
     if golden.config["kind"] in COMPUTED:
         return COMPUTED[golden.config["kind"]](golden)
-    recipe = resolve(recipe_of(golden))
-    model = recipe.build_model().eval()
-    weights = golden.weights()
-    # Runs that read one block name its norm as TokenGS does.
-    if hasattr(model.encoder, "norms"):
-        weights = {name.replace(LAST_NORM, READ_NORM): x for name, x in weights.items()}
-    model.load_state_dict(names_of(recipe).from_published(weights), strict=True)
+    model = model_of(golden)
     size = golden.config["options"]["img_size"]
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), tuple(size))
     times = (golden.input(name) if name in golden.tensors else None for name in TIMES)
@@ -89,19 +68,6 @@ def golden_tensors(golden: GoldenFile) -> Tensors:
         tuned = model.predict(views, memory, state)
         found["gaussians_of_tuned_latents"] = packed(tuned.gaussians)
     return found
-
-
-def recipe_of(golden: GoldenFile) -> Tree:
-    """Return the recipe of a golden file's model. Raises the errors of `golden_tensors`."""
-    constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
-    recipe = RECIPES[golden.config["kind"]](golden.config["options"] | constants)
-    weights = golden.weights()
-    # The releases have no option for it.
-    if DECODER_MLP in weights:
-        hidden, width = weights[DECODER_MLP].shape
-        ratio = real_ratio(hidden, width, DECODER_MLP)
-        recipe["model"]["decoder"]["feed_forward"] = {"ratio": ratio}
-    return recipe
 
 
 def watch(kept: Recorder, model: QueryGaussianModel) -> None:

@@ -1,4 +1,4 @@
-"""Shared parts of the golden files of MVSplat and DepthSplat, and files of single cases.
+"""Models of golden files, shared parts of those of MVSplat and DepthSplat, files of single cases.
 
 A recorder keeps inputs and outputs of modules inside a model.
 """
@@ -30,6 +30,15 @@ from qgs.recipe import resolve
 from qgs.types import Cameras, ImageMemory, Prediction, Views
 
 Change = Callable[[Tensor], Tensor]
+
+UNDECIDED = {
+    "gaussian_center_variant": {
+        "anchor_offset": "model.centers.type=locus/anchor_offset",
+        "free_center": "model.centers={type: qgs/free, z_offset: 0.0}",
+    },
+    "anchor_radius_affects_bias": {False: "model.decoder.cross_attention.bandwidth=fixed"},
+}
+"""Overrides for values of published options that the shapes of weights do not determine."""
 
 
 class Recorder:
@@ -80,13 +89,13 @@ def lens_of(k: Tensor, size: tuple[int, int] = (1, 1)) -> Tensor:
     return lens * lens.new_tensor([size[1], size[0], size[1], size[0]])
 
 
-def weights_of(golden: GoldenFile) -> Tensors:
-    """Return the weights of a golden file by their published names."""
+def seeded_weights(golden: GoldenFile) -> Tensors:
+    """Return the weights of a golden file that does not store them, by their published names."""
     rule = golden.config["weights"]
     # Sums of the weights, with which whoever recorded the file checked the rule.
     golden.read.add("weights_check")
     return {
-        name: torch.from_numpy(
+        f"encoder.{name}": torch.from_numpy(
             seeded_weight(name, shape, rule["seed"], rule["factors"].get(name, 1.0))
         )
         for name, shape in golden.config["state_dict"]
@@ -95,11 +104,13 @@ def weights_of(golden: GoldenFile) -> Tensors:
 
 def model_of(golden: GoldenFile) -> QueryGaussianModel:
     """Return the model that fits the weights of a golden file, with these weights."""
-    weights = {f"encoder.{name}": x for name, x in weights_of(golden).items()}
+    weights = golden.weights() or seeded_weights(golden)
     tree = fitting_recipe(shapes_of(weights), golden.config["kind"])[1]
-    # Weights do not determine it.
-    count = golden.config["options"].get("local_mv_match")
-    recipe = resolve(tree, [f"model.encoder.neighbours={count}"] if count else ())
+    options = golden.config["options"]
+    overrides = [of[options[name]] for name, of in UNDECIDED.items() if options.get(name) in of]
+    if count := options.get("local_mv_match"):
+        overrides.append(f"model.encoder.neighbours={count}")
+    recipe = resolve(tree, overrides)
     model = recipe.build_model(pretrained=False).eval()
     model.load_state_dict(names_of(recipe).from_published(weights))
     return model
