@@ -43,14 +43,14 @@ def photo_set(folder, images, c2w, intrinsics, name="{}.png"):
     return PhotoSet(files, c2w, intrinsics, images[0].shape[:2])
 
 
-def synthetic(folder, count=6, size=(30, 40), seed=0):
+def synthetic(folder, count=6, size=(30, 40), seed=0, suffix="png"):
     """Photos of noise at random poses."""
     rng = np.random.default_rng(seed)
     images = rng.integers(0, 256, (count, *size, 3), dtype=np.uint8)
     c2w = np.tile(np.eye(4), (count, 1, 1))
     c2w[:, :3, :3] = Rotation.random(count, rng).as_matrix()
     c2w[:, :3, 3] = rng.normal(size=(count, 3)) * 5
-    return photo_set(folder, images, c2w, (50.0, 52.0, 19.0, 16.0), "view_{:03d}.png")
+    return photo_set(folder, images, c2w, (50.0, 52.0, 19.0, 16.0), f"view_{{:03d}}.{suffix}")
 
 
 def opened(path, size=(30, 40), source=PhotosSource, **options):
