@@ -18,10 +18,20 @@ import typer
 from published.files import GoldenFile, read_golden
 from published.losses import loss_tensors
 from published.models import golden_tensors
+from published.splats import cases_tensors
+from published.sweeps import sweep_tensors
 from torch import Tensor
 
 RTOL = 1e-4
 ATOL = 5e-5
+COMPUTED = {
+    None: loss_tensors,
+    "mvsplat": sweep_tensors,
+    "mvsplat_cases": cases_tensors,
+    "depthsplat": sweep_tensors,
+    "depthsplat_cases": cases_tensors,
+}
+"""Functions that compute the tensors of a file, by its kind; others are of models of TokenGS."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +47,10 @@ class Row:
     problem: str = ""
 
 
+@torch.no_grad()
 def compared(golden: GoldenFile) -> list[Row]:
     """Return a row for every tensor in the golden file, and for every promised tensor it lacks."""
-    found = loss_tensors(golden) if golden.is_of_losses else golden_tensors(golden)
+    found = COMPUTED.get(golden.config.get("kind"), golden_tensors)(golden)
     expected = golden.expected()
     rows = [_row(name, found.get(name), tensor) for name, tensor in expected.items()]
     missing = sorted(set(golden.promised()) - set(expected))
@@ -52,7 +63,7 @@ def _row(name: str, found: Tensor | None, expected: Tensor) -> Row:
         return Row(name, shape, problem="not compared: nothing here has this name")
     if found.shape != expected.shape:
         return Row(name, shape, problem=f"shape {tuple(found.shape)} here")
-    ours = found.detach().double()
+    ours = found.double()
     theirs = expected.double()
     # 0 where both are the same infinity or NaN.
     same = (ours == theirs) | (ours.isnan() & theirs.isnan())

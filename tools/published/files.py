@@ -12,7 +12,6 @@ Tensors = dict[str, Tensor]
 """Tensors by name."""
 
 WEIGHTS = "weights."
-EXPECTED = "expected."
 LOADER = ("crop.", "patch.")
 """Prefixes of tensors of the published data loader.
 
@@ -31,11 +30,6 @@ class GoldenFile:
     tensors: Tensors
     config: dict[str, Any]
     read: set[str] = field(default_factory=set)
-
-    @property
-    def is_of_losses(self) -> bool:
-        """True for a file of loss terms, False for a file of tensors of a model."""
-        return any(name.startswith(EXPECTED) for name in self.tensors)
 
     def input(self, name: str) -> Tensor:
         """Return an input tensor in float32, and note that it was used."""

@@ -12,7 +12,7 @@ from qgs_locus.fields import CENTER
 from qgs_locus.visibility import AnchorVisibility
 from torch import Tensor
 
-from published.files import EXPECTED, GoldenFile, Tensors
+from published.files import GoldenFile, Tensors
 from qgs.contracts import Loss
 from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
@@ -75,7 +75,7 @@ def loss_tensors(golden: GoldenFile) -> Tensors:
         for ssim, weight in SSIM_WEIGHTS.items():
             terms = whole_loss(given, has_mask, release, options, weight)
             found |= {f"{release}.{ssim}.{name}": term for name, term in terms.items()}
-    return {"cam_view": seen, **{f"{EXPECTED}{name}": x for name, x in found.items()}}
+    return {"cam_view": seen, **{f"expected.{name}": x for name, x in found.items()}}
 
 
 def visibility(points: Tensor, cameras: Cameras, clamp: float | None) -> Tensors:

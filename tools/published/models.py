@@ -4,7 +4,6 @@ Names of tensors: tokens.l and anchor_*.l are the state after l layers; other na
 are inside layer i, counted from 0.
 """
 
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -16,31 +15,19 @@ from qgs_zoo.tokengs2026.multiscale import LatentBottleneck, time_features
 from torch import Tensor
 
 from published.files import GoldenFile, Tensors
-from published.splats import Recorder, cases_tensors, model_of
-from published.sweeps import sweep_tensors
+from published.splats import Recorder, model_of
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import QueryGaussianModel
 from qgs.tokengs import CrossSelfMlp
 from qgs.tokengs.encoder import PatchViT, imagenet_normalised
 from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
 
-COMPUTED: Mapping[str, Callable[[GoldenFile], Tensors]] = {
-    "mvsplat": sweep_tensors,
-    "mvsplat_cases": cases_tensors,
-    "depthsplat": sweep_tensors,
-    "depthsplat_cases": cases_tensors,
-}
-"""Functions for kinds of golden files whose weights and inputs are stored in another way."""
-
 TIMES = ("times", "target_time")
 TUNED = "tuned_latents"
 
 
-@torch.no_grad()
 def golden_tensors(golden: GoldenFile) -> Tensors:
     """Compute all tensors that a golden file may hold, by its model on its photos and cameras."""
-    if golden.config["kind"] in COMPUTED:
-        return COMPUTED[golden.config["kind"]](golden)
     model = model_of(golden)
     size = golden.config["options"]["img_size"]
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), tuple(size))
