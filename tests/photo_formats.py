@@ -224,8 +224,7 @@ def write_colmap(folder, photos, kind, camera=None, model="sparse/0", images="im
 def world_to_camera(c2w):
     """Quaternion w, x, y, z and translation of the inverse of a pose."""
     w2c = np.linalg.inv(c2w)
-    x, y, z, w = Rotation.from_matrix(w2c[:3, :3]).as_quat()
-    return w, x, y, z, *w2c[:3, 3]
+    return *Rotation.from_matrix(w2c[:3, :3]).as_quat(scalar_first=True), *w2c[:3, 3]
 
 
 def numbered_photos(path, count=10, size=(64, 48), cameras=(), **top):

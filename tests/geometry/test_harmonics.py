@@ -1,11 +1,12 @@
-"""Spherical harmonics against SciPy's Legendre functions, as a camera sees them; its rays."""
+"""Spherical harmonics against SciPy's, and as a camera sees them."""
 
 import math
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from renderers.scenes import make_scene
-from scipy.special import lpmv
+from scipy.special import sph_harm_y
 from torch.testing import assert_close
 
 from qgs.geometry.harmonics import harmonics, rotated, seen_colors
@@ -19,21 +20,17 @@ def directions():
     return F.normalize(torch.randn(50, 3).double(), dim=-1)
 
 
-def legendre(degree, order, d):
-    """The real harmonic from its definition; SciPy's functions have the Condon-Shortley phase."""
-    m = abs(order)
-    x, y, z = d.unbind(-1)
-    angle = m * torch.atan2(y, x)
-    factor = (2 * degree + 1) / (4 * math.pi) * math.factorial(degree - m)
-    factor = math.sqrt(factor / math.factorial(degree + m)) * (math.sqrt(2) if m else 1)
-    return factor * torch.from_numpy(lpmv(m, degree, z.numpy())) * (
-        angle.sin() if order < 0 else angle.cos()
-    )  # fmt: skip
+def real_harmonic(degree, order, d):
+    """From the complex one, which has the Condon-Shortley phase."""
+    x, y, z = d.numpy().T
+    found = sph_harm_y(degree, abs(order), np.arccos(z), np.arctan2(y, x))
+    part = found.imag if order < 0 else found.real
+    return torch.from_numpy(part * (math.sqrt(2) if order else 1))
 
 
 def test_they_are_the_real_harmonics_by_degree_and_order():
     d = directions()
-    expected = [legendre(n, m, d) for n in (1, 2, 3) for m in range(-n, n + 1)]
+    expected = [real_harmonic(n, m, d) for n in (1, 2, 3) for m in range(-n, n + 1)]
     for count in SH_COUNTS:
         assert_close(harmonics(d, count), torch.stack(expected[:count], -1))
 

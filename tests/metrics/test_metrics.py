@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 from tables import must_refuse
 from torch.testing import assert_close
@@ -53,15 +54,14 @@ def test_identical_images_with_leading_dimensions():
     assert_close(psnr(truth, truth), torch.full((2, 4), 100.0))
 
 
-def cameras(x, turn=()):
+def cameras(x, turn=(0.0,)):
     """Cameras along the x axis, turned by radians about y."""
     c2w = along_x(x)
-    skew = torch.tensor([[0, 0, 1.0], [0, 0, 0], [-1, 0, 0]])
-    c2w[: len(turn), :3, :3] = torch.tensor(turn)[:, None, None].mul(skew).matrix_exp()
+    c2w[: len(turn), :3, :3] = torch.tensor(Rotation.from_euler("y", np.c_[turn]).as_matrix())
     return pinhole(c2w, [4.0] * 4, (8, 8))[None]
 
 
-def views(x, turn=()):
+def views(x, turn=(0.0,)):
     return Views(torch.rand(1, len(x), 3, 8, 8), cameras(x, turn))
 
 

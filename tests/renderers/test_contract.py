@@ -6,6 +6,7 @@ from itertools import product
 import pytest
 import torch
 from renderers.scenes import differentiate, make_scene
+from scipy.spatial.transform import Rotation
 from tables import must_refuse
 from torch.testing import assert_close
 from walk import along_x, pinhole
@@ -184,9 +185,7 @@ def splat(scene, g, w2c, lens, size):
     border = 0.15 * size
     slope = (seen[:2] / seen[2]).clamp((-border - centre) / focal, (size + border - centre) / focal)
     held = torch.cat([slope * seen[2], seen[2:]])
-    w, x, y, z = (scene.quats[g] / scene.quats[g].norm()).tolist()
-    skew = w2c.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turn = torch.eye(3) + 2 * w * skew + 2 * skew @ skew
+    turn = torch.tensor(Rotation.from_quat(scene.quats[g], scalar_first=True).as_matrix())
     jacobian = torch.autograd.functional.jacobian(pixel, held)
     axes = jacobian @ w2c[:3, :3] @ turn * scene.scales[g]
     return pixel(seen), torch.linalg.inv(axes @ axes.T + 0.3 * torch.eye(2)), seen[2]
