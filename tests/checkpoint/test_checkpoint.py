@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from commands import SMALL
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from small_parts import Code, shaken
 from tables import assert_equal, must_refuse
 
@@ -20,7 +19,7 @@ from qgs.checkpoint.model_file import (
     unique_tensors,
     write_checkpoint,
 )
-from qgs.checkpoint.tensors import SEAL, CheckpointError, write_tensors
+from qgs.checkpoint.tensors import SEAL, CheckpointError, TensorFile, copied, write_tensors
 from qgs.domain import KEY, Domain
 from qgs.recipe import RecipeError, resolve
 from qgs.recipe.registry import available_plugins
@@ -47,12 +46,11 @@ def saved(written, tmp_path):
 
 
 def metadata_of(path):
-    with safe_open(path, "pt") as file:
-        return file.metadata()
+    return TensorFile(path).metadata
 
 
 def tensors_of(path):
-    return {name: tensor.clone() for name, tensor in load_file(path).items()}
+    return copied(TensorFile(path).read())
 
 
 def rewrite(path, tensors=None, **changed):

@@ -6,7 +6,7 @@ from unittest.mock import DEFAULT, Mock
 
 import pytest
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from tables import contents, must_not_find, must_refuse, names_in
 from training_runs import (
     TRAINED,
@@ -23,7 +23,7 @@ from training_runs import (
 )
 
 from qgs.checkpoint.model_file import CheckpointFile
-from qgs.checkpoint.tensors import CheckpointError, write_tensors
+from qgs.checkpoint.tensors import CheckpointError, TensorFile, write_tensors
 from qgs.data.stream import MAX_REPLACED, SampleError, WorkerError
 from qgs.train import periodic, training
 from qgs.train.folder import RunFolder
@@ -143,9 +143,9 @@ def test_a_full_disk_is_told_with_what_to_do(copied, monkeypatch):
 
 def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
     state = RunFolder(copied).state
-    with safe_open(state, "pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        metadata = file.metadata()
+    file = TensorFile(state)
+    tensors = file.read()
+    metadata = file.metadata
     damaged = [state.read_bytes()[:-100], RunFolder(copied).checkpoint.read_bytes()]
     for name, changed in (
         ("weights.queries.features", torch.ones(1)),

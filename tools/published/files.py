@@ -1,12 +1,12 @@
 """Golden files: tensors computed by the published code, with its options in the metadata."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from safetensors import safe_open
 from torch import Tensor
+
+from qgs.checkpoint.tensors import TensorFile, inside
 
 Tensors = dict[str, Tensor]
 """Tensors by name."""
@@ -39,8 +39,7 @@ class GoldenFile:
 
     def weights(self) -> Tensors:
         """Return the published state dict in the file."""
-        names = [name for name in self.tensors if name.startswith(WEIGHTS)]
-        return {name.removeprefix(WEIGHTS): self.input(name) for name in names}
+        return {name: self.input(f"{WEIGHTS}{name}") for name in inside(WEIGHTS, self.tensors)}
 
     def expected(self) -> Tensors:
         """Return the tensors to compare: all except inputs and weights."""
@@ -53,7 +52,6 @@ class GoldenFile:
 
 def read_golden(path: Path) -> GoldenFile:
     """Read a golden file."""
-    with safe_open(path, "pt") as file:
-        names = [name for name in list(file.keys()) if not name.startswith(LOADER)]
-        tensors = {name: file.get_tensor(name) for name in names}
-        return GoldenFile(tensors, json.loads(file.metadata()["config"]))
+    with TensorFile(path) as file:
+        tensors = {name: x for name, x in file.read().items() if not name.startswith(LOADER)}
+        return GoldenFile(tensors, file.mapping("config"))
