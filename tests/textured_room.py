@@ -22,13 +22,13 @@ class Shot:
     image: np.ndarray
     c2w: np.ndarray
 
-    def encoded(self, kind="JPEG"):
-        return photo_formats.encoded(self.image, kind, quality=92)
+    def encoded(self):
+        return photo_formats.encoded(self.image, "JPEG", quality=92)
 
 
-def walk(count, seed=0):
+def walk(count):
     """Photos along a rising arc that turns and rolls, so that no convention is ambiguous."""
-    noise = np.random.default_rng(seed).random((40, 40, 40))
+    noise = np.random.default_rng(0).random((40, 40, 40))
     return [_shot(noise, pose) for pose in _poses(count)]
 
 
