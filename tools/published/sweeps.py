@@ -1,10 +1,11 @@
 """Tensors of golden files of MVSplat and DepthSplat, computed by the components of qgs."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from qgs_zoo.dinov2.vit import PATCH
-from qgs_zoo.mvsplat.depthsplat import DepthPredictor, DepthSplatEncoder, finer_candidates
+from qgs_zoo.mvsplat.depthsplat import DepthSplatEncoder, finer_candidates
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, expected_disparity
 from qgs_zoo.mvsplat.sweep import (
     Sweep,
@@ -15,7 +16,7 @@ from qgs_zoo.mvsplat.sweep import (
     relative_poses,
 )
 from qgs_zoo.mvsplat.windows import shift_mask
-from torch import Tensor
+from torch import Tensor, nn
 
 from published.files import GoldenFile, Tensors
 from published.splats import (
@@ -32,14 +33,24 @@ from published.splats import (
 MVSPLAT_OUTPUTS = """
 cnn.layer2                          backbone.backbone.layer2
 features_cnn                        backbone.backbone.conv2
-cost_unet.stem                      depth_predictor.corr_refine_net.2
-cost_volume_unet                    depth_predictor.corr_refine_net
-match_logits                        depth_predictor.depth_head_lowres
 fullres_features                    depth_predictor.upsampler
 projected_features                  depth_predictor.proj_feature
 delta_disparity_and_density_logit   depth_predictor.to_disparity
 """
 """Lines with a name in the golden file and the encoder module whose output has this name."""
+MVSPLAT_NAMES = """
+coarse_inverse_depth.0       coarse_disparity
+cost_unet.0.                 cost_unet.
+cost_unet_out.0              cost_volume_unet
+cost_volume.0                cost_volume
+cost_volume_refined.0        cost_volume_refined
+inverse_depth_candidates.0   disparity_candidates
+match_logits.0               match_logits
+match_probability.0          match_pdf
+relative_pose.0              relative_pose
+warp_grid.0                  warp_grid
+"""
+"""Lines with the start of a name in files of DepthSplat and in those of MVSplat."""
 OUTPUTS = """
 features_cnn.0                        depth_predictor.backbone.conv2
 dino_block.0                          depth_predictor.pretrained.blocks.0
@@ -92,10 +103,17 @@ def sweep_tensors(golden: GoldenFile) -> Tensors:
     found["shift_mask"] = shift_mask(*low, device=near.device)
     sweep = Sweep(views.cameras, neighbours, near, far)
     if isinstance(encoder, MVSplatEncoder):
-        of_mvsplat(found, encoder, sweep, numbers)
-    else:
-        of_depthsplat(found, encoder.network.depth_predictor, sweep)
-        found["depth"] = numbers[..., 0].exp()
+        of_sweep(found, sweep, [encoder.config.candidates])
+        of_mvsplat(found, numbers)
+        return {mvsplat_name(name): x for name, x in found.items()}
+    predictor = encoder.network.depth_predictor
+    counts = [predictor.candidates(scale) for scale in range(encoder.config.scales)]
+    of_sweep(found, sweep, counts, 8)
+    height, width = views.cameras.size
+    found["dino_positions"] = predictor.pretrained.positions(height // PATCH, width // PATCH)
+    first = torch.arange(near.shape[1]).expand(near.shape)[..., None]
+    found["neighbours"] = torch.cat([first, neighbours], -1)
+    found["depth"] = numbers[..., 0].exp()
     if model.depth:
         # Of both scales, concatenated as in training.
         found["training.depths"] = torch.cat([numbers[..., -1], numbers[..., 0]]).exp()
@@ -104,21 +122,11 @@ def sweep_tensors(golden: GoldenFile) -> Tensors:
     return found
 
 
-def of_mvsplat(found: Tensors, encoder: MVSplatEncoder, sweep: Sweep, numbers: Tensor) -> None:
-    """Add to `found` the tensors of MVSplat that no module outputs.
+def of_mvsplat(found: Tensors, numbers: Tensor) -> None:
+    """Add to `found` further tensors of MVSplat that no module outputs.
 
     numbers: output of the networks for each pixel, (B, V, H, W, C).
     """
-    disparity = evenly_spaced(*bounds(sweep), encoder.config.candidates)
-    disparity = disparity.flatten(1).unflatten(0, sweep.near.shape)
-    found["disparity_candidates"] = disparity
-    found["match_pdf"] = found["match_logits"].softmax(2)
-    coarse = encoder.depth_predictor.match(found["features"], sweep)[0]
-    found["coarse_disparity"] = coarse.unflatten(0, sweep.near.shape)
-    poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
-    found["relative_pose"] = poses
-    low = found["cost_volume"].shape[-2:]
-    found["warp_grid"] = warps(sweep.cameras, poses, low, disparity)
     # The release keeps an axis of Gaussians a pixel here.
     for name in ("scales", "rotations"):
         found[name] = found[name][..., None, :]
@@ -127,18 +135,23 @@ def of_mvsplat(found: Tensors, encoder: MVSplatEncoder, sweep: Sweep, numbers: T
     found["raw_gaussians"] = numbers[..., 2:]
 
 
+def mvsplat_name(name: str) -> str:
+    """Return the name in files of MVSplat for a name in files of DepthSplat."""
+    for line in MVSPLAT_NAMES.strip().splitlines():
+        name = name.replace(*line.split())
+    return name
+
+
 def watch_mvsplat(kept: Recorder, encoder: MVSplatEncoder, low: tuple[int, ...]) -> None:
     """Record all modules whose input or output is in the golden file.
 
     low: size of the feature maps.
     """
     predictor = encoder.depth_predictor
-    refined = predictor.corr_refine_net
     kept.outputs(encoder, MVSPLAT_OUTPUTS)
     watch_transformer(kept, encoder.backbone.transformer, low, "features")
-    kept.input("cost_volume", refined, slice(encoder.config.candidates))
-    watch_unet(kept, "cost_unet", refined[3])
-    kept.input("cost_volume_refined", predictor.depth_head_lowres)
+    head = predictor.depth_head_lowres
+    watch_matching(kept, predictor.corr_refine_net, head, encoder.config.candidates)
     kept.input("fullres_disparity", predictor.refine_unet, slice(-2, -1))
     kept.input("pdf_max_fullres", predictor.refine_unet, slice(-1, None))
     watch_unet(kept, "depth_unet", predictor.refine_unet[3])
@@ -163,32 +176,36 @@ def watch_depthsplat(kept: Recorder, encoder: DepthSplatEncoder, low: tuple[int,
         lambda _, given: kept.found.update({"features_mono_eighth.3": kept.shaped(given[0][-1])})
     )
     for scale in range(encoder.config.scales):
-        regressor: Any = predictor.regressor[scale]
-        head = predictor.depth_head[scale]
-        kept.input(f"cost_volume.{scale}", regressor, slice(predictor.candidates(scale)))
-        kept.output(f"cost_unet.{scale}.stem", regressor[2])
-        watch_unet(kept, f"cost_unet.{scale}", regressor[3])
-        kept.output(f"cost_unet_out.{scale}", regressor)
-        kept.input(f"cost_volume_refined.{scale}", head)
-        kept.output(f"match_logits.{scale}", head)
+        count = predictor.candidates(scale)
+        watch_matching(kept, predictor.regressor[scale], predictor.depth_head[scale], count, scale)
     kept.output("raw_gaussians", network.gaussian_head, lambda x: kept.shaped(x).movedim(2, -1))
     kept.input("match_probability_max", network.gaussian_regressor, slice(4, 5))
 
 
-def of_depthsplat(found: Tensors, predictor: DepthPredictor, sweep: Sweep) -> None:
-    """Add to `found` the tensors of DepthSplat that no module outputs."""
+def watch_matching(
+    kept: Recorder, regressor: Any, head: nn.Module, count: int, scale: int = 0
+) -> None:
+    """Record the networks that correct a cost volume with `count` candidates and match views."""
+    kept.input(f"cost_volume.{scale}", regressor, slice(count))
+    kept.output(f"cost_unet.{scale}.stem", regressor[2])
+    watch_unet(kept, f"cost_unet.{scale}", regressor[3])
+    kept.output(f"cost_unet_out.{scale}", regressor)
+    kept.input(f"cost_volume_refined.{scale}", head)
+    kept.output(f"match_logits.{scale}", head)
+
+
+def of_sweep(found: Tensors, sweep: Sweep, counts: Sequence[int], step: int = 1) -> None:
+    """Add to `found` the tensors of a sweep that no module outputs, by the names of DepthSplat.
+
+    counts: number of candidates at each scale. step: the file has the warp of each `step`-th one.
+    """
     shape = sweep.near.shape
-    height, width = sweep.cameras.size
-    found["dino_positions"] = predictor.pretrained.positions(height // PATCH, width // PATCH)
-    first = torch.arange(shape[1]).expand(shape)[..., None]
-    found["neighbours"] = torch.cat([first, sweep.neighbours], -1)
     poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
-    counts = [predictor.candidates(scale) for scale in range(predictor.sizes.scales)]
     candidates = evenly_spaced(*bounds(sweep), counts[0])
     coarsest = candidates.flatten(1).unflatten(0, shape)
     found["inverse_depth_candidates.0"] = coarsest
     low = found["cost_volume.0"].shape[-2:]
-    found["warp_grid.0"] = warps(sweep.cameras, poses, low, coarsest[..., ::8])
+    found["warp_grid.0"] = warps(sweep.cameras, poses, low, coarsest[..., ::step])
     for scale, count in enumerate(counts):
         if scale:
             coarse = found["coarse_inverse_depth.0"].flatten(0, 1)
