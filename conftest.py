@@ -4,15 +4,9 @@ import gc
 
 import numpy as np
 import pytest
-import suite_watch
-from installing import install
 
-__all__ = ["install"]
-
-
-def pytest_configure(config):
-    """Have the whole suite, tests of plugins too, say what it costs."""
-    config.pluginmanager.register(suite_watch)
+pytest_plugins = ["installing", "suite_watch"]
+"""The fixture `install`; what the whole suite costs, tests of plugins too."""
 
 
 def pytest_collection_finish():
@@ -48,6 +42,7 @@ def here(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="session")
 def short_orbit():
+    """Make orbits of two frames of 16 pixels."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("qgs.reconstruction.saving.ORBIT_FRAMES", 2)
         patch.setattr("qgs.reconstruction.saving.ORBIT_SIDE", 16)
