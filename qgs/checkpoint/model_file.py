@@ -257,9 +257,8 @@ def load_weights(model: nn.Module, tensors: Weights, origin: object) -> None:
     # Everything is compared before anything is copied.
     refuse_misfit(model, tensors, origin)
     refuse_nonfinite(tensors, origin)
-    with torch.no_grad():
-        for name, tensor in unique_tensors(model).items():
-            tensor.copy_(tensors[name])
+    # A tensor that modules share comes under its first name alone, so that others are missing.
+    model.load_state_dict(tensors, strict=False)
 
 
 def refuse_nonfinite(tensors: Weights, origin: object) -> None:
