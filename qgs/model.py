@@ -80,6 +80,11 @@ class QueryGaussianModel(nn.Module):
         return model_text(self)
 
     @property
+    def device(self) -> torch.device:
+        """Device of the model's parameters."""
+        return next(self.parameters()).device
+
+    @property
     def depth(self) -> int:
         """Number of decoder layers that an evaluation runs, including repetitions by feedback."""
         return len(self.decoder) + self.feedback.rounds * self.feedback.layers

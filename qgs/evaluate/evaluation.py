@@ -181,7 +181,7 @@ class _Scorer:
     gaussians: int = 0
 
     def __post_init__(self) -> None:
-        self.device = next(self.model.parameters()).device
+        self.device = self.model.device
         for metric in self.measures.metrics.values():
             metric.to(self.device)
 

@@ -64,7 +64,7 @@ def tune(
     settings = recipe.evaluation
     loss = tuning_loss(recipe)
     what = settings.tuning
-    views = views.to(next(model.parameters()).device)
+    views = views.to(model.device)
     # Encoded once: weights and photos stay, so the memory does too.
     with torch.no_grad():
         memory = model.encoder(views)

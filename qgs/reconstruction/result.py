@@ -118,7 +118,7 @@ def reconstruct_sample(
     seen: frames that the model was trained on. changed: Gaussians to use in place of those from a
         forward pass; None runs the model.
     """
-    device = next(model.parameters()).device
+    device = model.device
     # Views come from the data on the CPU.
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     gaussians = model(sample.inputs).gaussians if changed is None else changed

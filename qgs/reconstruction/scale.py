@@ -141,7 +141,7 @@ def find_scale(
     # Places are thirds of a step, so that the finer search lies between those of the first.
     trial = _Trial(
         model,
-        sample.inputs.joined(sample.targets).to(next(model.parameters()).device),
+        sample.inputs.joined(sample.targets).to(model.device),
         len(given),
         # Photos that are not given count twice: inputs alone mislead.
         [1 / len(given) for _ in given] + [2 / len(further) for _ in further],
@@ -304,7 +304,7 @@ def find_size(
     if small is None or scene.times is not None:
         return None
     photos = small.targets.images[0]
-    device = next(model.parameters()).device
+    device = model.device
     found = []
     for sample in (small, whole):
         gaussians = model(sample.inputs.to(device)).gaussians

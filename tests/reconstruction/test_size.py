@@ -26,16 +26,16 @@ class Grey(Walk):
         return torch.full((len(frames), 3, *self.cameras.size), 0.5)
 
 
-class Painter(torch.nn.Linear):
+class Painter:
     """A model whose renderings are off by an error that depends on the side of the photos."""
 
+    device = torch.device("cpu")
     encoder = SimpleNamespace(config=None, size_multiple=lambda config: 8)
 
     def __init__(self, errors):
-        super().__init__(1, 1)
         self.errors = errors
 
-    def forward(self, views):
+    def __call__(self, views):
         return SimpleNamespace(gaussians=views.cameras.size)
 
     def render(self, gaussians, cameras):

@@ -108,7 +108,7 @@ def scenes_of(name: str, network: QueryGaussianModel, samples: Sequence[Sample])
     """Reconstruct `samples` by `network`, and keep the queries of the first sample."""
     # components draw random numbers in training mode
     network.eval()
-    device = next(network.parameters()).device
+    device = network.device
     own = [
         replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
         for sample in samples
