@@ -40,7 +40,7 @@ class QueryGaussianModel(nn.Module):
         index of the refinement for each decoder layer.
     recipe: the complete recipe of this model; None for a model built by hand.
     releases: distribution and version of each plugin of the recipe when the model was built.
-    trained_on: range of the training's cameras, from the checkpoint; None if it is unknown.
+    trained_on: range of the training's cameras, from the checkpoint; empty if it is unknown.
     loaded_from: absolute path of the checkpoint that `qgs.load` read; "" for other models.
     """
 
@@ -73,7 +73,7 @@ class QueryGaussianModel(nn.Module):
         self.renderer = renderer
         self.recipe = recipe
         self.releases: Mapping[str, tuple[str, str]] = {}
-        self.trained_on: Domain | None = None
+        self.trained_on = Domain()
         self.loaded_from = ""
 
     def __repr__(self) -> str:

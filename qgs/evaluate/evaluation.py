@@ -94,7 +94,8 @@ def _remarks(
 ) -> list[str]:
     """Return remarks on test views unlike the training views, and on scores below a baseline."""
     remarks: list[str] = []
-    if model.trained_on is not None:
+    # Of a model that was neither trained nor loaded there is nothing to say.
+    if model.loaded_from or model.trained_on.values:
         remarks.append(verdict(model.trained_on, seen))
     # Where a model sees what it is judged on, a copy of it is perfect.
     if evaluation.columns and not any(score.given for score in evaluation.scores):

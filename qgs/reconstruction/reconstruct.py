@@ -110,7 +110,7 @@ def choose_frames(
     inputs: int | None,
     frames: Sequence[int] | None,
     compare: Sequence[int] | None,
-    trained_on: Domain | None = None,
+    trained_on: Domain,
 ) -> Window:
     """Return the input frames of `scene` and the frames to compare the result with.
 
@@ -119,19 +119,17 @@ def choose_frames(
         and otherwise takes them from the best window of `ranked_windows`.
     compare: the user's choice of frames to compare with. None chooses frames that the inputs see;
         if the scene has times, frames of a single time between the inputs.
-    trained_on: distances and angles of cameras in the model's training; None allows any.
+    trained_on: distances and angles of cameras in the model's training; empty allows any.
     Raises ValueError for frames that do not exist or repeat, and for too few frames.
     """
     views = views.model_copy(update={"inputs": inputs or views.inputs})
-    # A model whose checkpoint records no range takes any views.
-    domain = trained_on or Domain()
     novel: Frames = ()
     if frames is not None:
         checked_window(len(scene), frames)
     if scene.times is not None:
         frames, novel = _over_time(scene, scene.times, views, frames)
     elif frames is None:
-        frusta = Frusta(scene, domain)
+        frusta = Frusta(scene, trained_on)
         frames = tuple(range(len(scene)))
         target = None
         if ranked := ranked_windows(frusta, views.inputs, compare):
@@ -142,7 +140,7 @@ def choose_frames(
                 frames = frusta.with_middle(frames, scored)
         novel = frusta.compared(frames, target)
     elif compare is None:
-        novel = Frusta(scene, domain).compared(tuple(frames))
+        novel = Frusta(scene, trained_on).compared(tuple(frames))
     # Photos that the user names replace the chosen ones.
     return checked_window(len(scene), frames, novel if compare is None else compare)
 
@@ -198,7 +196,7 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     remarks = (
         result.scale.poor if result.scale else "",
         result.worse_than_nearest,
-        verdict(result.model.trained_on or Domain(), found),
+        verdict(result.model.trained_on, found),
         choice(sample, scene),
     )
     return [*filter(None, remarks)]

@@ -134,7 +134,7 @@ def find_scale(
     frames = given if len(given) > 1 else given + further
     sample = half(sample, model) or sample
     depth = seen_depth(scene, inputs)
-    low, high = search_range(model.trained_on or Domain(), scene, frames, depth)
+    low, high = search_range(model.trained_on, scene, frames, depth)
     # Even steps in log scale: what counts is the ratio to the right factor.
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))

@@ -22,7 +22,7 @@ from qgs.checkpoint.tensors import (
     write_tensors,
 )
 from qgs.containers import map_tensors, named_tensors
-from qgs.domain import KEY, Domain
+from qgs.domain import KEY
 from qgs.files import is_leftover, naming_full_disk, read_records, write_text
 from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
@@ -216,8 +216,8 @@ class Saver:
                 ) from error
 
     def _write_checkpoint(self, path: Path, step: int, weights: Weights) -> None:
-        domain = self.model.trained_on or Domain()
-        save(self.model, path, extra={"step": str(step), KEY: domain.text}, weights=weights)
+        extra = {"step": str(step), KEY: self.model.trained_on.text}
+        save(self.model, path, extra=extra, weights=weights)
 
     def _write_state(self, states: Mapping[str, State]) -> None:
         # The history must reach the disk first: a state ahead of it would leave a gap.

@@ -21,7 +21,7 @@ def chosen(photos, inputs, times=range(9), held_out=(), gap=(3, 20)):
     """Input and compared frames of photos taken at `times`."""
     scene = GivenScene(photos.replace(times=torch.tensor([[*times]])))
     scene.held_out = held_out
-    return choose_frames(scene, ViewsConfig(gap=gap), inputs, None, None)
+    return choose_frames(scene, ViewsConfig(gap=gap), inputs, None, None, Domain())
 
 
 def test_inputs_spread_over_times_and_novel_frames_are_of_one_time_between(photos):
@@ -37,7 +37,8 @@ def test_held_out_times_are_compared_with_and_never_inputs(photos):
 
 
 def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
-    assert choose_frames(GivenScene(photos), ViewsConfig(), None, [1, 3], [2]) == ((1, 3), (2,))
+    given = (None, [1, 3], [2], Domain())
+    assert choose_frames(GivenScene(photos), ViewsConfig(), *given) == ((1, 3), (2,))
     for compared, *frames in ((0, 1, 5), (0, -1, 2), (0, 1, 1), (3, 0, 3)):
         must_refuse("frames", checked_window, 5, frames, [compared])
 

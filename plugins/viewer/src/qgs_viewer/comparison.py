@@ -246,7 +246,7 @@ def open_models(
     count = ALONE if len(models) == 1 else WINDOWS
     data = recipes[first.name].build_data()
     alone = len({*data.names("train"), *data.names("test")}) == 1
-    windows = PhotoWindows(first.network.trained_on or Domain(), count, alone)
+    windows = PhotoWindows(first.network.trained_on, count, alone)
     fixed = any(
         is_training_data(photos, recipe.data_config) or size_multiple(recipe) is None
         for recipe in trained.values()
