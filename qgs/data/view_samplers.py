@@ -3,10 +3,9 @@
 Source: TokenGS release (gap between inputs, targets from the span of the inputs).
 """
 
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from itertools import cycle
-from typing import TypeVar
+from itertools import cycle, groupby
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -50,12 +49,9 @@ def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
     frames: frames to group, by default those of `training_frames`.
     """
     frames = training_frames(scene) if frames is None else frames
-    if scene.times is None:
-        return [(frame,) for frame in frames]
-    together = defaultdict[float, list[int]](list)
-    for frame in frames:
-        together[scene.times[frame].item()].append(frame)
-    return [tuple(together[time]) for time in sorted(together)]
+    times: Any = range(len(scene)) if scene.times is None else scene.times.tolist()
+    ordered = sorted(frames, key=times.__getitem__)
+    return [tuple(moment) for _, moment in groupby(ordered, times.__getitem__)]
 
 
 def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
