@@ -15,16 +15,14 @@ def pixel_directions(intrinsics: Tensor, size: Size) -> Tensor:
     intrinsics (..., 4): fx, fy, cx, cy -> (..., H, W, 3). The centre of the first pixel is (0.5,
     0.5).
     """
-    height, width = size
-    options = {"dtype": intrinsics.dtype, "device": intrinsics.device}
-    v, u = torch.meshgrid(
-        torch.arange(height, **options) + 0.5, torch.arange(width, **options) + 0.5, indexing="ij"
-    )
-    fx, fy, cx, cy = (intrinsics[..., i, None, None] for i in range(4))
+    centres = [
+        torch.arange(side, dtype=intrinsics.dtype, device=intrinsics.device) + 0.5 for side in size
+    ]
+    # Rows come first in a size, but x in a pixel.
+    pixels = torch.cartesian_prod(*centres).flip(-1).unflatten(0, size)
+    focal, principal = intrinsics[..., None, None, :].split(2, -1)
     # z = 1, not unit length: a depth times the direction is then a point.
-    x = (u - cx) / fx
-    y = (v - cy) / fy
-    return torch.stack([x, y, torch.ones_like(x)], -1)
+    return F.pad((pixels - principal) / focal, (0, 1), value=1.0)
 
 
 @full_precision

@@ -151,8 +151,7 @@ def _image_excess(
         z = torch.where(z.abs() < z_guard, z_guard, z)
     # Divide by 1 there and insert the value later: where() alone would pass NaN gradients.
     at_zero = z.abs() < _TINY_Z
-    focal = cameras.intrinsics[..., :2]
-    principal = cameras.intrinsics[..., 2:]
+    focal, principal = cameras.intrinsics.split(2, -1)
     pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal
     pixels = torch.where(at_zero, torch.where(xy == 0, 0.0, infinite_pixel * xy.sign()), pixels)
     height, width = cameras.size
