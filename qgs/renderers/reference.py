@@ -161,6 +161,6 @@ def _weights(
     # Alpha below alpha_min changes no 8-bit image. The cap: gradients divide by 1 - alpha.
     alphas = torch.where(alphas >= config.alpha_min, alphas.clamp(max=config.alpha_cap), 0.0)
     after = torch.cumprod(1 - alphas, 0)
-    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])[: len(after)]
+    before = F.pad(after, (0, 0, 0, 0, 1, 0), value=1.0)[:-1]
     # `after`, not `before`: a Gaussian that would close the pixel is left out, as in gsplat.
     return torch.where(after > config.transmittance_min, alphas * before, 0.0)
