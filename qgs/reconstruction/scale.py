@@ -21,7 +21,7 @@ import torch
 import torch.nn.functional as F
 
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.inputs import seen_depth
+from qgs.data.inputs import BASELINE, seen_depth
 from qgs.data.samples import Sample, make_sample, shrunk
 from qgs.domain import Domain
 from qgs.geometry.poses import scaled
@@ -38,9 +38,6 @@ STEP = 1.6
 """Ratio of neighbouring factors in the coarse search."""
 MOST = 16
 """Largest number of factors in the coarse search."""
-BASELINES = (0.06, 0.25)
-"""Smallest and largest baseline to assume if the model does not record those of its training. A
-baseline is the largest distance between the inputs of a sample."""
 BELOW = 2.0
 """Ratio of the smallest baseline in training to the smallest that the search tries."""
 ABOVE = 4.0
@@ -193,7 +190,8 @@ def search_range(
     """
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
     baseline = float(torch.cdist(centres, centres).max())
-    least, most = trained.ranges.get("baseline", BASELINES)
+    # A baseline is the largest distance between the inputs of a sample.
+    least, most = trained.ranges.get("baseline", BASELINE)
     # Cameras on one point leave nothing to search: no factor changes what they see.
     if not baseline or not most:
         return 1.0, 1.0
