@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.transforms import quat_to_matrix
@@ -123,10 +124,8 @@ def on_photo(cameras: Cameras, pixels: Tensor, depth: float | Tensor) -> Tensor:
 
     cameras: (V,). pixels: (P, 2), the same pixels in all cameras. depth: one for all, or (V, P, 1).
     """
-    focal = cameras.intrinsics[:, None, :2]
-    principal = cameras.intrinsics[:, None, 2:]
-    flat = (pixels.to(focal) - principal) / focal
-    local = torch.cat([flat, torch.ones_like(flat[..., :1])], -1) * depth
+    focal, principal = cameras.intrinsics[:, None].split(2, -1)
+    local = F.pad((pixels.to(focal) - principal) / focal, (0, 1), value=1.0) * depth
     return local @ cameras.c2w[:, :3, :3].to(local).mT + cameras.c2w[:, None, :3, 3].to(local)
 
 
