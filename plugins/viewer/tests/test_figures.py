@@ -63,7 +63,7 @@ def test_attention_is_that_of_the_query_that_was_asked_for():
     assert [tile is None for tile in rows["tokengs, query 5"]] == [False, True, False]
     found = attention_pictures_of(models[1].scene, 5, models[1].scene.depth, Detail.side // 2)
     drawn = [tile.image for tile in rows["locus, query 5"]]
-    for picture, part in zip(drawn, ("content", "geometry", "result"), strict=True):
+    for picture, part in zip(drawn, ("content", "geometry", "weights"), strict=True):
         assert np.array_equal(picture, side_by_side(found[part]))
 
 

@@ -119,7 +119,7 @@ def test_a_model_without_anchors_has_the_rest(server):
     panel = panel_of(server, source_of("tokengs"))
     panel.pick(3)
     assert nodes(panel) == BASE | {"reading"}
-    assert {p for p, picture in panel.pictures.items() if picture.visible} == {"content", "result"}
+    assert {p for p, picture in panel.pictures.items() if picture.visible} == {"content", "weights"}
 
 
 def test_other_inputs_make_another_scene_at_once(panel):

@@ -18,7 +18,8 @@ from qgs_viewer.look import INK, Color, categorical, enlarged
 from qgs_viewer.query_scene import QueryScene
 
 ATTENTION_COLOR = categorical(0)
-PARTS = {"content": "content logits", "geometry": "geometry bias", "result": "attention"}
+PARTS = {"content": "content logits", "geometry": "geometry bias", "weights": "attention"}
+"""Captions of the fields of AttentionWeights."""
 # Lines are drawn on pictures so many times as large, which smooths them.
 OVERSAMPLING = 3
 # Part of a picture along its border, where no query is chosen to be shown.
@@ -262,10 +263,9 @@ def attention_pictures_of(
     if found is None or scene.views is None:
         return {}
     photos = [enlarged(rgb_picture(image), side) for image in scene.views.images[0]]
-    values = {"result": found.weights, "content": found.content, "geometry": found.geometry}
     return {
         part: attention_pictures(photos, patch_maps(value[0, :, 0], scene.grid))
-        for part, value in values.items()
+        for part, value in vars(found).items()
         if value is not None
     }
 
