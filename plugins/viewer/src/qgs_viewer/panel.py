@@ -3,7 +3,7 @@
 import re
 import socket
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -132,15 +132,6 @@ class Panel:
         # setting the field calls `_typed`
         self.number.value = NONE if query is None else query
 
-    def take(self, frames: Sequence[int]) -> None:
-        """Reconstruct from the photos with the indices `frames`, and show the result.
-
-        Raises ValueError if the model cannot take these photos, and OSError if one is unreadable.
-        """
-        with self._lock:
-            if tuple(frames) != tuple(self.scene.frames):
-                self._show(self.drawing.put, self.source.scene_of(frames), self.choice)
-
     def _show(self, draw: Callable[..., None], scene: QueryScene, choice: Choice) -> None:
         """Draw a scene, describe the picked query, and store `scene` and `choice`.
 
@@ -167,11 +158,15 @@ class Panel:
 
         If this fails, the last scene stays, and a notification in the browser gives the error.
         """
-        try:
-            self.take([frame for frame, box in enumerate(self.boxes) if box.value])
-        except (ValueError, OSError) as error:
-            if event.client is not None:
-                event.client.add_notification("Not reconstructed", str(error), color="red")
+        with self._lock:
+            frames = tuple(frame for frame, box in enumerate(self.boxes) if box.value)
+            try:
+                if frames != tuple(self.scene.frames):
+                    self._show(self.drawing.put, self.source.scene_of(frames), self.choice)
+            # the model cannot take these photos, or one is unreadable
+            except (ValueError, OSError) as error:
+                if event.client is not None:
+                    event.client.add_notification("Not reconstructed", str(error), color="red")
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         with self._lock:
