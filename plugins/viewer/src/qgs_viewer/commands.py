@@ -144,10 +144,10 @@ Only = Annotated[
     list[FigureName] | None, typer.Option(help="Figure to draw. Repeatable. Default: all figures.")
 ]
 
-view_app = typer.Typer(help="Show a reconstruction in the browser.")
-demo_app = typer.Typer(help="Compare trained models on unseen rooms or on your photos.")
-report_app = typer.Typer(help="Evaluate trained models and write a report page.")
-figures_app = typer.Typer(help="Draw figures of trained models for a paper.")
+view_app = typer.Typer()
+demo_app = typer.Typer()
+report_app = typer.Typer()
+figures_app = typer.Typer()
 
 
 @view_app.command()
