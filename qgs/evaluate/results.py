@@ -191,9 +191,7 @@ class Evaluation:
         """Yield notes to print below the table, such as missing scores and the protocol."""
         content = self.protocol.content
         height, width = content["image_size"]
-        counts = set[int]()
-        for score in self.scores:
-            counts.update(len(inputs) for inputs, _ in score.views)
+        counts = {len(inputs) for score in self.scores for inputs, _ in score.views}
         poses = content["poses"]
         scale = f"{poses['scale']} {poses.get('scale_factor', '')}".rstrip()
         yield (
