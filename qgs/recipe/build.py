@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -183,8 +182,11 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
     paths = {name: _paths(name.removeprefix("model."), model) for name in factors}
     problems = Problems()
     for pattern, factor in config.parts.items():
-        fits = partial(matches, pattern, below=True)
-        named = [name for name in factors if any(map(fits, paths[name]))]
+        named = [
+            name
+            for name in factors
+            if any(matches(pattern, path, below=True) for path in paths[name])
+        ]
         factors |= dict.fromkeys(named, float(factor))
         # The trained module has the model as `model`, a recipe its parts in the section `model`.
         wanted = pattern.removeprefix("model.").split(".")
