@@ -6,7 +6,7 @@ trace.layers[4].cross_attention.weights         # (scenes, heads, chosen queries
 """
 
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -103,19 +103,17 @@ def trace(
     if model.queries.count is not None:
         _checked(queries, range(model.queries.count), "queries")
     recorded = Trace(numbers, queries)
-    handles = [model.register_forward_pre_hook(recorded._start)]
-    for layer in model.decoder:
-        handles.append(layer.register_forward_pre_hook(recorded._enter))
-        for part in ("cross_attention", "self_attention"):
-            if hasattr(layer, part):
-                hook = partial(recorded._explain, part)
-                handles.append(getattr(layer, part).register_forward_pre_hook(hook))
-    handles += [part.register_forward_hook(recorded._leave) for part in model.refinements]
-    try:
+    with ExitStack() as hooks:
+        hooks.enter_context(model.register_forward_pre_hook(recorded._start))
+        for layer in model.decoder:
+            hooks.enter_context(layer.register_forward_pre_hook(recorded._enter))
+            for part in ("cross_attention", "self_attention"):
+                if hasattr(layer, part):
+                    hook = partial(recorded._explain, part)
+                    hooks.enter_context(getattr(layer, part).register_forward_pre_hook(hook))
+        for refinement in model.refinements:
+            hooks.enter_context(refinement.register_forward_hook(recorded._leave))
         yield recorded
-    finally:
-        for handle in handles:
-            handle.remove()
 
 
 def _checked(wanted: Collection[int] | None, existing: range, what: str) -> list[int]:

@@ -4,7 +4,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from importlib.util import find_spec
 from types import FrameType
@@ -106,9 +106,7 @@ def stop_requests(quiet: bool) -> Iterator[StopRequest]:
         request.append(asked)
 
     # Restored afterwards, because a notebook has handlers of its own.
-    before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with ExitStack() as before:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before.callback(signal.signal, number, signal.signal(number, ask))
         yield request
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

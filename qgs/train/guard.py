@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, NoReturn
@@ -346,18 +346,15 @@ def first_bad_tensor(
 
     for name, tensor in unique_tensors(training_pass).items():
         see(f"weight {name}", tensor)
-    handles = [training_pass.register_forward_pre_hook(see_batch)]
-    for name, module in training_pass.named_modules():
-        if name:
-            handles.append(module.register_forward_hook(partial(see_output, name)))
-    for name, parameter in training_pass.named_parameters():
-        if parameter.requires_grad:
-            handles.append(parameter.register_hook(partial(see, f"gradient of {name}")))
-    try:
+    with ExitStack() as hooks:
+        hooks.enter_context(training_pass.register_forward_pre_hook(see_batch))
+        for name, module in training_pass.named_modules():
+            if name:
+                hooks.enter_context(module.register_forward_hook(partial(see_output, name)))
+        for name, parameter in training_pass.named_parameters():
+            if parameter.requires_grad:
+                hooks.enter_context(parameter.register_hook(partial(see, f"gradient of {name}")))
         repeat()
-    finally:
-        for handle in handles:
-            handle.remove()
     return "".join(found)
 
 
