@@ -48,15 +48,17 @@ class Photometric(Loss):
 
         Raises ValueError for images too small for SSIM.
         """
+        config = self.config
+        images = (rendering.rgb, target.images)
         terms = {}
-        if self.config.mse_weight:
-            terms["mse"] = self.config.mse_weight * mean_squared_error(rendering.rgb, target.images)
-        if self.config.l1_weight:
-            terms["l1"] = self.config.l1_weight * F.l1_loss(rendering.rgb, target.images)
-        if self.config.ssim_weight:
+        if config.mse_weight:
+            terms["mse"] = config.mse_weight * mean_squared_error(*images)
+        if config.l1_weight:
+            terms["l1"] = config.l1_weight * F.l1_loss(*images)
+        if config.ssim_weight:
             # SSIM lies between -1 and 1, so this term lies between 0 and its weight.
-            similarity = mean_ssim(rendering.rgb, target.images, self.config.padding)
-            terms["ssim"] = self.config.ssim_weight * (1 - similarity) / 2
+            similarity = mean_ssim(*images, config.padding)
+            terms["ssim"] = config.ssim_weight * (1 - similarity) / 2
         return terms
 
 
