@@ -66,10 +66,9 @@ def concatenated(parts: Sequence[_C], dim: int, join: Callable[..., Tensor] = to
     for other in found:
         if some := sorted(other.keys() ^ found[0].keys()):
             raise ValueError(f"{', '.join(some)} must be in all concatenated parts or in none")
-    joined = [join([tensors[name] for tensors in found], dim) for name in found[0]]
+    joined = (join([tensors[name] for tensors in found], dim) for name in found[0])
     # `map_tensors` comes to the tensors in the order of their names.
-    tensors = iter(joined)
-    return map_tensors(lambda _: next(tensors), parts[0])
+    return map_tensors(lambda _: next(joined), parts[0])
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
