@@ -161,9 +161,9 @@ class Component(metaclass=ABCMeta):
         super().__init__()
         self.config = config
 
-    def __init_subclass__(cls, **options: Any) -> None:
+    def __init_subclass__(cls) -> None:
         """Give every subclass its own Config class, with a reference to the subclass."""
-        super().__init_subclass__(**options)
+        super().__init_subclass__()
         # A Config stores its component, so components must not share one.
         if cls.Config.__qualname__ != f"{cls.__qualname__}.Config":
 
