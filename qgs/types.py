@@ -312,17 +312,10 @@ class Gaussians(_Batch):
 
         Returns all Gaussians if there are fewer.
         """
-        # Sorted again, so that files keep the order of the queries.
-        chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
-
-        def kept(x: Tensor) -> Tensor:
-            index = chosen
-            # `take_along_dim` needs the same number of axes as x.
-            while index.ndim < x.ndim:
-                index = index[..., None]
-            return x.take_along_dim(index, chosen.ndim - 1)
-
-        return map_tensors(kept, self)
+        chosen = self.opacities.topk(min(count, self.count), -1).indices
+        # By a mask, so that files keep the order of the queries.
+        kept = torch.zeros_like(self.opacities, dtype=torch.bool).scatter(-1, chosen, True)
+        return map_tensors(lambda x: x[kept].unflatten(0, chosen.shape), self)
 
 
 @dataclass(frozen=True)
