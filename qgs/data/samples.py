@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.containers import concatenated, map_tensors
-from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.contracts import Frames, Scene, ViewsConfig, Window
 from qgs.data.view_samplers import refuse_too_many
 from qgs.geometry.poses import (
     largest_distance,
@@ -56,14 +56,13 @@ class Batch:
     """Batch of B samples: views (B, V_in) and (B, V_out), with names of scenes and frame numbers.
 
     V_in and V_out are the numbers of input views and target views. Tensors are float32 and
-    contiguous.
+    contiguous. windows: frames of inputs and of targets, for each sample.
     """
 
     inputs: Views
     targets: Views
     scenes: tuple[str, ...]
-    input_frames: tuple[Frames, ...]
-    target_frames: tuple[Frames, ...]
+    windows: tuple[Window, ...]
     left_out: tuple[str, ...] = ()
     """Messages about samples that failed and were replaced: scene, frame and reason."""
 
@@ -275,8 +274,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
         inputs=stack_views([sample.inputs for sample in samples]),
         targets=stack_views([sample.targets for sample in samples]),
         scenes=tuple(sample.scene for sample in samples),
-        input_frames=tuple(sample.input_frames for sample in samples),
-        target_frames=tuple(sample.target_frames for sample in samples),
+        windows=tuple((sample.input_frames, sample.target_frames) for sample in samples),
     )
 
 

@@ -359,8 +359,7 @@ def first_bad_tensor(
 
 
 def _samples(batch: Batch) -> str:
-    drawn = zip(batch.scenes, batch.input_frames, batch.target_frames, strict=True)
     return ", ".join(
         f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
-        for scene, inputs, targets in drawn
+        for scene, (inputs, targets) in zip(batch.scenes, batch.windows, strict=True)
     )

@@ -32,7 +32,7 @@ def told(step, tensor, batch):
     """Whether the words about a step begin with the tensor, and name the samples of the batch."""
     drawn = step.batches[batch]
     words = step.first()
-    parts = (f"scene {drawn.scenes[0]!r}", f"targets {list(drawn.target_frames[0])}")
+    parts = (f"scene {drawn.scenes[0]!r}", f"targets {list(drawn.windows[0][1])}")
     return words.startswith(f"the first bad tensor is {tensor}") and all(p in words for p in parts)
 
 
