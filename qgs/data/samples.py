@@ -7,7 +7,7 @@ copies images on one thread, because threads of torch would wait for cores that 
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -87,9 +87,9 @@ def make_sample(
     both = views_in(world, scene, frames, depths)
     count = len(input_frames)
     if both.times is not None:
-        both = replace(both, target_time=_asked(both.times, count))
+        both = both.replace(target_time=_asked(both.times, count))
     if noise is not None and views.pose_noise:
-        both = replace(both, cameras=with_noise(both.cameras, count, views, noise))
+        both = both.replace(cameras=with_noise(both.cameras, count, views, noise))
         # The first camera is exact, so its depth map is valid.
         if both.depths is not None:
             both.depths[:, 1:count] = 0
@@ -136,7 +136,7 @@ def with_noise(
     off = cameras.c2w.clone()
     off[0, 1:inputs, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
     off[0, 1:inputs, :3, 3] += (moves * distances)[1:]
-    return replace(cameras, c2w=off)
+    return cameras.replace(c2w=off)
 
 
 def views_in(world: World, scene: Scene, frames: Frames, depths: bool = False) -> Views:
@@ -235,7 +235,7 @@ def mirrored_views(views: Views) -> Views:
         lambda x: torch.from_numpy(np.ascontiguousarray(x.numpy()[..., ::-1])),
         (views.images, views.masks, views.depths),
     )
-    return replace(views, images=images, cameras=flipped, masks=masks, depths=depths)
+    return views.replace(images=images, cameras=flipped, masks=masks, depths=depths)
 
 
 def shrunk(views: Views, part: int) -> Views:
@@ -255,7 +255,7 @@ def shrunk(views: Views, part: int) -> Views:
     factors = [size[1] / width, size[0] / height]
     intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
     cameras = views.cameras.replace(intrinsics=intrinsics, size=size)
-    return replace(views, images=images, cameras=cameras, masks=masks)
+    return views.replace(images=images, cameras=cameras, masks=masks)
 
 
 def collate(samples: Sequence[Sample]) -> Batch:

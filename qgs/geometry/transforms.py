@@ -1,7 +1,6 @@
 """Transforms of points to camera frames and pixels; operations on quaternions and on Gaussians."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -86,8 +85,7 @@ def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
     pose = pose.to(gaussians.means.device, torch.float64)
     rotation = pose[:3, :3]
     turn = rotation_matrix_to_quaternion(rotation).to(gaussians.quats).expand_as(gaussians.quats)
-    placed = replace(
-        gaussians,
+    placed = gaussians.replace(
         means=gaussians.means.double() * factor @ rotation.T + pose[:3, 3],
         scales=gaussians.scales * factor,
         quats=quat_product(turn, gaussians.quats),
@@ -104,4 +102,4 @@ def narrowed(gaussians: Gaussians) -> Gaussians:
     """
     means = gaussians.means.to(gaussians.scales.dtype)
     off = (means - gaussians.means).norm(dim=-1) > MOVED * gaussians.scales.norm(dim=-1)
-    return gaussians if off.float().mean() > 0.5 else replace(gaussians, means=means)
+    return gaussians if off.float().mean() > 0.5 else gaussians.replace(means=means)

@@ -1,7 +1,7 @@
 """Draw queries on photos: anchors, support ellipsoids, attention, Gaussians."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -175,7 +175,7 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
     # it is the gradient of a render's sum by the colours
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
-        painted = replace(gaussians, colors=colors, sh=None, features=None)
+        painted = gaussians.replace(colors=colors, sh=None, features=None)
         rgb = model.render(painted, cameras).rgb
         (gradient,) = torch.autograd.grad(rgb.sum(), colors)
     return gradient.mean(-1)
@@ -231,7 +231,7 @@ def query_picture(
     colors = paint.repeat_interleave(per_query, 0)[None]
     # a query whose Gaussians are nearly clear is still seen
     opacities = shown.opacities.clamp_min(0.5)
-    visible = replace(shown, colors=colors, opacities=opacities, sh=None, features=None)
+    visible = shown.replace(colors=colors, opacities=opacities, sh=None, features=None)
     # over black, so that its colour and alpha can be mixed with the scene
     painted = model.render(visible, cameras, torch.zeros(3))
     alpha = painted.alpha[0, 0, 0].cpu().numpy()[..., None]
