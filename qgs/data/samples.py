@@ -181,7 +181,7 @@ def in_world(world: World, cameras: Cameras) -> Cameras:
 def from_0_to_1(times: Tensor) -> Tensor:
     """Return times (F,) scaled to [0, 1] (TokenGS 2026.6), or zeros if all times are equal."""
     first, last = times.aminmax()
-    return (times - first) / (last - first) if last > first else torch.zeros_like(times)
+    return (times - first) / (last - first or 1)
 
 
 def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> World:
