@@ -247,11 +247,9 @@ def shrunk(views: Views, part: int) -> Views:
         return views
     height, width = views.cameras.size
     size = (height // part, width // part)
-
-    def smaller(images: Tensor) -> Tensor:
-        return F.interpolate(images[0], size=size, mode="area")[None]
-
-    images, masks = map_tensors(smaller, (views.images, views.masks))
+    images, masks = map_tensors(
+        lambda x: F.interpolate(x[0], size=size, mode="area")[None], (views.images, views.masks)
+    )
     factors = [size[1] / width, size[0] / height]
     intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
     cameras = views.cameras.replace(intrinsics=intrinsics, size=size)
