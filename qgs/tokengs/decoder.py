@@ -7,6 +7,7 @@ from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import (
+    SUBLAYER_SLOTS,
     AttentionWeights,
     ComponentConfig,
     CrossAttention,
@@ -51,7 +52,7 @@ class CrossSelfMlp(DecoderLayer):
     """
 
     name = "cross_self_mlp"
-    sublayers = ("cross_attention", "self_attention", "feed_forward")
+    sublayers = SUBLAYER_SLOTS
 
     def __init__(self, config: ComponentConfig, parts: LayerParts) -> None:
         super().__init__(config, parts)
