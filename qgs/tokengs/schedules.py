@@ -70,7 +70,7 @@ class Steps(_Listed):
     @property
     def corners(self) -> tuple[int, ...]:
         """Steps in `at`, and the last step before each of them."""
-        before = [max(at - 1, 0) for at in self.at]
+        before = [at - 1 for at in self.at]
         return (*before, *self.at)
 
 
