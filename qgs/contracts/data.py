@@ -19,7 +19,6 @@ Split = Literal["train", "test"]
 Frames: TypeAlias = tuple[int, ...]
 Window: TypeAlias = tuple[Frames, Frames]
 """Indices of the input frames, and of the target frames with which renderings are compared."""
-Side: TypeAlias = PositiveInt
 
 
 class Scene(ABC):
@@ -84,7 +83,7 @@ class Scene(ABC):
 class SceneSourceConfig(ComponentConfig):
     """Options of all data sources. A source adds the option `path`, the location of its data."""
 
-    image_size: tuple[Side, Side] = (64, 64)
+    image_size: tuple[PositiveInt, PositiveInt] = (64, 64)
     """Size (H, W), in pixels, of all images that the source returns."""
 
 

@@ -3,14 +3,12 @@
 import math
 from bisect import bisect_right
 from collections.abc import Mapping
-from typing import ClassVar, Literal, Self, TypeAlias
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from qgs.contracts.component import OptionError
 from qgs.contracts.schedule import Schedule
-
-Step: TypeAlias = NonNegativeInt
 
 
 class Constant(Schedule):
@@ -82,7 +80,7 @@ class Linear(_Listed):
     values: tuple[float, ...] = Field(min_length=2)
     """The numbers at the steps in `at`. The first one also holds before the first step, the last
     one after the last step."""
-    at: tuple[Step, ...]
+    at: tuple[NonNegativeInt, ...]
     """Ascending training steps, one for each of `values`."""
 
     def number(self, step: int) -> float:
