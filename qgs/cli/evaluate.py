@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli import options
-from qgs.cli.options import Checkpoint, Device, Gaussians, Overrides, Threads, Tune
+from qgs.cli.options import Checkpoint, Device, Gaussians, Overrides, Threads, Tune, use_threads
 
 if TYPE_CHECKING:
     from qgs.evaluate.results import Evaluation
@@ -52,7 +51,7 @@ def evaluate(
     from qgs.recipe import resolve
     from qgs.train.distributed import choose_device
 
-    options.use_threads(threads)
+    use_threads(threads)
     settings += tuning_settings(tune)
     free = (*SECTIONS, "model.feedback.rounds")
     for setting in settings:

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 
-from qgs.cli import options
 from qgs.cli.options import (
     Checkpoint,
     Device,
@@ -15,14 +15,16 @@ from qgs.cli.options import (
     Scale,
     SceneName,
     Size,
+    Threads,
     Tune,
     ViewsSettings,
+    parse_size,
+    scale_settings,
+    use_threads,
 )
 from qgs.files import refuse_filled
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from qgs.reconstruction.result import Reconstruction
 
 
@@ -53,7 +55,7 @@ def reconstruct(
     size: Size = None,
     gaussians: Gaussians = None,
     scene_name: SceneName = None,
-    threads: options.Threads = None,
+    threads: Threads = None,
     device: Device = "auto",
 ) -> None:
     """Reconstruct a scene from photos.
@@ -64,13 +66,11 @@ def reconstruct(
     """
     _refuse_unusable(out, overwrite)
 
-    from rich.console import Console
-
     from qgs.checkpoint.model_file import load
     from qgs.reconstruction.reconstruct import reconstruct as run
     from qgs.train.distributed import choose_device
 
-    options.use_threads(threads)
+    use_threads(threads)
     console = Console()
     result = run(
         load(checkpoint, choose_device(device), gaussians=gaussians),
@@ -78,9 +78,9 @@ def reconstruct(
         inputs=inputs,
         frames=frames,
         compare=holdout,
-        size=options.parse_size(size),
+        size=parse_size(size),
         scene=scene_name,
-        overrides=[*(overrides or ()), *options.scale_settings(scale)],
+        overrides=[*(overrides or ()), *scale_settings(scale)],
         tune=tune,
     )
     show(result, console)
@@ -104,7 +104,7 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
         find()
 
 
-def show(result: "Reconstruction", console: "Console") -> None:
+def show(result: "Reconstruction", console: Console) -> None:
     """Print the PSNR of model and baselines in each view, means by kind of view, and remarks."""
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
