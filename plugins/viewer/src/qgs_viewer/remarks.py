@@ -49,9 +49,8 @@ def chosen_windows(model: Model) -> Iterator[str]:
         return
     for score in model.evaluation.scores:
         texts = []
-        for inputs, targets in score.views:
-            given = listed(score.names.get(frame, frame) for frame in inputs)
-            judged = listed(score.names.get(frame, frame) for frame in targets)
+        for window in score.views:
+            given, judged = (listed(score.names.get(f, f) for f in frames) for frames in window)
             texts.append(f"{given} ({judged})")
         windows = "; ".join(texts)
         yield f"{score.scene}, input photos (scored photos in parentheses): {windows}"
