@@ -16,8 +16,7 @@ from qgs.wording import listed
 from qgs_viewer import sections
 from qgs_viewer.commands import FigureName
 from qgs_viewer.look import hex_color
-from qgs_viewer.scenes import ModelScenes
-from qgs_viewer.sections import Detail, Section
+from qgs_viewer.sections import Detail, Section, Shown
 
 # Inches of a figure across a page of two columns.
 WIDTH = 7.0
@@ -25,7 +24,7 @@ DPI = 220
 # Pixels on the longer side of pictures that models render.
 SIDE = 512
 LISTING = "figures.md"
-FIGURES: Mapping[str, Callable[[Sequence[ModelScenes], Detail], Section]] = {
+FIGURES: Mapping[str, Callable[[Shown, Detail], Section]] = {
     "novel_views": sections.novel_views,
     "queries": sections.queries,
     "anchors": sections.anchors,
@@ -36,7 +35,7 @@ FIGURES: Mapping[str, Callable[[Sequence[ModelScenes], Detail], Section]] = {
 
 @torch.no_grad()
 def write_figures(
-    models: Sequence[ModelScenes],
+    models: Shown,
     folder: Path,
     names: Sequence[FigureName],
     query: int | None,
