@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from pydantic import PositiveFloat
 from torch import Tensor
 
+from qgs.containers import concatenated
 from qgs.contracts import Loss
 from qgs.geometry.transforms import to_camera
 from qgs.precision import full_precision
@@ -52,7 +53,7 @@ class DepthSurface(Loss):
         found = [
             surface_errors(means, view, self.config.beta, self.config.near) for view in measured
         ]
-        errors, seen = (torch.cat(parts, 1) for parts in zip(*found, strict=True))  # (B, V, G)
+        errors, seen = concatenated(found, 1)  # (B, V, G)
         # Places without a query have Gaussians that nobody sees.
         if mask is not None:
             seen = seen & mask.repeat_interleave(means.shape[1] // mask.shape[1], 1)[:, None]
