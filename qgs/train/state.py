@@ -150,9 +150,9 @@ class OptimizerState:
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         names = {parameter: name for name, parameter in module.named_parameters()}
-        self._names: list[str] = []
-        for group in optimizer.param_groups:
-            self._names += [names[parameter] for parameter in group["params"]]
+        self._names = [
+            names[parameter] for group in optimizer.param_groups for parameter in group["params"]
+        ]
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
