@@ -94,7 +94,7 @@ def make_sample(
         if both.depths is not None:
             both.depths[:, 1:count] = 0
     both = mirrored_views(both) if mirror else both
-    names = {frame: scene.frame_name(frame) for frame in frames}
+    names = {frame: name for frame in frames if (name := scene.frame_name(frame)) != str(frame)}
     return Sample(
         scene=scene.name,
         inputs=both.select(slice(0, count)),
@@ -102,7 +102,7 @@ def make_sample(
         input_frames=input_frames,
         target_frames=target_frames,
         world=world,
-        names={frame: name for frame, name in names.items() if name != str(frame)},
+        names=names,
     )
 
 
