@@ -7,9 +7,8 @@ float32. Each sum is added in a fixed order, so a repeated run gives the same bi
 
 A query has five numbers: its anchor's centre mu = (x, y, z), factor = gamma / (2 sigma^2) and
 lower = gamma * bias_min. A token has six: moment and direction of its ray. `RayBias` in
-`qgs_locus.ray_bias` explains them. The functions of the bias get pointers (n, 1) and (1, m) to the
-first numbers of n queries and m tokens. `step` is the stride between two numbers of a token.
-The kernels take these numbers as read_q (B, N, 5) and read_k (B, 6, M).
+`qgs_locus.ray_bias` explains them. The kernels take these numbers as queries (B, N, 5) and tokens
+(B, 6, M). Every 4-d tensor (B, h, count, width) comes with its strides and its shape.
 
 Axes: as in `qgs_locus.kernels.attention_bias`. W is the head width d, rounded up to a power of two.
 """
@@ -28,46 +27,37 @@ G = tl.constexpr(6)
 
 
 @jit
-def _moment(queries, tokens, step):
-    """Return mu x d - m, whose length is the distance of anchor and ray, as three tensors (n, m).
+def _read(queries, tokens, n, m, N, M):
+    """Load what the bias of queries n and tokens m of the program's scene is computed from.
 
-    mu is the anchor's centre, m and d are moment and direction of the ray. The three tensors hold
-    the coordinates.
+    Returns e = mu x d - m, whose length is the distance of anchor and ray, as three tensors (n, m)
+    of coordinates; the ray's direction d, as three tensors (1, m); factor and lower, each (n, 1).
+    mu is the anchor's centre, m the ray's moment.
     """
-    x = tl.load(queries)
-    y = tl.load(queries + 1)
-    z = tl.load(queries + 2)
-    m0 = tl.load(tokens)
-    m1 = tl.load(tokens + step)
-    m2 = tl.load(tokens + 2 * step)
-    d0 = tl.load(tokens + 3 * step)
-    d1 = tl.load(tokens + 4 * step)
-    d2 = tl.load(tokens + 5 * step)
-    return y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2
+    scene = tl.program_id(2).to(tl.int64)
+    of_n = queries + (scene * N + tl.minimum(n, N - 1))[:, None] * F
+    of_m = tokens + scene * G * M + tl.minimum(m, M - 1)[None, :]
+    x = tl.load(of_n)
+    y = tl.load(of_n + 1)
+    z = tl.load(of_n + 2)
+    m0 = tl.load(of_m)
+    m1 = tl.load(of_m + M)
+    m2 = tl.load(of_m + 2 * M)
+    d0 = tl.load(of_m + 3 * M)
+    d1 = tl.load(of_m + 4 * M)
+    d2 = tl.load(of_m + 5 * M)
+    moment = (y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2)
+    return moment, (d0, d1, d2), tl.load(of_n + 3), tl.load(of_n + 4)
 
 
 @jit
-def _bias(queries, tokens, step):
-    """Return the bias (n, m) of `RayBias`, from the numbers of n queries and of m tokens."""
-    e0, e1, e2 = _moment(queries, tokens, step)
-    bias = -tl.load(queries + 3) * (e0 * e0 + e1 * e1 + e2 * e2)
-    lower = tl.load(queries + 4)
-    return tl.where(bias <= lower, lower, bias)
-
-
-@jit
-def _bias_gradients(queries, tokens, step, gradient, sums):
+def _bias_gradients(queries, tokens, n, m, N, M, gradient, sums):
     """Add the gradients of n queries' five numbers to `sums`, five tensors (n,); return the sums.
 
-    gradient: gradient of the loss with respect to the bias (n, m). With e = mu x d - m, the result
-    of `_moment`, the gradient of |e|^2 with respect to mu is 2 d x e.
+    gradient: gradient of the loss with respect to the bias (n, m). With e = mu x d - m, the
+    gradient of |e|^2 with respect to mu is 2 d x e.
     """
-    e0, e1, e2 = _moment(queries, tokens, step)
-    d0 = tl.load(tokens + 3 * step)
-    d1 = tl.load(tokens + 4 * step)
-    d2 = tl.load(tokens + 5 * step)
-    factor = tl.load(queries + 3)
-    lower = tl.load(queries + 4)
+    (e0, e1, e2), (d0, d1, d2), factor, lower = _read(queries, tokens, n, m, N, M)
     distance_sq = e0 * e0 + e1 * e1 + e2 * e2
     at_bound = -factor * distance_sq <= lower
     inside = tl.where(at_bound, 0.0, gradient)
@@ -84,61 +74,60 @@ def _bias_gradients(queries, tokens, step, gradient, sums):
 
 
 @jit
-def _load(x, rows, count, width, WIDTH: tl.constexpr):
+def _load(x, rows, WIDTH: tl.constexpr):
     """Load `rows` of the program's scene and head of `x`, (rows, WIDTH); outside of `x` it is 0.
 
-    x: pair of a tensor (B, h, count, width) and its strides. WIDTH: power of 2, at least `width`.
+    WIDTH: power of 2, at least the width of `x`.
     """
-    at, inside = _at(x, rows, count, width, WIDTH)
+    at, inside = _at(x, rows, WIDTH)
     return tl.load(at, mask=inside, other=0.0)
 
 
 @jit
-def _store(x, rows, count, width, values, WIDTH: tl.constexpr):
+def _store(x, rows, values):
     """Write `values` to `rows` of the program's scene and head of x; do nothing if x is None."""
     if x is not None:
-        at, inside = _at(x, rows, count, width, WIDTH)
+        at, inside = _at(x, rows, values.shape[1])
         tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
 
 
 @jit
-def _at(x, rows, count, width, WIDTH: tl.constexpr):
-    tensor, strides = x
+def _at(x, rows, WIDTH: tl.constexpr):
+    tensor, strides, shape = x
     columns = tl.arange(0, WIDTH)[None, :]
     # Offsets exceed 2^31 for large batches.
     at = tl.program_id(2).to(tl.int64) * strides[0] + columns * strides[3]
     at += tl.program_id(1).to(tl.int64) * strides[1]
     at += rows.to(tl.int64)[:, None] * strides[2]
-    return tensor + at, (rows[:, None] < count) & (columns < width)
+    return tensor + at, (rows[:, None] < shape[2]) & (columns < shape[3])
 
 
 @jit
-def _logits(q, k, queries, tokens, m, M, scale):
+def _logits(q, k, queries, tokens, n, m, N, M, scale):
     """Return logits q k / sqrt(d) + b (n, m), with -inf for tokens of index M or more."""
+    (e0, e1, e2), _, factor, lower = _read(queries, tokens, n, m, N, M)
+    bias = -factor * (e0 * e0 + e1 * e1 + e2 * e2)
     products = tl.dot(q, tl.trans(k), input_precision="ieee") * scale
-    return tl.where((m < M)[None, :], products + _bias(queries, tokens, M), float("-inf"))
+    logits = products + tl.where(bias <= lower, lower, bias)
+    return tl.where((m < M)[None, :], logits, float("-inf"))
 
 
 @jit
 def _forward(
-    q, k, v, read_q, read_k, out, lse, heads, N, M, width, scale,
+    q, k, v, queries, tokens, out, lse, N, M, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Write attention to `out`, and the log-sum-exp of each query's logits (B, h, N) to `lse`."""
-    scene = tl.program_id(2).to(tl.int64)
-    each = scene * heads + tl.program_id(1)
+    """Write attention to `out`, and the log-sum-exp of queries' logits to `lse` (B, h, N, 1)."""
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
-    of_q = _load(q, n, N, width, WIDTH)
-    queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
+    of_q = _load(q, n, WIDTH)
     greatest = tl.full((BLOCK_N,), float("-inf"), tl.float32)
     total = tl.zeros((BLOCK_N,), tl.float32)
     sums = tl.zeros((BLOCK_N, WIDTH), tl.float32)
     for first in range(0, M, BLOCK_M):
         m = first + tl.arange(0, BLOCK_M)
-        of_k = _load(k, m, M, width, WIDTH)
-        of_v = _load(v, m, M, width, WIDTH)
-        tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
-        logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
+        of_k = _load(k, m, WIDTH)
+        of_v = _load(v, m, WIDTH)
+        logits = _logits(of_q, of_k, queries, tokens, n, m, N, M, scale)
         # The running maximum keeps exp in range. When it rises, earlier sums are scaled down.
         above = tl.maximum(greatest, tl.max(logits, 1))
         p = tl.exp(logits - above[:, None])
@@ -146,84 +135,76 @@ def _forward(
         total = total * shrunk + tl.sum(p, 1)
         sums = sums * shrunk[:, None] + tl.dot(p.to(of_v.dtype), of_v, input_precision="ieee")
         greatest = above
-    _store(out, n, N, width, sums / total[:, None], WIDTH)
-    tl.store(lse + each * N + n, greatest + tl.log(total), mask=n < N)
+    _store(out, n, sums / total[:, None])
+    _store(lse, n, (greatest + tl.log(total))[:, None])
 
 
 @jit
 def _backward_queries(
-    q, k, v, read_q, read_k, g, lse, rowsum, dq, of_bias, heads, N, M, width, scale,
+    q, k, v, queries, tokens, g, lse, rowsum, dq, of_bias, N, M, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
     """Write the gradient of q to `dq`, and the gradient of the bias to `of_bias` (B, h, N, F).
 
     `of_bias` holds the gradient with respect to the F numbers of each query, for each head. If
     `dq` or `of_bias` is None, its gradient is not computed. g: gradient of the attention result.
-    rowsum: sum of g times the result over the head's channels, (B, h, N).
+    rowsum: sum of g times the result over the head's channels, (B, h, N, 1).
     """
-    scene = tl.program_id(2).to(tl.int64)
-    each = scene * heads + tl.program_id(1)
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
-    of_q = _load(q, n, N, width, WIDTH)
-    of_g = _load(g, n, N, width, WIDTH)
-    # Rows outside get weights exp(-inf) = 0.
-    of_lse = tl.load(lse + each * N + n, mask=n < N, other=float("inf"))
-    of_rowsum = tl.load(rowsum + each * N + n, mask=n < N, other=0.0)
-    queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
+    of_q = _load(q, n, WIDTH)
+    of_g = _load(g, n, WIDTH)
+    of_lse = _load(lse, n, 1)
+    of_rowsum = _load(rowsum, n, 1)
     sums = tl.zeros((BLOCK_N, WIDTH), tl.float32)
     bias_sums = (tl.zeros((BLOCK_N,), tl.float32),) * F
     for first in range(0, M, BLOCK_M):
         m = first + tl.arange(0, BLOCK_M)
-        of_k = _load(k, m, M, width, WIDTH)
-        of_v = _load(v, m, M, width, WIDTH)
-        tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
-        logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
+        of_k = _load(k, m, WIDTH)
+        of_v = _load(v, m, WIDTH)
+        logits = _logits(of_q, of_k, queries, tokens, n, m, N, M, scale)
         of_p = tl.dot(of_g, tl.trans(of_v), input_precision="ieee")
-        ds = tl.exp(logits - of_lse[:, None]) * (of_p - of_rowsum[:, None])
+        ds = tl.exp(logits - of_lse) * (of_p - of_rowsum)
         if dq is not None:
             sums += tl.dot(ds.to(of_k.dtype), of_k, input_precision="ieee")
         if of_bias is not None:
-            bias_sums = _bias_gradients(queries, tokens, M, ds, bias_sums)
-    _store(dq, n, N, width, sums * scale, WIDTH)
+            bias_sums = _bias_gradients(queries, tokens, n, m, N, M, ds, bias_sums)
+    _store(dq, n, sums * scale)
     if of_bias is not None:
+        at, inside = _at(of_bias, n, 1)
         for f in tl.static_range(F):
-            tl.store(of_bias + (each * N + n) * F + f, bias_sums[f], mask=n < N)
+            tl.store(at + f, bias_sums[f][:, None], mask=inside)
 
 
 @jit
 def _backward_tokens(
-    q, k, v, read_q, read_k, g, lse, rowsum, dk, dv, heads, N, M, width, scale,
+    q, k, v, queries, tokens, g, lse, rowsum, dk, dv, N, M, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients of k and v to `dk` and `dv`; leave one out if its tensor is None.
 
-    Rows beyond the last query get log-sum-exp inf, so their attention weights are 0. g: gradient
-    of the attention result. rowsum: sum of g times the result over the head's channels, (B, h, N).
+    Rows beyond the last query have g = 0 and rowsum = 0, so they add nothing. g: gradient of the
+    attention result. rowsum: sum of g times the result over the head's channels, (B, h, N, 1).
     """
-    scene = tl.program_id(2).to(tl.int64)
-    each = scene * heads + tl.program_id(1)
     m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
-    of_k = _load(k, m, M, width, WIDTH)
-    of_v = _load(v, m, M, width, WIDTH)
-    tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
+    of_k = _load(k, m, WIDTH)
+    of_v = _load(v, m, WIDTH)
     k_sums = tl.zeros((BLOCK_M, WIDTH), tl.float32)
     v_sums = tl.zeros((BLOCK_M, WIDTH), tl.float32)
     for first in range(0, N, BLOCK_N):
         n = first + tl.arange(0, BLOCK_N)
-        of_q = _load(q, n, N, width, WIDTH)
-        of_g = _load(g, n, N, width, WIDTH)
-        of_lse = tl.load(lse + each * N + n, mask=n < N, other=float("inf"))
-        of_rowsum = tl.load(rowsum + each * N + n, mask=n < N, other=0.0)
-        queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
-        logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
-        p = tl.exp(logits - of_lse[:, None])
+        of_q = _load(q, n, WIDTH)
+        of_g = _load(g, n, WIDTH)
+        of_lse = _load(lse, n, 1)
+        of_rowsum = _load(rowsum, n, 1)
+        logits = _logits(of_q, of_k, queries, tokens, n, m, N, M, scale)
+        p = tl.exp(logits - of_lse)
         if dv is not None:
             v_sums += tl.dot(tl.trans(p.to(of_g.dtype)), of_g, input_precision="ieee")
         if dk is not None:
-            ds = p * (tl.dot(of_g, tl.trans(of_v), input_precision="ieee") - of_rowsum[:, None])
+            ds = p * (tl.dot(of_g, tl.trans(of_v), input_precision="ieee") - of_rowsum)
             k_sums += tl.dot(tl.trans(ds.to(of_q.dtype)), of_q, input_precision="ieee")
-    _store(dk, m, M, width, k_sums * scale, WIDTH)
-    _store(dv, m, M, width, v_sums, WIDTH)
+    _store(dk, m, k_sums * scale)
+    _store(dv, m, v_sums)
 
 
 class TritonAttention(torch.autograd.Function):
@@ -238,7 +219,7 @@ class TritonAttention(torch.autograd.Function):
         ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor
     ) -> Tensor:
         out = torch.empty_like(q)
-        lse = q.new_empty(q.shape[:3], dtype=torch.float32)
+        lse = q.new_empty(*q.shape[:3], 1, dtype=torch.float32)
         # Kernels assume that rows of these are contiguous.
         saved = q, k, v, queries.contiguous(), tokens.contiguous()
         _launch(_forward, *saved, out, lse)
@@ -251,30 +232,32 @@ class TritonAttention(torch.autograd.Function):
         *saved, out, lse = ctx.saved_tensors
         q, k, v, queries, _ = saved
         needs = ctx.needs_input_grad
-        shape = (q.shape[0] * q.shape[1], *queries.shape[1:])
         dq, dk, dv = (torch.empty_like(x) if needs[n] else None for n, x in enumerate((q, k, v)))
-        by_head = queries.new_empty(shape) if needs[3] else None
-        given = *saved, gradients[0], lse, (gradients[0].float() * out.float()).sum(-1)
+        by_head = queries.new_empty(*q.shape[:2], *queries.shape[1:]) if needs[3] else None
+        rowsum = (gradients[0].float() * out.float()).sum(-1, keepdim=True)
+        given = *saved, gradients[0], lse, rowsum
         if dq is not None or by_head is not None:
             _launch(_backward_queries, *given, dq, by_head)
         if dk is not None or dv is not None:
             _launch(_backward_tokens, *given, dk, dv)
         # Summed over heads here: atomics in the kernel would add in a changing order.
-        summed = None if by_head is None else by_head.unflatten(0, q.shape[:2]).sum(1)
+        summed = None if by_head is None else by_head.sum(1)
         return dq, dk, dv, summed, None
 
 
 def _launch(kernel: Any, *tensors: Any) -> None:
-    """Run a kernel for each head and block; a 4-d tensor is passed as (tensor, strides)."""
+    """Run a kernel for each head and block; a 4-d tensor is passed as (tensor, strides, shape)."""
     q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)
     count, block = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
     # One program per block (of queries, or of tokens in the third kernel), head and scene.
     grid = triton.cdiv(count, sizes[block]), heads, scenes
-    arguments = [(x, x.stride()) if x is not None and x.ndim == 4 else x for x in tensors]
+    arguments = [
+        (x, x.stride(), tuple(x.shape)) if x is not None and x.ndim == 4 else x for x in tensors
+    ]
     with torch.cuda.device_of(q):
-        kernel[grid](*arguments, heads, N, M, width, width**-0.5, **sizes)
+        kernel[grid](*arguments, N, M, width**-0.5, **sizes)
 
 
 def _blocks(q: Tensor) -> dict[str, int]:
