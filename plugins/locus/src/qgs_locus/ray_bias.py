@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from qgs.precision import full_precision
-from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
+from qgs_locus.kernels.attention_bias import AttentionBias
 
 
 @full_precision
@@ -64,6 +64,7 @@ class RayBias(AttentionBias):
     """
 
     in_triton = True
+    kernels = "qgs_locus.kernels.ray_bias_numba"
 
     @classmethod
     @full_precision
@@ -96,11 +97,6 @@ class RayBias(AttentionBias):
         d_M3 = tokens_GM[3:6].mT
         moment_nM3 = torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1) - m_M3
         return clamped(-factor_n1 * moment_nM3.square().sum(-1), lower_n1)
-
-    def compiled(self) -> tuple[Kernel, Kernel]:
-        from qgs_locus.kernels import ray_bias_numba as kernels  # needs numba
-
-        return kernels.write, kernels.gradients
 
 
 def clamped(bias_nM: Tensor, lower_n1: Tensor) -> Tensor:

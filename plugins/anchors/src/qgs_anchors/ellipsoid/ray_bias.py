@@ -11,7 +11,7 @@ minimum is |cof(W) (m - mu x d)|^2 / |W d|^2.
 from typing import Self
 
 import torch
-from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
+from qgs_locus.kernels.attention_bias import AttentionBias
 from qgs_locus.ray_bias import clamped, normalised_rays
 from torch import Tensor
 
@@ -39,6 +39,8 @@ class EllipsoidBias(AttentionBias):
     and gamma * bias_min. The numbers of a token are moment m, direction d and unit direction
     d / |d| of its ray. gamma is a weight. The docstring of this module defines b, W and cof(W).
     """
+
+    kernels = "qgs_anchors.ellipsoid.ray_bias_numba"
 
     @classmethod
     @full_precision
@@ -80,11 +82,6 @@ class EllipsoidBias(AttentionBias):
         moment_nM = _times(cofactors_n33, e_nM3).square().sum(-1)
         along_nM = _times(ball_n33, unit_M3[None]).square().sum(-1)
         return clamped(-factor_n1 * moment_nM / along_nM, lower_n1)
-
-    def compiled(self) -> tuple[Kernel, Kernel]:
-        from qgs_anchors.ellipsoid import ray_bias_numba as kernels  # needs numba
-
-        return kernels.write, kernels.gradients
 
 
 def _times(matrix_n33: Tensor, vectors: Tensor) -> Tensor:

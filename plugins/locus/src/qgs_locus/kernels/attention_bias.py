@@ -14,6 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from copy import copy
 from functools import cache
+from importlib import import_module
 from typing import Any, TypeAlias, TypeVar
 
 import torch
@@ -26,7 +27,6 @@ from qgs.precision import full_precision
 from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 
 T = TypeVar("T")
-Kernel: TypeAlias = Callable[..., None]
 Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]
 """Block: index of the scene, slice of its queries, and buffers (n, M) for these n queries."""
 
@@ -53,6 +53,14 @@ class AttentionBias(ABC):
 
     in_triton = False
     """True if the kernels of `attention_triton` can compute this bias."""
+    kernels = ""
+    """Name of a module with two kernels (`qgs.kernels.kernel`) for float32 on a CPU; "" for none.
+
+    `write` takes arrays (queries, tokens, out) and writes the bias (n, M) to `out`. `gradients`
+    takes (queries, tokens, gradient, out): `gradient` is that of the bias (n, M), and the kernel
+    writes the gradient of the queries (n, F) to `out`. Several threads may run a kernel at the same
+    time, each on other queries.
+    """
 
     def __init__(self, queries: Tensor, tokens: Tensor) -> None:
         self.queries = queries
@@ -62,23 +70,13 @@ class AttentionBias(ABC):
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
         """Return the bias (n, M) of n queries and all tokens of a scene, differentiable."""
 
-    def compiled(self) -> tuple[Kernel, Kernel] | None:
-        """Return two kernels (`qgs.kernels.kernel`) for float32 on a CPU; None if there are none.
-
-        The first takes arrays (queries, tokens, out) and writes the bias (n, M) to `out`. The
-        second takes (queries, tokens, gradient, out): `gradient` is that of the bias (n, M), and
-        the kernel writes the gradient of the queries (n, F) to `out`. Several threads may run a
-        kernel at the same time, each on other queries.
-        """
-        return None
-
     @full_precision
     def write(self, queries_nF: Tensor, tokens_GM: Tensor, out_nM: Tensor) -> None:
         """Write the bias (n, M) of n queries and all tokens of a scene into `out_nM`."""
         kernels = self._kernels(queries_nF)
         # Kernels need no (n, M, 3) tensors: they work in registers.
         if kernels is not None:
-            return _in_rows(kernels[0], tokens_GM, queries_nF, out_nM)
+            return _in_rows(kernels.write, tokens_GM, queries_nF, out_nM)
         for part_nF, out in _parts(queries_nF, out_nM):
             out.copy_(self.value(part_nF, tokens_GM))
 
@@ -98,7 +96,7 @@ class AttentionBias(ABC):
         kernels = None if of_tokens else self._kernels(queries_nF)
         if kernels is not None:
             out_nF = torch.empty_like(queries_nF)
-            _in_rows(kernels[1], tokens_GM, queries_nF, gradient_nM, out_nF)
+            _in_rows(kernels.gradients, tokens_GM, queries_nF, gradient_nM, out_nF)
             return out_nF, None
         found: list[tuple[Tensor, ...]] = []
         for part_nF, part_nM in _parts(queries_nF, gradient_nM):
@@ -115,9 +113,10 @@ class AttentionBias(ABC):
         summed_GM = torch.stack(parts[-1]).sum(0) if of_tokens else None
         return torch.cat(parts[0]) if of_queries else None, summed_GM
 
-    def _kernels(self, queries: Tensor) -> tuple[Kernel, Kernel] | None:
-        usable = queries.device.type == "cpu" and queries.dtype == torch.float32
-        return self.compiled() if usable else None
+    def _kernels(self, queries: Tensor) -> Any:
+        usable = self.kernels and queries.device.type == "cpu" and queries.dtype == torch.float32
+        # It needs numba.
+        return import_module(self.kernels) if usable else None
 
     def dense(self, chosen: Tensor | None = None) -> Tensor:
         """Return the bias (B, N, M) of all queries, or (B, Q, M) of the Q queries `chosen`.
@@ -151,7 +150,7 @@ def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> Iterator[tuple[Tensor, Te
     return zip(queries_nF.split(rows), of_pairs_nM.split(rows), strict=True)
 
 
-def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
+def _in_rows(kernel: Callable[..., None], tokens_GM: Tensor, *of_rows: Tensor) -> None:
     """Call a kernel on several threads, each with all tokens and some rows of the other tensors."""
     tokens = tokens_GM.numpy()
     count = len(of_rows[0])
