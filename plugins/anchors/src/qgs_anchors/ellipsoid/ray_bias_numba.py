@@ -6,12 +6,7 @@ and bias_min. A token is a column of nine numbers: moment m, direction d and uni
 of its ray. In the code, a matrix is a tuple of its nine entries.
 """
 
-import numpy as np
-
-from qgs.kernels import kernel
-
-_ZERO = np.float32(0)
-_TWO = np.float32(2)
+from qgs.kernels import TWO, ZERO, kernel
 
 
 @kernel
@@ -83,10 +78,10 @@ def gradients(queries, tokens, gradient, out):
         row = gradient[n]
         of = out[n]
         mu, c, w, factor, lower = _query(queries[n])
-        of_x = of_y = of_z = of_factor = of_lower = _ZERO
+        of_x = of_y = of_z = of_factor = of_lower = ZERO
         # Eighteen scalars, which the compiler keeps in registers, unlike an array.
-        c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = _ZERO
-        w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = w8 = _ZERO
+        c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = ZERO
+        w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = w8 = ZERO
         for j in range(row.shape[0]):
             e = _moment(mu, tokens, j)
             u, v, t = tokens[6, j], tokens[7, j], tokens[8, j]
@@ -94,10 +89,10 @@ def gradients(queries, tokens, gradient, out):
             b, below = _times(w, (u, v, t))
             ratio = above / below
             # At the clamp the gradient goes to the bound.
-            inside = _ZERO if -factor * ratio <= lower else row[j]
+            inside = ZERO if -factor * ratio <= lower else row[j]
             of_lower += row[j] - inside
             of_factor -= inside * ratio
-            up = -_TWO * factor * inside / below
+            up = -TWO * factor * inside / below
             a0, a1, a2 = up * a[0], up * a[1], up * a[2]
             c0 += a0 * e[0]
             c1 += a0 * e[1]

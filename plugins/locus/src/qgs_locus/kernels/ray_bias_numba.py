@@ -5,12 +5,13 @@ factor = gamma / (2 sigma^2) and lower = gamma * bias_min, with the weight gamma
 of the bias. A token is a column of six numbers: moment m and direction d of its ray.
 """
 
-import numpy as np
+from qgs.kernels import TWO, ZERO, kernel
 
-from qgs.kernels import kernel
 
-_ZERO = np.float32(0)
-_TWO = np.float32(2)
+@kernel
+def _query(row):
+    """Return x, y, z, factor and lower of a query."""
+    return row[0], row[1], row[2], row[3], row[4]
 
 
 @kernel
@@ -33,11 +34,7 @@ def write(queries, tokens, out):
     D = |mu x d - m| is the distance of the anchor's centre mu from the ray (moment m, direction d).
     """
     for n in range(queries.shape[0]):
-        x = queries[n, 0]
-        y = queries[n, 1]
-        z = queries[n, 2]
-        factor = queries[n, 3]
-        lower = queries[n, 4]
+        x, y, z, factor, lower = _query(queries[n])
         row = out[n]
         for j in range(row.shape[0]):
             e0, e1, e2 = _moment(x, y, z, tokens, j)
@@ -54,25 +51,21 @@ def gradients(queries, tokens, gradient, out):
     e = mu x d - m. The gradient of |e|^2 with respect to the anchor's centre mu is 2 d x e.
     """
     for n in range(queries.shape[0]):
-        x = queries[n, 0]
-        y = queries[n, 1]
-        z = queries[n, 2]
-        factor = queries[n, 3]
-        lower = queries[n, 4]
+        x, y, z, factor, lower = _query(queries[n])
         row = gradient[n]
-        of_x = of_y = of_z = of_factor = of_lower = _ZERO
+        of_x = of_y = of_z = of_factor = of_lower = ZERO
         for j in range(row.shape[0]):
             e0, e1, e2 = _moment(x, y, z, tokens, j)
             distance_sq = e0 * e0 + e1 * e1 + e2 * e2
             # At the clamp the gradient goes to the bound, which contains gamma.
-            inside = _ZERO if -factor * distance_sq <= lower else row[j]
+            inside = ZERO if -factor * distance_sq <= lower else row[j]
             of_x += inside * (tokens[4, j] * e2 - tokens[5, j] * e1)
             of_y += inside * (tokens[5, j] * e0 - tokens[3, j] * e2)
             of_z += inside * (tokens[3, j] * e1 - tokens[4, j] * e0)
             of_factor += inside * distance_sq
             of_lower += row[j] - inside
-        out[n, 0] = -_TWO * factor * of_x
-        out[n, 1] = -_TWO * factor * of_y
-        out[n, 2] = -_TWO * factor * of_z
+        out[n, 0] = -TWO * factor * of_x
+        out[n, 1] = -TWO * factor * of_y
+        out[n, 2] = -TWO * factor * of_z
         out[n, 3] = -of_factor
         out[n, 4] = of_lower
