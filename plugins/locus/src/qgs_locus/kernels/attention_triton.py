@@ -8,7 +8,7 @@ float32. Each sum is added in a fixed order, so a repeated run gives the same bi
 A query has five numbers: its anchor's centre mu = (x, y, z), factor = gamma / (2 sigma^2) and
 lower = gamma * bias_min. A token has six: moment and direction of its ray. `RayBias` in
 `qgs_locus.ray_bias` explains them. The kernels take these numbers as queries (B, N, 5) and tokens
-(B, 6, M). Every 4-d tensor (B, h, count, width) comes with its strides and its shape.
+(B, 6, M). Every 4-d tensor (B, h, count, width) comes with its strides, count and width.
 
 Axes: as in `qgs_locus.kernels.attention_bias`. W is the head width d, rounded up to a power of two.
 """
@@ -46,8 +46,10 @@ def _read(queries, tokens, n, m, N, M):
     d0 = tl.load(of_m + 3 * M)
     d1 = tl.load(of_m + 4 * M)
     d2 = tl.load(of_m + 5 * M)
-    moment = (y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2)
-    return moment, (d0, d1, d2), tl.load(of_n + 3), tl.load(of_n + 4)
+    e0 = y * d2 - z * d1 - m0
+    e1 = z * d0 - x * d2 - m1
+    e2 = x * d1 - y * d0 - m2
+    return e0, e1, e2, d0, d1, d2, tl.load(of_n + 3), tl.load(of_n + 4)
 
 
 @jit
@@ -57,7 +59,7 @@ def _bias_gradients(queries, tokens, n, m, N, M, gradient, sums):
     gradient: gradient of the loss with respect to the bias (n, m). With e = mu x d - m, the
     gradient of |e|^2 with respect to mu is 2 d x e.
     """
-    (e0, e1, e2), (d0, d1, d2), factor, lower = _read(queries, tokens, n, m, N, M)
+    e0, e1, e2, d0, d1, d2, factor, lower = _read(queries, tokens, n, m, N, M)
     distance_sq = e0 * e0 + e1 * e1 + e2 * e2
     at_bound = -factor * distance_sq <= lower
     inside = tl.where(at_bound, 0.0, gradient)
@@ -93,19 +95,19 @@ def _store(x, rows, values):
 
 @jit
 def _at(x, rows, WIDTH: tl.constexpr):
-    tensor, strides, shape = x
+    tensor, of_scene, of_head, of_row, of_column, count, width = x
     columns = tl.arange(0, WIDTH)[None, :]
     # Offsets exceed 2^31 for large batches.
-    at = tl.program_id(2).to(tl.int64) * strides[0] + columns * strides[3]
-    at += tl.program_id(1).to(tl.int64) * strides[1]
-    at += rows.to(tl.int64)[:, None] * strides[2]
-    return tensor + at, (rows[:, None] < shape[2]) & (columns < shape[3])
+    at = tl.program_id(2).to(tl.int64) * of_scene + columns * of_column
+    at += tl.program_id(1).to(tl.int64) * of_head
+    at += rows.to(tl.int64)[:, None] * of_row
+    return tensor + at, (rows[:, None] < count) & (columns < width)
 
 
 @jit
 def _logits(q, k, queries, tokens, n, m, N, M, scale):
     """Return logits q k / sqrt(d) + b (n, m), with -inf for tokens of index M or more."""
-    (e0, e1, e2), _, factor, lower = _read(queries, tokens, n, m, N, M)
+    e0, e1, e2, _, _, _, factor, lower = _read(queries, tokens, n, m, N, M)
     bias = -factor * (e0 * e0 + e1 * e1 + e2 * e2)
     products = tl.dot(q, tl.trans(k), input_precision="ieee") * scale
     logits = products + tl.where(bias <= lower, lower, bias)
@@ -246,7 +248,7 @@ class TritonAttention(torch.autograd.Function):
 
 
 def _launch(kernel: Any, *tensors: Any) -> None:
-    """Run a kernel for each head and block; a 4-d tensor is passed as (tensor, strides, shape)."""
+    """Run a kernel for each head and block; 4-d tensors are passed with strides and last sizes."""
     q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)
@@ -254,7 +256,7 @@ def _launch(kernel: Any, *tensors: Any) -> None:
     # One program per block (of queries, or of tokens in the third kernel), head and scene.
     grid = triton.cdiv(count, sizes[block]), heads, scenes
     arguments = [
-        (x, x.stride(), tuple(x.shape)) if x is not None and x.ndim == 4 else x for x in tensors
+        (x, *x.stride(), *x.shape[2:]) if x is not None and x.ndim == 4 else x for x in tensors
     ]
     with torch.cuda.device_of(q):
         kernel[grid](*arguments, N, M, width**-0.5, **sizes)
