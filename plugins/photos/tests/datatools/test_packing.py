@@ -133,7 +133,7 @@ def test_copies_of_copies_read_alike_at_urls_resized_and_as_jpeg(kinds, tmp_path
         before = packed(UPath(url))
         same(source(kinds), before, tolerance)
         assert names_in(UPath(url) / "train") == {"000000.torch", "index.json"}
-    with Image.open(io.BytesIO(before.scenes("train")[0].encoded(0).data)) as image:
+    with Image.open(io.BytesIO(before.scenes("train")[0].record.images[0].numpy())) as image:
         assert (image.format, image.size) == ("JPEG", (32, 24))
 
 
@@ -225,7 +225,7 @@ def test_the_command(six, tmp_path):
     assert list(packed(out).names("test")) == ["s2", "s5"]
     told = command(f"{out} --out {small} --image-size 8 12 --jpeg 80")
     assert "2 test; images of this run: 12, of which 0 copied unchanged and 12 enc" in told
-    assert packed(small, size=(8, 12)).scenes("test")[0].encoded(0).size == (8, 12)
+    assert packed(small, size=(8, 12)).scenes("test")[0].stored_size(0) == (8, 12)
 
 
 def test_the_command_packs_the_data_of_a_recipe(tmp_path):

@@ -82,8 +82,8 @@ def test_a_lens_turns_with_its_photo(written, shots):
 def test_packed_photos_are_upright(written, shots, tmp_path):
     (frame, kept), *_ = encoded_frames(scene(written(8, "stored"), SIZE), Encoding())
     assert_array_equal(frame.mask, 255 * (shots[0].image[..., 0] > 128))
-    assert frame.size == SIZE
-    assert_allclose(frame.c2w, shots[0].c2w, atol=1e-12)
+    assert frame.listed.size == SIZE
+    assert_allclose(frame.listed.c2w, shots[0].c2w, atol=1e-12)
     path = tmp_path / "packed.png"
     path.write_bytes(frame.data)
     image = Image.open(path)

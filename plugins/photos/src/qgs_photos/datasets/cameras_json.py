@@ -28,7 +28,7 @@ from qgs.data.photos.reader import (
 )
 from qgs.paths import open_file, read_json
 from qgs.wording import warn_once
-from qgs_photos.datasets.encoded import as_intrinsics
+from qgs_photos.datasets.intrinsics import as_intrinsics
 from qgs_photos.image_files import image_files
 
 _LISTS = ("frames", "cameras", "views")

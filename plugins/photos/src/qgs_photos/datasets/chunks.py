@@ -30,7 +30,6 @@ from qgs_photos.datasets.chunk_files import (
     read_mask,
     require_usable,
 )
-from qgs_photos.datasets.encoded import EncodedFrame
 
 # Chunks kept open.
 _OPEN = 4
@@ -76,12 +75,13 @@ class ChunkScene(Scene):
         self._chunks = chunks
 
     @property
-    def _record(self) -> Record:
+    def record(self) -> Record:
+        """The scene as stored."""
         return self._chunks.get(str(self._file), lambda: Chunk(self._file)).record(self.name)
 
     @cached_property
     def _length(self) -> int:
-        return len(self._record)
+        return len(self.record)
 
     def __len__(self) -> int:
         return self._length
@@ -90,12 +90,12 @@ class ChunkScene(Scene):
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
         """Held-out frames: every Nth if the option `holdout` is N > 0, else those in the chunk."""
         every = self.config.holdout
-        return held_out_frames(len(self), every) if every else self._record.held_out
+        return held_out_frames(len(self), every) if every else self.record.held_out
 
     @cached_property
     def times(self) -> Tensor | None:  # type: ignore[override]  # known once the chunk is open
         """Times (F,) of the frames, float64; None for a static scene."""
-        return self._record.times
+        return self.record.times
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -103,7 +103,7 @@ class ChunkScene(Scene):
 
         Raises ValueError for a pose or intrinsics that are invalid.
         """
-        record = self._record
+        record = self.record
         target = self.config.image_size
         require_usable(record)
         intrinsics = record.cameras[:, :4].double()
@@ -116,18 +116,18 @@ class ChunkScene(Scene):
 
     def frame_name(self, frame: int) -> str:
         """Return the name of a frame in the chunk, or its time stamp if the chunk has no names."""
-        return self._record.names[frame]
+        return self.record.names[frame]
 
     def stored_size(self, frame: int) -> Size:
         """Return (H, W) of the stored photo of `frame`. Raises ValueError if it is unreadable."""
-        return self._record.stored_size(frame)
+        return self.record.stored_size(frame)
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """Return images (len(frames), 3, H, W), float32 in [0, 1].
 
         Raises ValueError for an image that cannot be decoded.
         """
-        record = self._record
+        record = self.record
         return to_tensor(np.stack([self._pixels(record, frame) for frame in frames]))
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
@@ -135,24 +135,11 @@ class ChunkScene(Scene):
 
         In a scene with masks, the mask of a frame without one is 1 everywhere.
         """
-        record = self._record
+        record = self.record
         if record.masks is None:
             return None
         masks = np.stack([self._mask(record, frame) for frame in frames])
         return torch.from_numpy(masks)[:, None].float().div_(255)
-
-    def encoded(self, frame: int) -> EncodedFrame:
-        """Return a frame as an encoded file. Raises ValueError for an image that cannot be read."""
-        record = self._record
-        size = record.stored_size(frame)
-        return EncodedFrame(
-            name=record.names[frame],
-            data=record.images[frame].numpy().tobytes(),
-            c2w=torch.linalg.inv(record.w2c[frame]).numpy(),
-            intrinsics=record.intrinsics(frame, size),
-            size=size,
-            mask=read_mask(record, frame),
-        )
 
     def _pixels(self, record: Record, frame: int) -> np.ndarray:
         file = io.BytesIO(record.images[frame].numpy().tobytes())

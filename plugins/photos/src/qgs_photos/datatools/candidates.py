@@ -1,7 +1,7 @@
 """List the scenes to check in chunks, in folders of photos, and of other data sources."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, lru_cache, partial
@@ -37,7 +37,7 @@ from qgs_photos.datasets.chunk_files import (
     unit_problems,
 )
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
-from qgs_photos.datasets.encoded import as_intrinsics
+from qgs_photos.datasets.intrinsics import as_intrinsics
 from qgs_photos.datatools.findings import Finding, Severity
 from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
@@ -105,10 +105,16 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
 
 def _of_source(source: SceneSource, split: Split, place: int) -> Photos:
     scene = source.scenes(split)[place]
-    return [_source_photo(scene, frame) for frame in range(len(scene))], scene.missing
+    return [source_photo(scene, frame) for frame in range(len(scene))], scene.missing
 
 
-def _source_photo(scene: Scene, frame: int) -> Photo:
+def source_photo(
+    scene: Scene, frame: int, encode: Callable[[np.ndarray], bytes] = png_bytes
+) -> Photo:
+    """Return a frame as a photo whose file has the pixels that the scene returns.
+
+    encode: function that returns the file's bytes from pixels (H, W, 3), uint8.
+    """
     camera = scene.cameras[frame]
     name = scene.frame_name(frame)
     listed = PhotoFrame(
@@ -121,14 +127,14 @@ def _source_photo(scene: Scene, frame: int) -> Photo:
     )
     return Photo(
         listed,
-        lambda: png_bytes(rgb_picture(scene.images([frame])[0])),
+        lambda: encode(rgb_picture(scene.images([frame])[0])),
         {"mask": lambda: _read_mask(scene, frame)},
     )
 
 
 def _read_mask(scene: Scene, frame: int) -> np.ndarray | None:
-    mask = scene.masks([frame])
-    return None if mask is None else mask[0, 0].numpy()
+    masks = scene.masks([frame])
+    return None if masks is None else rgb_picture(masks[0])[..., 0]
 
 
 def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
@@ -284,19 +290,20 @@ def _of_chunk(file: UPath, place: int) -> Photos:
     if record.sizes is None:
         # without sizes each image would be opened again to know its own
         record = replace(record, sizes=torch.tensor([_usual_size(record)] * len(record)))
-    return [_chunk_photo(file, record, frame) for frame in range(len(record))], ()
+    return [chunk_photo(record, *item) for item in enumerate(record.image_sizes)], ()
 
 
-def _chunk_photo(file: UPath, record: Record, frame: int) -> Photo:
-    size = record.image_sizes[frame]
+def chunk_photo(record: Record, frame: int, size: Size) -> Photo:
+    """Return a frame of a chunk as a photo. size: (H, W) of the photo."""
+    name = record.names[frame]
     try:
         c2w = np.linalg.inv(record.w2c[frame].numpy())
     # a singular matrix is told as a pose with NaN
     except np.linalg.LinAlgError:
         c2w = np.full((4, 4), np.nan)
     photo = PhotoFrame(
-        name=record.names[frame],
-        path=file,
+        name=name,
+        path=UPath(name),
         c2w=c2w,
         intrinsics=record.intrinsics(frame, size),
         size=size,

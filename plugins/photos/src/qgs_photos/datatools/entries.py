@@ -3,7 +3,7 @@
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -12,11 +12,14 @@ from torch import Tensor
 
 from qgs.contracts import Scene
 from qgs.data.images import CropResize, decode_rgb
+from qgs.data.photos.reader import PhotoFrame
 from qgs.data.photos.source import PhotoScene, turned, whole_mask
-from qgs.drawing.images import png_bytes, rgb_picture
+from qgs.drawing.images import png_bytes
 from qgs.paths import read_file
 from qgs_photos.datasets.chunks import ChunkScene
-from qgs_photos.datasets.encoded import EncodedFrame, as_intrinsics
+from qgs_photos.datasets.intrinsics import as_intrinsics
+from qgs_photos.datatools.candidates import chunk_photo, source_photo
+from qgs_photos.datatools.photos import Photo
 
 ChunkEntry: TypeAlias = dict[str, Any]
 
@@ -45,6 +48,18 @@ class Encoding:
         return file.getvalue()
 
 
+class EncodedFrame(NamedTuple):
+    """A photo as an encoded file.
+
+    listed: its name, camera and size. data: bytes of the image file. mask: (H, W) uint8; None for a
+    photo without a mask.
+    """
+
+    listed: PhotoFrame
+    data: bytes
+    mask: np.ndarray | None
+
+
 def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
     """Yield each frame of a scene with its image file, and whether the file is copied unchanged.
 
@@ -54,7 +69,11 @@ def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFr
         if isinstance(scene, PhotoScene | ChunkScene) and not encoding.resized:
             yield _stored(scene, index, encoding)
         else:
-            yield _delivered(scene, index, encoding), False
+            yield _read(source_photo(scene, index, encoding.image)), False
+
+
+def _read(photo: Photo) -> EncodedFrame:
+    return EncodedFrame(photo.listed, photo.read(), photo.maps["mask"]())
 
 
 def _encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
@@ -71,69 +90,51 @@ def _encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
         file = io.BytesIO()
         turned(decode_rgb(io.BytesIO(data), scene.config.background), photo).save(file, "png")
         data = file.getvalue()
-    return EncodedFrame(
-        name=photo.name,
-        data=data,
-        c2w=photo.c2w,
-        intrinsics=photo.at_size(size),
-        size=size,
-        lens=photo.lens,
-        mask=photo.mask and np.array(turned(whole_mask(photo), photo)),
-    )
+    listed = replace(photo, intrinsics=photo.at_size(size), size=size)
+    mask = photo.mask and np.array(turned(whole_mask(photo), photo))
+    return EncodedFrame(listed, data, mask)
 
 
 def _stored(
     scene: PhotoScene | ChunkScene, index: int, encoding: Encoding
 ) -> tuple[EncodedFrame, bool]:
-    photos = isinstance(scene, PhotoScene)
-    frame = _encoded_photo(scene, index) if photos else scene.encoded(index)
+    if isinstance(scene, PhotoScene):
+        frame = _encoded_photo(scene, index)
+    else:
+        frame = _read(chunk_photo(scene.record, index, scene.stored_size(index)))
     try:
         pixels = np.array(decode_rgb(io.BytesIO(frame.data), scene.config.background))
     except OSError as error:
         raise ValueError(
-            f"scene {scene.name!r}, frame {index} ({frame.name}) cannot be read as an image "
+            f"scene {scene.name!r}, frame {index} ({frame.listed.name}) cannot be read as an image "
             f"({error}): replace the file, or leave the scene out"
         ) from error
-    if frame.lens is not None:
+    if frame.listed.lens is not None:
         return _straightened(frame, pixels, encoding), False
     with Image.open(io.BytesIO(frame.data)) as image:
         # every reader gets three channels out of it
         plain = image.mode == "RGB" and not image.has_transparency_data
         if plain and image.format in _KEPT_FORMATS:
             return frame, True
-    return replace(frame, data=encoding.image(pixels)), False
+    return frame._replace(data=encoding.image(pixels)), False
 
 
 def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -> EncodedFrame:
     """Undistort a frame as a pinhole camera would show it, and crop the black border."""
-    assert frame.lens is not None
-    lens = frame.lens
-    zoom = lens.whole_zoom(frame.intrinsics, frame.size, frame.size)
-    crop = CropResize(frame.size, frame.size, zoom)
+    own = frame.listed
+    assert own.lens is not None
+    lens = own.lens
+    size = (pixels.shape[0], pixels.shape[1])
+    crop = CropResize(size, size, lens.whole_zoom(own.intrinsics, size, size))
 
     def straight(image: np.ndarray) -> np.ndarray:
-        return crop.image(Image.fromarray(lens.undistorted(image, frame.intrinsics)))
+        return crop.image(Image.fromarray(lens.undistorted(image, own.intrinsics)))
 
-    own = torch.tensor(frame.intrinsics, dtype=torch.float64)
-    return replace(
-        frame,
-        data=encoding.image(straight(pixels)),
-        intrinsics=as_intrinsics(crop.intrinsics(own)),
-        lens=None,
-        mask=None if frame.mask is None else straight(frame.mask),
-    )
-
-
-def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
-    cameras = scene.cameras[index]
-    masks = scene.masks([index])
+    cropped = crop.intrinsics(torch.tensor(own.intrinsics, dtype=torch.float64))
     return EncodedFrame(
-        name=scene.frame_name(index),
-        data=encoding.image(rgb_picture(scene.images([index])[0])),
-        c2w=cameras.c2w.double().numpy(),
-        intrinsics=as_intrinsics(cameras.intrinsics),
-        size=cameras.size,
-        mask=None if masks is None else rgb_picture(masks[0])[..., 0],
+        replace(own, intrinsics=as_intrinsics(cropped), lens=None),
+        encoding.image(straight(pixels)),
+        None if frame.mask is None else straight(frame.mask),
     )
 
 
@@ -145,7 +146,7 @@ def chunk_entry(
     key: name of the scene. held_out: indices of frames that are left out of training. times: time
     of each of the V frames, (V,); None for a scene that does not move.
     """
-    names = [frame.name for frame in frames]
+    names = [frame.listed.name for frame in frames]
     # 19 digits may be more than an int64 holds
     stamps = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
     entry = {
@@ -157,7 +158,7 @@ def chunk_entry(
         "cameras": torch.from_numpy(np.stack([_camera(frame) for frame in frames])),
         "images": [_bytes(frame.data) for frame in frames],
         "names": names,
-        "sizes": torch.tensor([frame.size for frame in frames], dtype=torch.int32),
+        "sizes": torch.tensor([frame.listed.size for frame in frames], dtype=torch.int32),
     }
     if any(frame.mask is not None for frame in frames):
         entry["masks"] = [
@@ -180,8 +181,5 @@ def _camera(frame: EncodedFrame) -> np.ndarray:
 
     fx and cx are divided by the width of the image, fy and cy by its height.
     """
-    height, width = frame.size
-    fx, fy, cx, cy = frame.intrinsics
-    w2c = np.linalg.inv(frame.c2w)[:3].flatten()
-    values = [fx / width, fy / height, cx / width, cy / height, 0.0, 0.0, *w2c]
-    return np.array(values, np.float32)
+    w2c = np.linalg.inv(frame.listed.c2w)[:3].flatten()
+    return np.array([*frame.listed.at_size((1, 1)), 0.0, 0.0, *w2c], np.float32)
