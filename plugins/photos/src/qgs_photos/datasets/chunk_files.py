@@ -171,8 +171,6 @@ def _is_plain(data: Tensor) -> bool:
 
 
 def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
-    if isinstance(data, np.ndarray):
-        data = torch.from_numpy(data)
     found = list(data.shape) if isinstance(data, Tensor) else type(data).__name__
     wanted = f"a tensor of shape {list(shape)}, as there are {shape[0]} images"
     _expect(found == list(shape), where, f"{name!r} must be {wanted}, got {found}")
