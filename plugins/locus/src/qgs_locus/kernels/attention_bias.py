@@ -12,7 +12,6 @@ Axes: F numbers per query and G numbers per token, from which b is computed; n q
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from copy import copy
 from functools import cache
 from importlib import import_module
 from typing import Any, TypeAlias, TypeVar
@@ -118,15 +117,12 @@ class AttentionBias(ABC):
         # It needs numba.
         return import_module(self.kernels) if usable else None
 
-    def dense(self, chosen: Tensor | None = None) -> Tensor:
+    def dense(self, chosen: Tensor | slice = slice(None)) -> Tensor:
         """Return the bias (B, N, M) of all queries, or (B, Q, M) of the Q queries `chosen`.
 
         chosen: indices (Q,) of queries.
         """
-        bias = self
-        if chosen is not None:
-            bias = copy(self)
-            bias.queries = self.queries[:, chosen]
+        bias = type(self)(self.queries[:, chosen], self.tokens)
         return _outside_graphs(_Dense.apply)(bias.queries, bias.tokens, bias)
 
     def blocks(self, buffers: int, dtype: torch.dtype) -> Iterator[Block]:
