@@ -145,7 +145,7 @@ def _tripled(name: str, values: Tensor) -> Tensor:
         return values.repeat(1, 3)
     # Rows of the last layer are the radii: with equal rows they get equal steps.
     if name.startswith("refinements.0.radius_mlp.fc2."):
-        return values.repeat(3, *(1 for _ in values.shape[1:]))
+        return torch.cat([values] * 3)
     return values.clone()
 
 

@@ -1,5 +1,6 @@
 """State fields of a query's footprint, which is the part of a photo that the query starts from."""
 
+import torch
 from torch import Tensor
 
 from qgs.contracts import Fields, FieldSpec
@@ -34,6 +35,4 @@ def in_world(steps_BNx3: Tensor, frame_BN33: Tensor) -> Tensor:
     steps: (B, N, 3) or (B, N, K, 3), along the axes right, down and ahead. frame: these axes in the
     world frame, as rows (B, N, 3, 3).
     """
-    if steps_BNx3.ndim == frame_BN33.ndim:
-        return steps_BNx3 @ frame_BN33
-    return (steps_BNx3[:, :, None] @ frame_BN33)[:, :, 0]
+    return torch.einsum("bn...i,bnij->bn...j", steps_BNx3, frame_BN33)
