@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from itertools import groupby
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -38,9 +37,8 @@ def check_plugin(
     results: list[CheckResult] = []
     tiers = ("core", "construction") if core else running.TIERS
     # Each case is reported as soon as it is done.
-    checked = running.check_plugin(name, tiers)
-    for _, group in groupby(checked, key=lambda result: id(result.case)):
-        of_case = list(group)
+    for run in running.runs_of(name):
+        of_case = list(run.results(tiers))
         _print_case(of_case)
         results += of_case
     unchecked = running.without_case(installed)
