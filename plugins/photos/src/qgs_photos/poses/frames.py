@@ -60,17 +60,18 @@ def extract(
     start = times[0]
     # the last frame is shown as long as the others in the mean
     length = (times[-1] - start) * len(times) / (len(times) - 1) or 1.0
-    intervals = Intervals(start, length, count)
-    every = max(int(len(times) / (length * intervals.rate) / _JUDGED), 1)
+    # more in a short video, so that there are FEWEST
+    rate = count / length if count else max(PER_SECOND, FEWEST / length)
+    every = max(int(len(times) / (length * rate) / _JUDGED), 1)
     scores = dict[Path, float]()
     best: tuple[Any, Path] | None = None
     shown = list[float]()
-    for number, frame in enumerate(_decoded(video)):
+    placed = _placed(_decoded(video), start, rate, count)
+    for number, (frame, place) in enumerate(placed):
         if frame is None:
             damaged = True
             continue
         shown.append(frame.time)
-        place = intervals.place(frame)
         progress("seconds of the video", int(frame.time - start), int(length))
         path = folder / f"{place:05d}.jpg"
         if path in scores and number % every:
@@ -123,42 +124,35 @@ def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
     return list(best.values())
 
 
-class Intervals:
-    """Division of a video into intervals; one frame is taken from each.
+def _placed(
+    frames: Iterator[Any], start: float, rate: float, count: int | None
+) -> Iterator[tuple[Any, int]]:
+    """Yield each frame, or None, with the index of the interval that holds it.
 
-    start, length: first time and duration of the video in seconds. count: number of intervals, all
-    of the same duration. With None, an interval ends when the picture has moved by the fraction
-    STEP of its sides, or at the latest after 1 / `rate` seconds. Then `rate` is PER_SECOND; in a
-    short video it is higher, so that there are FEWEST intervals.
+    Frames must come in the order of time. One frame is taken from each interval. start: first time
+    in seconds. rate: intervals per second. count: number of intervals, all of the same duration.
+    With None, an interval ends when the picture has moved by the fraction STEP of its sides, or at
+    the latest after 1 / `rate` seconds.
     """
-
-    def __init__(self, start: float, length: float, count: int | None) -> None:
-        self.start = start
-        self.count = count
-        self.rate = count / length if count else max(PER_SECOND, FEWEST / length)
-        self._place = 0
-        self._opened = start
-        self._moved = 0.0
-        self._thumb: np.ndarray | None = None
-
-    def place(self, frame: Any) -> int:
-        """Return the index of the interval that holds the next frame.
-
-        Frames must come in the order of time.
-        """
+    place = 0
+    opened = start
+    moved = 0.0
+    before: np.ndarray | None = None
+    for frame in frames:
         # an interval ends with the frame that is due, in spite of rounding
-        if self.count:
-            place = int((frame.time - self.start) * self.rate + 1e-6)
-            return min(max(place, 0), self.count - 1)
-        thumb = _grey(frame, _THUMB)
-        if self._thumb is not None:
-            self._moved += shift(self._thumb, thumb)
-        self._thumb = thumb
-        if max((frame.time - self._opened) * self.rate + 1e-6, self._moved / STEP) >= 1:
-            self._place += 1
-            self._opened = frame.time
-            self._moved = 0.0
-        return self._place
+        if frame and count:
+            due = int((frame.time - start) * rate + 1e-6)
+            place = min(max(due, 0), count - 1)
+        elif frame:
+            after = _grey(frame, _THUMB)
+            if before is not None:
+                moved += shift(before, after)
+            before = after
+            if max((frame.time - opened) * rate + 1e-6, moved / STEP) >= 1:
+                place += 1
+                opened = frame.time
+                moved = 0.0
+        yield frame, place
 
 
 def shift(before: np.ndarray, after: np.ndarray) -> float:
