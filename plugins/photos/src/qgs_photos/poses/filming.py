@@ -115,10 +115,14 @@ def cameras_of(
     """
     size = size or _film_size(scene.cameras.size)
     if path in KINDS:
-        found = path_of(path, scene.cameras, seen_depth(scene), max(frames, 2))
-        return Cameras(found.c2w, lenses(found, size, fov), size)
-    c2w, intrinsics = read_path(Path(path), size, fov)
-    return in_world(scene.world, Cameras(c2w, intrinsics, size))[None]
+        photos = scene.cameras
+        c2w = path_of(path, photos, seen_depth(scene), max(frames, 2))
+        # all of the shorter side is seen
+        factor = max(size[0] / photos.size[0], size[1] / photos.size[1])
+        focal = factor * photos.intrinsics[0, :1, :2].expand(len(c2w), 2)
+        return Cameras(c2w, _centred(focal, size, fov), size)[None]
+    c2w, focal = read_path(Path(path), size)
+    return in_world(scene.world, Cameras(c2w, _centred(focal, size, fov), size))[None]
 
 
 def _film_size(photos: Size) -> Size:
@@ -128,24 +132,16 @@ def _film_size(photos: Size) -> Size:
     return height, width
 
 
-def lenses(path: Cameras, size: Size, fov: float | None) -> Tensor:
-    """Return intrinsics (1, T, 4) for pictures of `size` (H, W), with centred principal points.
+def _centred(focal: Tensor, size: Size, fov: float | None) -> Tensor:
+    """Return intrinsics (T, 4) for pictures of `size` (H, W), with centred principal points.
 
-    fov: vertical angle of view in degrees; None keeps the angle of `path` along the shorter side.
+    focal: fx and fy (T, 2) in pixels. fov: vertical angle of view in degrees, which replaces them;
+    None keeps them.
     """
     height, width = size
-    fx, fy, _, _ = path.intrinsics.unbind(-1)
-    if fov is None:
-        # all of the shorter side is seen
-        factor = max(height / path.size[0], width / path.size[1])
-        fx = fx * factor
-        fy = fy * factor
-    else:
-        fy = torch.full_like(fy, focal_length(fov, height))
-        fx = fy
-    cx = torch.full_like(fx, width / 2)
-    cy = torch.full_like(fx, height / 2)
-    return torch.stack([fx, fy, cx, cy], -1)
+    if fov is not None:
+        focal = torch.full_like(focal, focal_length(fov, height))
+    return torch.cat([focal, focal.new_tensor([width / 2, height / 2]).expand_as(focal)], -1)
 
 
 @torch.no_grad()

@@ -27,17 +27,15 @@ _SMOOTH = 1.5
 _TURNS = 2.0
 
 
-def path_of(kind: str, cameras: Cameras, depth: float, frames: int) -> Cameras:
-    """Return a camera path (1, frames) of a `kind` in KINDS, for a scene with `cameras` (1, V).
+def path_of(kind: str, cameras: Cameras, depth: float, frames: int) -> Tensor:
+    """Return poses (frames, 4, 4) of a `kind` of path in KINDS, for a scene with `cameras` (1, V).
 
-    depth: distance from the cameras to what they show. Intrinsics are those of the first camera.
+    depth: distance from the cameras to what they show.
     """
     if kind == "orbit":
-        return orbit(cameras, depth, frames)
+        return orbit(cameras, depth, frames).c2w[0]
     poses = cameras.c2w[0]
-    c2w = spiral(poses, depth, frames) if kind == "spiral" else walk(poses, frames)
-    intrinsics = cameras.intrinsics[:, :1].expand(1, frames, 4)
-    return Cameras(c2w[None], intrinsics, cameras.size)
+    return spiral(poses, depth, frames) if kind == "spiral" else walk(poses, frames)
 
 
 def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
@@ -65,12 +63,11 @@ def walk(c2w: Tensor, frames: int) -> Tensor:
     return look_at(centre, forward, down)
 
 
-def read_path(file: Path, size: Size, fov: float | None) -> tuple[Tensor, Tensor]:
-    """Read a camera path: camera-to-world (T, 4, 4), OpenCV axes, and intrinsics (T, 4), float64.
+def read_path(file: Path, size: Size) -> tuple[Tensor, Tensor]:
+    """Read a camera path: camera-to-world (T, 4, 4), OpenCV axes, and fx and fy (T, 2), float64.
 
-    file: a camera path of nerfstudio's viewer, or a transforms file. size: (H, W) of the video, for
-    the intrinsics in pixels. fov: vertical angle of view in degrees; None takes the file's angle.
-    Raises ValueError for any other file.
+    file: a camera path of nerfstudio's viewer, or a transforms file. size: (H, W) of the video, of
+    whose pixels the focal lengths are. Raises ValueError for any other file.
     """
     try:
         data = json.loads(file.read_bytes())
@@ -86,11 +83,9 @@ def read_path(file: Path, size: Size, fov: float | None) -> tuple[Tensor, Tensor
             f"{file} is not a camera path ({type(error).__name__}: {error}): give a path that "
             "nerfstudio's viewer saved, a transforms.json, or one of " + ", ".join(KINDS)
         ) from error
-    height, width = size
     # focal lengths of both axes are the same: paths list one angle
-    given = fov and focal_length(fov, height)
-    lenses = [(given or focal,) * 2 + (width / 2, height / 2) for _, focal in read]
-    return torch.from_numpy(poses), torch.tensor(lenses, dtype=torch.float64)
+    focal = torch.tensor([[focal] * 2 for _, focal in read], dtype=torch.float64)
+    return torch.from_numpy(poses), focal
 
 
 def _keyframe(entry: Mapping[str, Any], size: Size) -> tuple[np.ndarray, float]:
