@@ -284,7 +284,7 @@ def _one_patch_each(views: Views, places: Tensor, patch: int) -> Views:
 
     places: view, row and column of each patch. patch: side of a patch in pixels.
     """
-    scenes = map_tensors(lambda x: x.repeat(len(places), *[1] * (x.ndim - 1)), views)
+    scenes = map_tensors(lambda x: x.repeat_interleave(len(places), 0), views)
     generator = torch.Generator().manual_seed(1)
     for images, (view, row, column) in zip(scenes.images, (places * patch).tolist(), strict=True):
         # Writing in place is safe, because these scenes are copies.
