@@ -4,13 +4,7 @@ import numpy as np
 from upath import UPath
 
 from qgs.data.images import load_array
-from qgs.data.photos.reader import (
-    Listing,
-    PhotoFrame,
-    PhotoReader,
-    image_folder,
-    listed_size,
-)
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder, listed_size
 from qgs.paths import open_file
 from qgs_photos.image_files import image_files
 

@@ -20,13 +20,7 @@ from qgs.contracts import (
 )
 from qgs.contracts.schedule import END
 from qgs.data.inputs import Frusta, scene_depth, trained_ratios
-from qgs.data.view_samplers import (
-    evenly,
-    moments,
-    one_of_each,
-    refuse_too_many,
-    training_frames,
-)
+from qgs.data.view_samplers import evenly, moments, one_of_each, refuse_too_many, training_frames
 from qgs.domain import Domain
 
 _SHARE = 0.5
