@@ -21,36 +21,21 @@ from qgs_worlds.rooms.materials import Materials, between, kinds_beside
 WALLS = 6
 
 
-def _shape(kind: int, center: Point, half: Point, texture: int) -> Shape:
-    """Return a shape that is not turned. texture: index of a material."""
-    return Shape(Primitive(kind, center, half), texture=texture + WALLS)
+def solid(at: Point, size: Sequence[float], texture: int, kind: int = s.BLOCK) -> Shape:
+    """Return an upright solid that is not turned. Lengths are in metres.
+
+    at: centre of its bottom. size: width (along x), depth (along y) and height. texture: index of a
+    material. kind: BLOCK, CYLINDER or BALL; width and depth of the last two are equal.
+    """
+    x, y, z = at
+    w, d, h = size
+    body = Primitive(kind, (x, y, z + h / 2), (w / 2, d / 2, h / 2))
+    return Shape(body, texture=texture + WALLS)
 
 
 def _turned(shape: Shape, angle: float) -> Shape:
     """Return a shape turned by `angle` radians about its own z axis, in place of its own turn."""
     return shape._replace(body=shape.body._replace(turn=about_z(angle)))
-
-
-def box(x: float, y: float, z: float, w: float, d: float, h: float, texture: int) -> Shape:
-    """Return a box of width w (along x), depth d (along y) and height h, in metres.
-
-    (x, y, z) is the centre of its bottom face. texture: index of a material.
-    """
-    return _shape(s.BLOCK, (x, y, z + h / 2), (w / 2, d / 2, h / 2), texture)
-
-
-def cylinder(x: float, y: float, z: float, radius: float, height: float, texture: int) -> Shape:
-    """Return an upright cylinder. Lengths are in metres.
-
-    (x, y, z) is the centre of its bottom face. texture: index of a material.
-    """
-    half = (radius, radius, height / 2)
-    return _shape(s.CYLINDER, (x, y, z + height / 2), half, texture)
-
-
-def sphere(x: float, y: float, z: float, radius: float, texture: int) -> Shape:
-    """Return a sphere whose lowest point is (x, y, z). texture: index of a material."""
-    return _shape(s.BALL, (x, y, z + radius), (radius, radius, radius), texture)
 
 
 def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
@@ -59,8 +44,8 @@ def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
     size: x, y, z extent of the room in metres. Textures 0 to 5 are those of walls, floor and
     ceiling; textures of the other shapes follow from 6 on.
     """
-    walls = _shape(s.INTERIOR, (0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2]), -WALLS)
-    return shapes.packed([walls, *inside])
+    walls = Primitive(s.INTERIOR, (0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2]))
+    return shapes.packed([Shape(walls), *inside])
 
 
 Piece = list[Shape]
@@ -84,9 +69,7 @@ def _terms(value: float | str) -> list[tuple[float, str]]:
 
     The name of a plain number is "".
     """
-    if not isinstance(value, str):
-        return [(value, "")]
-    found = re.findall(r"([+-]?)(?=[\d.a-z])([\d.]*)([a-z]*)", value)
+    found = re.findall(r"([+-]?)(?=[\d.a-z])([\d.]*)([a-z]*)", str(value))
     return [(float(f"{sign}{factor or 1}"), name) for sign, factor, name in found]
 
 
@@ -96,10 +79,10 @@ def _lengths(values: list[Any], sizes: Sizes) -> list[float]:
 
 # Sums are parsed once, because rooms are drawn often.
 _KINDS = kinds_beside(__file__)
-_MAKERS: dict[str, Any] = {"box": box, "cylinder": cylinder, "sphere": sphere}
+_SOLIDS = {"box": s.BLOCK, "cylinder": s.CYLINDER, "sphere": s.BALL}
 for _kind in _KINDS.values():
     for _row in _kind.setdefault("parts", []):
-        _row[:3] = _MAKERS[_row[0]], [*map(_terms, (*_row[1], *_row[2]))]
+        _row[:3] = _SOLIDS[_row[0]], [*map(_terms, (*_row[1], *_row[2]))]
     for _row in _kind.setdefault("tops", []):
         _row[1:] = map(_terms, _row[1:])
 
@@ -109,8 +92,9 @@ def _part(row: list[Any], sizes: Sizes) -> Shape:
 
     sizes: values of the names in the row: lengths in metres, or indices of materials.
     """
-    make, lengths, material, *turn = row
-    part = make(*_lengths(lengths, sizes), sizes[material])
+    kind, lengths, material, *turn = row
+    x, y, z, *size = _lengths(lengths, sizes)
+    part = solid((x, y, z), size, sizes[material], kind)
     return _turned(part, sizes[turn[0]]) if turn else part
 
 
@@ -198,7 +182,7 @@ def _books(make: Furniture, sizes: Sizes) -> Piece:
     levels = sizes["n"]
     # the top board ends at the height of the sides
     heights = [min(i * _LEVEL, levels * _LEVEL - 0.03) for i in range(levels + 1)]
-    piece = [box(0, 0, z, w, 0.32, 0.03, sizes["wood"]) for z in heights]
+    piece = [solid((0, 0, z), (w, 0.32, 0.03), sizes["wood"]) for z in heights]
     for i in range(levels):
         z = i * _LEVEL + 0.03
         left = -w / 2 + 0.04
@@ -206,10 +190,11 @@ def _books(make: Furniture, sizes: Sizes) -> Piece:
             run = rng.uniform(0.18, 0.45)
             x = left + run / 2
             if rng.random() < 0.72:
-                high = rng.uniform(0.2, 0.3)
-                piece.append(box(x, 0.02, z, run - 0.02, 0.22, high, make.material("books")))
+                size = (run - 0.02, 0.22, rng.uniform(0.2, 0.3))
+                piece.append(solid((x, 0.02, z), size, make.material("books")))
             else:
-                piece.append(sphere(x, 0, z, rng.uniform(0.06, 0.09), make.material("paint")))
+                size = [rng.uniform(0.12, 0.18)] * 3
+                piece.append(solid((x, 0, z), size, make.material("paint"), s.BALL))
             left += run
     return piece
 
@@ -221,8 +206,9 @@ def _doors(make: Furniture, sizes: Sizes) -> Piece:
     wide = sizes["w"] / doors
     for i in range(doors):
         x = (i + 0.5) * sizes["w"] / doors - sizes["w"] / 2
-        piece.append(box(x, -0.21, 0.12, wide - 0.04, 0.03, h - 0.18, sizes["front"]))
-        piece.append(sphere(x + 0.3 * wide, -0.24, h / 2, 0.025, sizes["knob"]))
+        piece.append(solid((x, -0.21, 0.12), (wide - 0.04, 0.03, h - 0.18), sizes["front"]))
+        knob = (x + 0.3 * wide, -0.24, h / 2)
+        piece.append(solid(knob, (0.05, 0.05, 0.05), sizes["knob"], s.BALL))
     return piece
 
 

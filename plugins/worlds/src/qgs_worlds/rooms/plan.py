@@ -7,16 +7,15 @@ import numpy as np
 
 from qgs_worlds.caster.interiors import blurred, darkened_floor
 from qgs_worlds.caster.shapes import Point, Shape
-from qgs_worlds.caster.tables import LIGHT, Room, Size
+from qgs_worlds.caster.tables import CYLINDER, LIGHT, Room, Size
 from qgs_worlds.rooms.furniture import (
     AGAINST_WALLS,
     CENTRAL,
     LOOSE,
     Furniture,
     Piece,
-    box,
-    cylinder,
     packed,
+    solid,
 )
 from qgs_worlds.rooms.materials import Materials
 
@@ -201,13 +200,14 @@ def _fixed(make: Furniture, size: Size) -> list[Shape]:
     rng = make.rng
     board = make.material("pale")
     w, d, h = size
-    shapes = [box(0, side * d / 2, 0, w, 0.04, 0.09, board) for side in (-1, 1)]
-    shapes += [box(side * w / 2, 0, 0, 0.04, d, 0.09, board) for side in (-1, 1)]
-    shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, make.material("glow")))
+    shapes = [solid((0, side * d / 2, 0), (w, 0.04, 0.09), board) for side in (-1, 1)]
+    shapes += [solid((side * w / 2, 0, 0), (0.04, d, 0.09), board) for side in (-1, 1)]
+    lamp = (0, 0, h - 0.12)
+    shapes.append(solid(lamp, (0.5, 0.5, 0.12), make.material("glow"), CYLINDER))
     if rng.random() < 0.75:
         wide = rng.uniform(0.35, 0.6) * w
         deep = rng.uniform(0.35, 0.6) * d
-        rug = box(0, 0, 0, wide, deep, 0.012, make.material("rug"))
+        rug = solid((0, 0, 0), (wide, deep, 0.012), make.material("rug"))
         x, y = [rng.uniform(-0.3, 0.3) for _ in range(2)]
         shapes.append(rug.moved(rng.gauss(0, 0.1), (x, y, 0.0)))
     return shapes
