@@ -7,7 +7,6 @@ axis goes through the centre of the room. Shapes are upright and may be turned a
 import math
 import re
 from collections.abc import Sequence
-from random import Random
 from typing import Any
 
 import numpy as np
@@ -98,12 +97,8 @@ def _part(row: list[Any], sizes: Sizes) -> Shape:
     return _turned(part, sizes[turn[0]]) if turn else part
 
 
-class Furniture:
+class Furniture(Materials):
     """Generator of random furniture for one room, of the kinds in furniture.toml."""
-
-    def __init__(self, rng: Random, material: Materials) -> None:
-        self.rng = rng
-        self.material = material
 
     def piece(self, name: str, **sizes: Any) -> Piece:
         """Return a random piece of furniture of the kind `name` in furniture.toml.

@@ -36,7 +36,7 @@ def between(rng: Random, value: float | Sequence[float]) -> float:
 
 
 class Materials:
-    """Random textures of one room, in a few matching hues; calling the object adds a texture."""
+    """Random textures of one room, in a few matching hues."""
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
@@ -46,7 +46,7 @@ class Materials:
         self._hues = [(base + step + 0.04 * rng.gauss(0, 1)) % 1 for step in (0.0, 0.08, 0.5, 0.35)]
         self._wood = rng.choice(_WOODS)
 
-    def __call__(self, name: str) -> int:
+    def material(self, name: str) -> int:
         """Add a random material of the kind `name` in materials.toml, and return its index."""
         rng = self.rng
         paints = dict(_FIXED)
@@ -68,7 +68,7 @@ class Materials:
         )
         return len(self._rows) - 1
 
-    def table(self, first: Sequence[int]) -> np.ndarray:
+    def textures(self, first: Sequence[int]) -> np.ndarray:
         """Return a table of TEXTURE for the ray caster, one row for each material.
 
         first: indices of materials whose rows are repeated at the start, before all materials.

@@ -17,7 +17,6 @@ from qgs_worlds.rooms.furniture import (
     packed,
     solid,
 )
-from qgs_worlds.rooms.materials import Materials
 
 # metres between a camera and the nearest shape
 CLEARANCE = 0.4
@@ -36,12 +35,11 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
 
     eyes: camera centres (F, 3), from which furniture keeps a distance.
     """
-    material = Materials(rng)
+    make = Furniture(rng)
     # in most rooms all four walls are of one kind
-    wall = material("wall")
-    walls = [wall] + [material("wall") if rng.random() < 0.4 else wall for _ in range(3)]
-    surfaces = [*walls, material("floor"), material("pale")]
-    make = Furniture(rng, material)
+    wall = make.material("wall")
+    walls = [wall] + [make.material("wall") if rng.random() < 0.4 else wall for _ in range(3)]
+    surfaces = [*walls, make.material("floor"), make.material("pale")]
     furnisher = Furnisher(size, eyes)
     # the table comes first, because it needs the most room
     _centre(make, furnisher)
@@ -58,7 +56,7 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
     lights = _lights(rng, size, window_side)
     # blurring twice is nearly a Gaussian; lamps are wide
     floor = 1 - blurred(blurred(darkened_floor(shapes, size, lights["place"][0])))
-    return Room(shapes, NO_HEIGHTS, material.table(surfaces), size, lights, floor)
+    return Room(shapes, NO_HEIGHTS, make.textures(surfaces), size, lights, floor)
 
 
 class Furnisher:
