@@ -6,7 +6,7 @@ from random import Random
 import numpy as np
 
 from qgs_worlds.caster.interiors import blurred, darkened_floor
-from qgs_worlds.caster.shapes import Point, Shape
+from qgs_worlds.caster.shapes import Point, Shape, about_z, rotated
 from qgs_worlds.caster.tables import CYLINDER, LIGHT, Room, Size
 from qgs_worlds.rooms.furniture import (
     AGAINST_WALLS,
@@ -48,7 +48,7 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
     for _ in range(3):
         name = rng.choice(LOOSE)
         x, y = (rng.uniform(-0.4, 0.4) * extent for extent in size[:2])
-        furnisher.place(make.piece(name), x, y, rng.uniform(0, 2 * math.pi))
+        furnisher.place(make.piece(name), (x, y, 0.0), rng.uniform(0, 2 * math.pi))
     window_side = rng.randrange(4)
     furnisher.shapes += _on_walls(make, size, window_side)
     furnisher.shapes += _fixed(make, size)
@@ -68,16 +68,16 @@ class Furnisher:
         self.shapes: list[Shape] = []
         self._taken: list[tuple[Point, Point]] = []
 
-    def place(self, piece: Piece, x: float, y: float, turn: float) -> bool:
-        """Place `piece` at (x, y), turned by `turn` radians, if it fits.
+    def place(self, piece: Piece, to: Point, turn: float) -> bool:
+        """Place `piece` at `to` on the floor, turned by `turn` radians, if it fits.
 
         Returns True if the piece was placed, False if it does not fit.
         """
-        low, high = turned(*bounds(piece), x, y, turn)
+        low, high = turned(*bounds(piece), to, turn)
         if not self.free(low, high):
             return False
         self._taken.append((low, high))
-        self.shapes += [shape.moved(turn, (x, y, 0.0)) for shape in piece]
+        self.shapes += [shape.moved(turn, to) for shape in piece]
         return True
 
     def free(self, low: Point, high: Point) -> bool:
@@ -109,11 +109,12 @@ def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
     return low, high
 
 
-def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
-    """Return the bounding box of a box after a turn by `turn` radians about z and a move by (x, y).
+def turned(low: Point, high: Point, to: Point, turn: float) -> tuple[Point, Point]:
+    """Return the bounding box of a box after a turn by `turn` radians about z and a move by `to`.
 
-    low, high, and the result: lowest and highest corner of a box.
+    low, high, and the result: lowest and highest corner of a box. Only x and y of `to` count.
     """
+    x, y, _ = to
     cos = math.cos(turn)
     sin = math.sin(turn)
     xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
@@ -129,7 +130,7 @@ def _centre(make: Furniture, furnisher: Furnisher) -> None:
     # after a few failed tries the room stays without it
     for _ in range(4):
         x, y = (rng.uniform(-0.18, 0.18) * extent for extent in furnisher.size[:2])
-        if furnisher.place(piece, x, y, turn):
+        if furnisher.place(piece, (x, y, 0.0), turn):
             return
 
 
@@ -145,27 +146,24 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
     position = -along / 2 + rng.uniform(0.1, 0.6)
     while position < along / 2 - 0.4:
         # drawing a piece takes long, so first test if any piece would fit
-        spot = turned(*_SMALLEST, *_from_wall(side, across / 2 - 0.2, position + 0.2), turn)
+        spot = turned(*_SMALLEST, _from_wall(side, across / 2 - 0.2, position + 0.2), turn)
         if furnisher.free(*spot):
             piece = make.piece(rng.choice(AGAINST_WALLS))
             low, high = bounds(piece)
             # the skirting board sticks out by 2 cm
             at = _from_wall(side, across / 2 - high[1] - 0.02, position - low[0])
-            if furnisher.place(piece, *at, turn):
+            if furnisher.place(piece, at, turn):
                 position += high[0] - low[0]
         position += rng.uniform(0.1, 0.5)
 
 
-def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
-    """Return x and y of a point that is given relative to the centre of the room and a wall.
+def _from_wall(side: int, away: float, along: float) -> Point:
+    """Return a point on the floor that is given relative to the centre of the room and a wall.
 
     side: number of the wall, 0 to 3. away: metres from the centre of the room towards the wall.
     along: metres parallel to the wall, from the line that leads from the centre to the wall.
     """
-    angle = math.pi + side * math.pi / 2
-    cos = math.cos(angle)
-    sin = math.sin(angle)
-    return cos * away + sin * along, sin * away - cos * along
+    return rotated(about_z(math.pi + side * math.pi / 2), (away, -along, 0.0))
 
 
 def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
@@ -188,8 +186,8 @@ def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
             places = [place for place in places if rng.random() < 0.65]
             hung = {place: make.piece("picture") for place in places}
         for place, item in hung.items():
-            x, y = _from_wall(side, across / 2, place)
-            shapes += [shape.moved(turn, (x, y, 0.0)) for shape in item]
+            at = _from_wall(side, across / 2, place)
+            shapes += [shape.moved(turn, at) for shape in item]
     return shapes
 
 
@@ -213,7 +211,7 @@ def _fixed(make: Furniture, size: Size) -> list[Shape]:
 
 def _lights(rng: Random, size: Size, window_side: int) -> np.ndarray:
     """Return a table of LIGHT with two rows: a warm lamp below the ceiling, a cool window."""
-    x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
+    x, y, _ = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
     lights = np.zeros(2, LIGHT)
     lights["place"] = (0.0, 0.0, size[2] - 0.2), (x, y, 1.6)
     lamp = rng.uniform(0.55, 0.95)
