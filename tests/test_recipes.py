@@ -221,7 +221,7 @@ def test_a_study_keeps_its_promises(file, tmp_path):
         promises["varies as the tiny one"] = tiny.variants.keys() == study.variants.keys()
         promises["asks what the tiny one does"] = shared == claims
     if "/published/" in file and (prefix := TABLES.get(Path(file).stem)) is not None:
-        for name, variant in recipes.items():
+        for (name, _), variant in recipes.items():
             table = recipe(f"ablations/{prefix}{NAMES.get(name, name)}.yaml")
             sections = {path.split(".")[0] for path in differences(variant, table)}
             promises[f"has {name} of the tables"] = sections <= {"data", "evaluation"}

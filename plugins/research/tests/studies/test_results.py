@@ -2,7 +2,7 @@
 
 import re
 import shutil
-from types import SimpleNamespace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -56,14 +56,11 @@ def results(folder, lead=(0, 0, 0), views=lambda variant, evaluation: evaluation
     """Of 8 scenes. lead: of `other`, for each seed. views: what a protocol says."""
     (folder / "study.yaml").write_text(text)
     study = read_study(folder / "study.yaml")
-    plan = Plan(study, folder, dict.fromkeys(study.variants, SimpleNamespace()))
-    for variant in plan.recipes:
-        for seed, ahead in enumerate(lead):
-            for name in plan.evaluations:
-                more = ahead * (variant == "other")
-                values = {f"s{n}": score(variant, name, seed, n) + more for n in range(8)}
-                where = run_of(folder, variant, seed).evaluation(name)
-                write_run(where, values, views(variant, name))
+    plan = Plan(study, folder, dict.fromkeys(product(study.variants, ["", *study.evaluations])))
+    for (variant, name), (seed, ahead) in product(plan.recipes, enumerate(lead)):
+        more = ahead * (variant == "other")
+        values = {f"s{n}": score(variant, name, seed, n) + more for n in range(8)}
+        write_run(run_of(folder, variant, seed).evaluation(name), values, views(variant, name))
     return Results(plan)
 
 

@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 
 from pydantic_core import to_jsonable_python
@@ -79,13 +78,13 @@ class Run:
 class Plan:
     """Runs and evaluations of a study in `folder`.
 
-    recipes: checked recipe of each variant, by name of the variant. All have the study's first
-    seed.
+    recipes: checked recipe of each variant, changed as each evaluation says, by names of variant
+    and evaluation. All have the study's first seed.
     """
 
     study: Study
     folder: Path
-    recipes: Mapping[str, Recipe]
+    recipes: Mapping[tuple[str, str], Recipe]
 
     @property
     def evaluations(self) -> list[str]:
@@ -97,19 +96,13 @@ class Plan:
         """All runs of the study: each variant with the first seed, then with the second, ..."""
         seeds = self.study.settings.seeds
         # Seeds come first, so that an unfinished study has complete comparisons.
-        return [run_of(self.folder, name, seed) for seed in seeds for name in self.recipes]
+        return [run_of(self.folder, name, seed) for seed in seeds for name in self.study.variants]
 
     @property
     def size(self) -> str:
         """Size of the study, for example "4 variants x 3 seeds"."""
-        variants = counted(len(self.recipes), "variant")
+        variants = counted(len(self.study.variants), "variant")
         return f"{variants} x {counted(len(self.study.settings.seeds), 'seed')}"
-
-    def evaluation_recipe(self, variant: str, evaluation: str) -> Recipe:
-        """Return the recipe of `variant`, changed as the evaluation `evaluation` says."""
-        recipe = self.recipes[variant]
-        changes = self.study.evaluations.get(evaluation)
-        return changed_recipe(recipe, changes) if changes else recipe
 
     def done(self, run: Run) -> bool:
         """Return True if all evaluations of `run` are complete."""
@@ -140,10 +133,9 @@ def changed_recipe(recipe: Recipe, changes: MapNode) -> Recipe:
 
 def write_plan(plan: Plan) -> None:
     """Write the checked recipes of all variants, which the training processes read."""
-    for variant, evaluation in product(plan.recipes, plan.evaluations):
+    for place, recipe in plan.recipes.items():
         # Include the file and line that set each value, for readers of the folder.
-        text = annotated(plan.evaluation_recipe(variant, evaluation))
-        write_text(recipe_file(plan.folder, variant, evaluation), f"{text}\n")
+        write_text(recipe_file(plan.folder, *place), f"{annotated(recipe)}\n")
 
 
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[str | None, str | None]]:
@@ -168,9 +160,10 @@ def planned(study: Study, folder: Path) -> Plan:
     return plan
 
 
-def composed(study: Study) -> dict[str, Recipe]:
+def composed(study: Study) -> dict[tuple[str, str], Recipe]:
     """Return the checked recipes of all variants, with the budget of the study.
 
+    The keys are names of variant and evaluation; recipes of the default evaluation come first.
     Raises RecipeError with all faults of the recipes and all forbidden differences between them.
     Raises the errors of building the models.
     """
@@ -181,6 +174,7 @@ def composed(study: Study) -> dict[str, Recipe]:
             # A recipe has one seed, which each run replaces by its own.
             recipe = resolve(node, [f"seed={study.settings.seeds[0]}"])
             recipes[name] = _with_budget(study, with_absolute_path(recipe))
+    found = {(name, MAIN): recipe for name, recipe in recipes.items()}
     # Differences to a variant that cannot be composed are unknown.
     if len(recipes) == len(study.variants):
         check_equal(study, recipes, problems)
@@ -188,7 +182,7 @@ def composed(study: Study) -> dict[str, Recipe]:
         for label, node in study.evaluations.items():
             for name, recipe in recipes.items():
                 with _collected(problems, f"evaluations.{label}, of {name}", node.origin):
-                    changed_recipe(recipe, node)
+                    found[name, label] = changed_recipe(recipe, node)
     problems.raise_any()
     for name, recipe in recipes.items():
         try:
@@ -197,7 +191,7 @@ def composed(study: Study) -> dict[str, Recipe]:
             # The error of a component does not name the variant.
             error.add_note(f"in the variant `{name}`, {study.variants[name].origin}")
             raise
-    return recipes
+    return found
 
 
 @contextmanager
@@ -305,8 +299,7 @@ def check_data(plan: Plan) -> None:
     settings = plan.study.settings
     metrics = [settings.metric, *(h.metric for h in settings.hypotheses if h.metric)]
     opened = set[str]()
-    for variant, name in product(plan.recipes, plan.evaluations):
-        recipe = plan.evaluation_recipe(variant, name)
+    for recipe in plan.recipes.values():
         # Most variants share their data, and opening it takes seconds.
         key = dump([recipe.tree[section] for section in ("data", "evaluation", "metrics")])
         if key in opened:
@@ -329,8 +322,7 @@ def check_data(plan: Plan) -> None:
 
 def refuse_changed(plan: Plan) -> None:
     """Raise ValueError if a recipe has changed since it made results in the study folder."""
-    for variant, name in product(plan.recipes, plan.evaluations):
-        recipe = plan.evaluation_recipe(variant, name)
+    for (variant, name), recipe in plan.recipes.items():
         file = recipe_file(plan.folder, variant, name)
         # Runs of seeds that the study no longer names count too, since it may name them again.
         folders = (plan.folder / "runs" / variant).glob("seed-*/")

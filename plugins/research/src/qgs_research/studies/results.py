@@ -55,7 +55,7 @@ class Results(Scores):
 
     def __init__(self, plan: Plan) -> None:
         settings = plan.study.settings
-        stored = {place: {} for place in product(plan.recipes, plan.evaluations)}
+        stored = {place: {} for place in plan.recipes}
         for run, evaluation in product(plan.runs, plan.evaluations):
             # Only complete evaluations count: one that is being written would change the means.
             if run.evaluated(evaluation):

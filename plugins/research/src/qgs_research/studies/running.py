@@ -46,7 +46,8 @@ def run_study(
     with console.status("composing and checking all variants"):
         plan = planned(read_study(file), out)
         write_plan(plan)
-    for name, recipe in plan.recipes.items():
+    for name in plan.study.variants:
+        recipe = plan.recipes[name, MAIN]
         print_lines(console, [f"warning: {name}: {warning}" for warning in recipe.warnings])
     missing = sum(not plan.done(run) for run in plan.runs)
     print_lines(console, [f"{plan.size}: {counted(len(plan.runs), 'run')}, {missing} missing"])
