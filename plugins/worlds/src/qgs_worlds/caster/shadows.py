@@ -22,12 +22,9 @@ _LAMP_SIDE = 72
 # Distance of the sun in metres: far enough for nearly parallel rays, near enough for float32.
 _SUN = 300.0
 
+_AXES = ((1, 2, 0), (0, 2, 1), (0, 1, 2))
 # Rotations of a lamp's cameras, which look along +x, -x, +y, -y, +z, -z.
-_FACES = np.zeros((6, 3, 3))
-for _face in range(6):
-    _axis = _face // 2
-    _others = [axis for axis in range(3) if axis != _axis]
-    _FACES[_face, [*_others, _axis], range(3)] = 1, 1, 1 - 2 * (_face % 2)
+_FACES = [np.eye(3)[:, axes] * (1, 1, sign) for axes in _AXES for sign in (1, -1)]
 
 
 def shadow_maps(
