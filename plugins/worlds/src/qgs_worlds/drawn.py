@@ -111,10 +111,8 @@ class DrawnScene(Scene):
             cache.update(
                 {(self.name, frame): images[frame] for frame in missing[: max(fitting, 0)]}
             )
-        out = np.empty((len(frames), 3, *config.image_size), np.float32)
-        for place, frame in enumerate(frames):
-            np.multiply(images[frame].transpose(2, 0, 1), np.float32(1 / 255), out=out[place])
-        return torch.from_numpy(out)
+        found = torch.from_numpy(np.stack([images[frame] for frame in frames]))
+        return found.permute(0, 3, 1, 2).contiguous() * (1 / 255)
 
 
 class DrawnSource(LazySource):
