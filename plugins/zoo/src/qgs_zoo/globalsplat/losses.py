@@ -172,9 +172,8 @@ def subset(count: int, part: int) -> list[int]:
 def disagreement(one: Tensor, other: Tensor) -> Tensor:
     """Return the mean of |one - other|, 0-d, with the symmetric stop-gradient of the paper.
 
-    It is the mean of two equal terms. In the first, `other` gets no gradient; in the second, `one`
-    gets no gradient.
+    The paper has the mean of two equal terms. In the first, `other` gets no gradient, in the
+    second, `one` gets none. So each side gets half of the gradient that it would get without stops.
     """
-    # If neither side were held fixed, both would drift to the blurred mean.
-    held = (one - other.detach()).abs().mean(), (other - one.detach()).abs().mean()
-    return (held[0] + held[1]) / 2
+    apart = (one - other).abs().mean()
+    return (apart + apart.detach()) / 2
