@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from einops import rearrange
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from qgs.contracts import MissingExtraError, Outcome
 from qgs.precision import full_precision
@@ -19,6 +19,13 @@ PIXEL_ENCODING = "camera centre; directions of z = 1: upper left corner, step ac
 
 The ray through the point (u, v), from (0, 0) to (1, 1), has the direction corner + u * step across
 + v * step down."""
+
+
+class Decaying:
+    """Part of components all of whose parameters have weight decay, as in the released code."""
+
+    def decays(self, name: str, parameter: nn.Parameter) -> bool:
+        return True
 
 
 def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> Tensor:

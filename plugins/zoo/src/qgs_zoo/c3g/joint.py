@@ -15,10 +15,10 @@ from qgs.geometry.harmonics import SH_C0
 from qgs.precision import at_least_float32
 from qgs.tokengs import Mlp, NormConfig
 from qgs.types import GaussianAttributes, ImageMemory, QueryState
-from qgs_zoo.parts import self_attention
+from qgs_zoo.parts import Decaying, self_attention
 
 
-class JointLayer(DecoderLayer):
+class JointLayer(Decaying, DecoderLayer):
     """Decoder layer with self-attention over image tokens and queries together, then an MLP (C3G).
 
     It computes x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)), without LayerScale. It
@@ -45,10 +45,6 @@ class JointLayer(DecoderLayer):
         self.mlp_norm = nn.LayerNorm(width, config.norm_eps)
         self.mlp = Mlp(width, int(config.mlp_ratio * width), width)
 
-    def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return True, because all parameters have weight decay (C3G release)."""
-        return True
-
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         """Return updated queries and image tokens. No token attends to masked queries."""
         # Image tokens come first, so that one cut separates them from queries.
@@ -70,7 +66,7 @@ CHANNELS = (3, 1, 3, 4, 3)
 """Channels per Gaussian: position, opacity, scale, rotation, colour (C3G release)."""
 
 
-class C3GHead(Head):
+class C3GHead(Decaying, Head):
     """Head with LayerNorm, a linear layer, and the activations of the C3G release.
 
     The linear layer maps the D features of a query to K Gaussians of 14 raw channels.
@@ -93,10 +89,6 @@ class C3GHead(Head):
         super().__init__(config, dims)
         self.norm = nn.LayerNorm(dims.width, config.norm_eps)
         self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
-
-    def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return True, because all parameters have weight decay (C3G release)."""
-        return True
 
     def forward(self, state: QueryState) -> GaussianAttributes:
         """Return attributes of (B, N, K) Gaussians, at least float32, from features (B, N, D)."""

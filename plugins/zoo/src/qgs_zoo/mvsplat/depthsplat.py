@@ -35,6 +35,7 @@ from qgs_zoo.mvsplat.sweep import (
 )
 from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, resized, two_convolutions
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
+from qgs_zoo.parts import Decaying
 
 GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
 """Number of a raw Gaussian's channels for opacity, position in the pixel, scale and quaternion. The
@@ -323,7 +324,7 @@ class DepthSplat(nn.Module):
         return found.depths, raw.unflatten(0, images_BV3HW.shape[:2])
 
 
-class DepthSplatEncoder(SweepEncoder):
+class DepthSplatEncoder(Decaying, SweepEncoder):
     """Encoder that predicts depth and raw Gaussian of each pixel, with a plane sweep and a ViT.
 
     The ViT is pretrained. The memory has a token for each pixel. The D numbers of a token are those
@@ -367,10 +368,6 @@ class DepthSplatEncoder(SweepEncoder):
 
     def load_pretrained(self) -> None:
         self.network.depth_predictor.pretrained.load(self.config.vit.weights)
-
-    def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return True, because all parameters have weight decay (released code)."""
-        return True
 
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
         # Chosen once: both scales and the transformer read the same views.
