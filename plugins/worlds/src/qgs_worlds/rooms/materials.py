@@ -40,7 +40,7 @@ class Materials:
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
-        self._rows: list[dict[str, Any]] = []
+        self._rows: list[np.ndarray] = []
         # neighbouring hues, an opposite one and a third one match
         base = rng.random()
         self._hues = [(base + step + 0.04 * rng.gauss(0, 1)) % 1 for step in (0.0, 0.08, 0.5, 0.35)]
@@ -51,21 +51,18 @@ class Materials:
         rng = self.rng
         paints = dict(_FIXED)
         kind = _KINDS[name]
-        row = self._pattern(kind, paints)
+        row = np.zeros((), TEXTURE)
+        self._rows.append(row)
+        self._pattern(row, kind, paints)
         if "kinds" in kind:
             pick = rng.random()
             one = next(one for one in kind["kinds"] if pick < one["below"])
-            row |= self._pattern(one, paints)
+            self._pattern(row, one, paints)
             kind = kind | one
-        self._rows.append(
-            {
-                **row,
-                "period": between(rng, kind["period"]),
-                "seed": int(rng.random() * 65536),
-                "emission": kind.get("emission", 0.0),
-                "colors": [toned(paints[paint], factor) for paint, factor in kind["colors"]],
-            }
-        )
+        row["period"] = between(rng, kind["period"])
+        row["seed"] = rng.random() * 65536
+        row["emission"] = kind.get("emission", 0.0)
+        row["colors"][:3] = [toned(paints[paint], factor) for paint, factor in kind["colors"]]
         return len(self._rows) - 1
 
     def textures(self, first: Sequence[int]) -> np.ndarray:
@@ -73,24 +70,20 @@ class Materials:
 
         first: indices of materials whose rows are repeated at the start, before all materials.
         """
-        rows = [self._rows[i] for i in first] + self._rows
-        table = np.zeros(len(rows), TEXTURE)
-        for field in rows[0].keys() - {"colors"}:
-            table[field] = [row[field] for row in rows]
-        table["colors"][:, :3] = [row["colors"] for row in rows]
-        return table
+        return np.stack([self._rows[i] for i in first] + self._rows)
 
-    def _pattern(self, kind: dict[str, Any], paints: dict[str, Color]) -> dict[str, int]:
+    def _pattern(self, row: np.ndarray, kind: dict[str, Any], paints: dict[str, Color]) -> None:
         """Choose a random pattern for a kind of material, and add its colours to `paints`.
 
-        Returns {"pattern": number of the pattern}; an empty dict if the kind has no pattern.
+        row: row of TEXTURE, which gets the pattern if the kind has one.
         """
         names = kind.get("patterns", [])
-        # a choice among one would consume a random number
-        name = self.rng.choice(names) if len(names) > 1 else "".join(names)
+        if names:
+            # a choice among one would consume a random number
+            name = self.rng.choice(names) if len(names) > 1 else names[0]
+            row["pattern"] = getattr(patterns, name)
         for paint, how in kind.get("paints", {}).items():
             paints[paint] = self._paint(how, paints)
-        return {"pattern": getattr(patterns, name)} if name else {}
 
     def _paint(self, how: dict[str, Any], paints: dict[str, Color]) -> Color:
         rng = self.rng
