@@ -39,6 +39,7 @@ class DrawnConfig(SceneSource.Config):
 class DrawnScene(Scene):
     """Procedural scene with F = `views_per_scene` cameras, determined by (seed, split, index).
 
+    name: SPLIT/INDEX.
     c2w: poses (F, 4, 4) with OpenCV axes, in the units of `tables`. lens: fx, fy, cx, cy in pixels.
     scale: factor from lengths in the units of `tables` to metres.
     """
@@ -47,14 +48,12 @@ class DrawnScene(Scene):
     lens: np.ndarray
     scale = 1.0
 
-    def __init__(
-        self, name: str, index: int, config: DrawnConfig, split: Split, cache: ImageCache
-    ) -> None:
+    def __init__(self, name: str, index: int, config: DrawnConfig, cache: ImageCache) -> None:
         self.name = name
         self._config = config
         self._cache = cache
         # a list, because numpy's generators take a list as seed
-        self.key = [config.seed, 0 if split == "train" else 1, index]
+        self.key = [config.seed, 0 if name.startswith("train") else 1, index]
 
     def __len__(self) -> int:
         return self._config.views_per_scene
@@ -120,7 +119,7 @@ class DrawnSource(LazySource):
 
     Config = DrawnConfig
     scene: ClassVar[Callable[..., DrawnScene]]
-    """Function that makes a scene from its name, index, config, split and cache."""
+    """Function that makes a scene from its name, index, config and cache."""
     not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
     split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 
@@ -128,9 +127,8 @@ class DrawnSource(LazySource):
         super().__init__(config)
         cache: ImageCache = {}
         counts: dict[Split, int] = {"train": config.scenes, "test": config.test_scenes}
-        splits = {}
-        for split, count in counts.items():
-            places = {f"{split}/{index:06d}": index for index in range(count)}
-            scene = partial(self.scene, config=config, split=split, cache=cache)
-            splits[split] = LazyScenes(places, scene)
-        self.splits = splits
+        scene = partial(self.scene, config=config, cache=cache)
+        self.splits = {
+            split: LazyScenes({f"{split}/{index:06d}": index for index in range(count)}, scene)
+            for split, count in counts.items()
+        }

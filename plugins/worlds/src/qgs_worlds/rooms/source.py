@@ -11,7 +11,6 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from qgs.contracts.data import Split
 from qgs.contracts.settings import ascending
 from qgs_worlds.caster.lens import lens, look_along
 from qgs_worlds.caster.shapes import about_z
@@ -42,10 +41,8 @@ class RoomScene(DrawnScene):
     World frame: metres, z up, floor at z = 0.
     """
 
-    def __init__(
-        self, name: str, index: int, config: RoomsConfig, split: Split, cache: ImageCache
-    ) -> None:
-        super().__init__(name, index, config, split, cache)
+    def __init__(self, name: str, index: int, config: RoomsConfig, cache: ImageCache) -> None:
+        super().__init__(name, index, config, cache)
         rng = np.random.default_rng(self.key)
         # drawn first, so that it does not depend on the number of draws for the path
         self._plan_seed = int(rng.integers(1 << 62))

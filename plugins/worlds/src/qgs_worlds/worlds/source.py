@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from pydantic import Field, PositiveInt
 
-from qgs.contracts import Ascending, Split
+from qgs.contracts import Ascending
 from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
 from qgs_worlds.rooms.source import RoomScene, RoomsConfig
 
@@ -102,17 +102,16 @@ class WorldScene(DrawnScene):
         return [photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
 
 
-def world_or_room(
-    name: str, index: int, config: WorldsConfig, split: Split, cache: ImageCache
-) -> DrawnScene:
+def world_or_room(name: str, index: int, config: WorldsConfig, cache: ImageCache) -> DrawnScene:
     """Return scene `index` of a split: a furnished room or an abstract scene.
 
     `config.rooms` is the probability of a furnished room.
     """
+    split = name.partition("/")[0]
     # a separate generator, so that the share changes no scene
     if Random(f"{config.seed} {split} {index}").random() >= config.rooms:
-        return WorldScene(name, index, config, split, cache)
-    return RoomScene(name, index, config.of_rooms, split, cache)
+        return WorldScene(name, index, config, cache)
+    return RoomScene(name, index, config.of_rooms, cache)
 
 
 class WorldsSource(DrawnSource):
