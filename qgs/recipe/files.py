@@ -1,7 +1,7 @@
 """Reading of recipe files, of the files that they extend, and of `--set` overrides."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -25,6 +25,8 @@ KINDS = ("kind", "schedule")
 """Options that decide which other options a mapping without `type` has."""
 _Trees: TypeAlias = dict[Path, MapNode | None]
 """Merged recipe of each file, by resolved path; None while the file is being read."""
+_Merge: TypeAlias = Callable[[MapNode, MapNode], MapNode]
+"""Function that merges the second of two mappings, a file's, into the first, which it extends."""
 
 
 def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
@@ -88,10 +90,15 @@ def found_recipe(file: Path, name: str | Path) -> Path:
     return file
 
 
-def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> MapNode:
-    """Read a recipe and merge it over the files that it extends."""
+def read_recipe(
+    recipe: str | Path | Mapping[str, Any], problems: Problems, merging: _Merge = merge
+) -> MapNode:
+    """Read a recipe, or a file of another kind, and merge it over the files that it extends.
+
+    merging: function that merges two files of this kind.
+    """
     if not isinstance(recipe, Mapping):
-        return _read(found_recipe(Path(recipe), recipe), {}, problems)
+        return _read(found_recipe(Path(recipe), recipe), {}, problems, merging)
     origin = Origin("<mapping>")
     try:
         # A study's variant is a mapping that knows where it was written.
@@ -100,7 +107,7 @@ def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> M
         problems.stop(
             origin, "", str(error), "use only mappings, lists, strings, numbers, bools, None"
         )
-    return _with_bases(node, Path(), {}, problems)
+    return _with_bases(node, Path(), {}, problems, merging)
 
 
 def files_of(recipe: Path) -> list[Path]:
@@ -109,12 +116,14 @@ def files_of(recipe: Path) -> list[Path]:
     Symbolic links are followed. Raises RecipeError if a file cannot be read.
     """
     trees: _Trees = {}
-    _read(recipe, trees, Problems())
+    _read(recipe, trees, Problems(), merge)
     return [*trees]
 
 
-def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = None) -> MapNode:
-    """Read `file` and merge it over the files that it extends.
+def _read(
+    file: Path, trees: _Trees, problems: Problems, merging: _Merge, at: Origin | None = None
+) -> MapNode:
+    """Read `file` and merge it, by `merging`, over the files that it extends.
 
     trees: recipes read so far, by file. at: line that extends `file`; None for the first file.
     """
@@ -122,9 +131,9 @@ def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = Non
     place = Path(os.path.realpath(file))
     if known := trees.get(place):
         return known
-    option = "extends" if at else ""
+    option = "extends" if at else problems.what
     at = at or Origin(str(file))
-    fix = "check the path, or choose a recipe from `qgs recipes`"
+    fix = "check the path, or choose a recipe from `qgs recipes`, or a study of recipes/studies"
     try:
         with open_file(file) as opened:
             text = opened.read().decode("utf-8")
@@ -140,17 +149,19 @@ def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = Non
         problems.stop(at, option, f"{file} cannot be read: {why}", fix)
     trees[place] = None
     trees[place] = tree = _with_bases(
-        load_mapping(text, str(file), problems), file.parent, trees, problems
+        load_mapping(text, str(file), problems), file.parent, trees, problems, merging
     )
     return tree
 
 
-def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) -> MapNode:
+def _with_bases(
+    node: MapNode, folder: Path, trees: _Trees, problems: Problems, merging: _Merge
+) -> MapNode:
     """Merge the recipe `node` over the files that it extends; later files win over earlier ones."""
     layers: list[MapNode] = []
     for name, origin in items_of(node.get("extends"), node.origin_of("extends")):
         if not isinstance(name, str):
-            reason = "`extends` must be a recipe file or a list of recipe files"
+            reason = f"`extends` must be a {problems.what} file or a list of {problems.what} files"
             fix = "write `extends: base.yaml`, relative to this file"
             problems.stop(origin, "extends", reason, fix)
         # `..` must not follow links: the path of a base is read as written.
@@ -158,10 +169,10 @@ def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) 
         place = Path(os.path.realpath(file))
         if place in (above := [path for path, tree in trees.items() if tree is None]):
             circle = [*above[above.index(place) :], place]
-            reason = f"recipes extend each other: {' -> '.join(path.name for path in circle)}"
+            reason = f"files extend each other: {' -> '.join(path.name for path in circle)}"
             problems.stop(origin, "extends", reason, "remove the `extends` of one of these files")
-        layers.append(_read(file, trees, problems, origin))
-    return reduce(merge, [*layers, node.without("extends")])
+        layers.append(_read(file, trees, problems, merging, origin))
+    return reduce(merging, [*layers, node.without("extends")])
 
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:

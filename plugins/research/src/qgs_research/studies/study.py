@@ -22,11 +22,10 @@ from pydantic import (
 
 from qgs.contracts import ComponentConfig, OptionError
 from qgs.evaluate.evaluation import SECTIONS
-from qgs.paths import read_file
 from qgs.recipe.decode import decode_config
-from qgs.recipe.errors import Origin, Problems
-from qgs.recipe.files import found_recipe, merge
-from qgs.recipe.yaml_text import ListNode, MapNode, load_mapping
+from qgs.recipe.errors import Problems
+from qgs.recipe.files import found_recipe, merge, read_recipe
+from qgs.recipe.yaml_text import ListNode, MapNode, items_of
 from qgs.wording import did_you_mean
 
 NAME = r"[A-Za-z0-9_][A-Za-z0-9_.]*"
@@ -238,7 +237,7 @@ def read_study(file: str | Path) -> Study:
     """
     problems = Problems("study")
     found = found_recipe(Path(file), str(file))
-    tree = _read(found, problems, ())
+    tree = read_recipe(found, problems, _merged)
     for name, written, origin in tree.child("variants").entries():
         # A file name stands for a recipe that changes nothing in that file.
         if isinstance(written, str):
@@ -254,26 +253,10 @@ def read_study(file: str | Path) -> Study:
     return Study(file=found, settings=settings, variants=variants, evaluations=evaluations)
 
 
-def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
-    """Read the study file `file` and merge it over the study that it extends.
-
-    chain: files that extend this one, to find cycles.
-    """
-    try:
-        text = read_file(file).decode("utf-8")
-    except (OSError, ValueError) as error:
-        fix = "check the path, or take one such as studies/tiny/structural.yaml"
-        problems.stop(Origin(str(file)), "study", f"{file} cannot be read: {error}", fix)
-    tree = load_mapping(text, str(file), problems)
-    extended = tree.get("extends")
-    if extended is None:
-        return tree
-    if not isinstance(extended, str) or file in chain:
-        reason = "`extends` must name one other study, without a cycle"
-        fix = "write `extends: other.yaml`, relative to this file"
-        problems.stop(tree.origins["extends"], "extends", reason, fix)
-    base = _read(found_recipe(file.parent / extended, extended), problems, (*chain, file))
-    for key, value, origin in tree.without("extends").entries():
+def _merged(base: MapNode, study: MapNode) -> MapNode:
+    """Merge a study into the study `base`, which it extends."""
+    merged = MapNode(study.origin, base.entries())
+    for key, value, origin in study.entries():
         old = base.get(key)
         if isinstance(old, MapNode) and isinstance(value, MapNode):
             if key == "overlay":
@@ -283,9 +266,8 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
                 dropped = [name for name in value if value[name] is None and name in old]
                 kept = old.without(*value).entries()
                 value = MapNode(origin, [*kept, *value.without(*dropped).entries()])
-        base[key] = value
-        base.origins[key] = origin
-    return base
+        merged.put(key, value, origin)
+    return merged
 
 
 def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
@@ -299,16 +281,15 @@ def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
         fix = "add `base: RECIPE.yaml`, or `extends` here"
         problems.add(origin, f"variants.{name}", reason, fix)
         return node
-    at = holder.origins[key]
-    written = holder[key]
     files = []
-    for recipe in written if isinstance(written, list) else [written]:
+    at = holder.origins[key]
+    for recipe, line in items_of(holder[key], at):
         file = found_recipe(Path(at.file).parent / recipe, recipe).resolve()
         if not file.exists():
             option = "base" if holder is tree else f"variants.{name}.extends"
             fix = "check the path, or take one of `qgs recipes`"
-            problems.add(at, option, f"there is no recipe {file}", fix)
-        files.append((str(file), at))
+            problems.add(line, option, f"there is no recipe {file}", fix)
+        files.append((str(file), line))
     overlay = tree.child("overlay")
     _locate_index(overlay)
     whole = merge(node.without("extends"), overlay)
