@@ -19,6 +19,7 @@ from qgs.checkpoint.tensors import (
     CheckpointError,
     TensorFile,
     copied,
+    inside,
     nonfinite,
     pickle_kind,
     shapes_of,
@@ -200,8 +201,8 @@ def _without_prefix(file: WeightFile) -> WeightFile:
     # A common prefix is a prefix of any name, so the first name is enough.
     modules = next(iter(file.tensors)).split(".")[:-1]
     for prefix in accumulate(f"{module}." for module in modules):
-        tensors = {name.removeprefix(prefix): tensor for name, tensor in file.tensors.items()}
-        if all(name.startswith(prefix) for name in file.tensors) and recognise(shapes_of(tensors)):
+        tensors = inside(prefix, file.tensors)
+        if len(tensors) == len(file.tensors) and recognise(shapes_of(tensors)):
             note = f"removed the prefix {prefix!r} from all {len(tensors)} names"
             return WeightFile(file.path, tensors, (*file.notes, note))
     return file

@@ -46,12 +46,10 @@ def _unet_levels(shapes: Shapes, name: str) -> int:
 
     name: prefix of its parameter names. Raises LayoutError for an odd number of blocks.
     """
-    numbers = {key[len(name) :].split(".")[1] for key in shapes if key.startswith(name + "output")}
-    if not numbers or len(numbers) % 2:
-        raise LayoutError(
-            f"{name}output_blocks has {len(numbers)} blocks, expected two for each level"
-        )
-    return len(numbers) // 2
+    blocks = layer_count(shapes, f"{name}output_blocks.")
+    if not blocks or blocks % 2:
+        raise LayoutError(f"{name}output_blocks has {blocks} blocks, expected two for each level")
+    return blocks // 2
 
 
 def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
