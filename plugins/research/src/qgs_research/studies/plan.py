@@ -20,7 +20,7 @@ from qgs.recipe.files import merge
 from qgs.recipe.recipe import annotated, differing_options
 from qgs.recipe.yaml_text import MapNode, dump, from_plain
 from qgs.train.folder import RunFolder
-from qgs.wording import counted, listed
+from qgs.wording import listed
 from qgs_research.studies.study import MAIN, Study
 
 BESIDE = ("seed", "plugins")
@@ -98,12 +98,6 @@ class Plan:
         # Seeds come first, so that an unfinished study has complete comparisons.
         return [run_of(self.folder, name, seed) for seed in seeds for name in self.study.variants]
 
-    @property
-    def size(self) -> str:
-        """Size of the study, for example "4 variants x 3 seeds"."""
-        variants = counted(len(self.study.variants), "variant")
-        return f"{variants} x {counted(len(self.study.settings.seeds), 'seed')}"
-
     def done(self, run: Run) -> bool:
         """Return True if all evaluations of `run` are complete."""
         return all(map(run.evaluated, self.evaluations))
@@ -126,9 +120,7 @@ def recipe_file(folder: Path, variant: str, evaluation: str = MAIN) -> Path:
 
 def changed_recipe(recipe: Recipe, changes: MapNode) -> Recipe:
     """Return `recipe` with the changes of an evaluation. Raises RecipeError for invalid options."""
-    tree = from_plain(recipe.tree, Origin("the variant"))
-    assert isinstance(tree, MapNode)
-    return resolve(merge(tree, changes))
+    return resolve(merge(from_plain(recipe.tree, Origin("the variant")), changes))
 
 
 def write_plan(plan: Plan) -> None:

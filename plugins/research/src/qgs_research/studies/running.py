@@ -50,7 +50,9 @@ def run_study(
         recipe = plan.recipes[name, MAIN]
         print_lines(console, [f"warning: {name}: {warning}" for warning in recipe.warnings])
     missing = sum(not plan.done(run) for run in plan.runs)
-    print_lines(console, [f"{plan.size}: {counted(len(plan.runs), 'run')}, {missing} missing"])
+    variants = counted(len(plan.study.variants), "variant")
+    size = f"{variants} x {counted(len(plan.study.settings.seeds), 'seed')}"
+    print_lines(console, [f"{size}: {counted(len(plan.runs), 'run')}, {missing} missing"])
     failed: Sequence[Run] = ()
     stopped = None
     if workers:
