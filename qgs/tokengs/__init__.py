@@ -19,7 +19,7 @@ from qgs.tokengs.decoder import (
     NoRefinement,
 )
 from qgs.tokengs.encoder import MultiViewViT
-from qgs.tokengs.head import FreeCenters, GaussianHead, OffsetCenters, posact
+from qgs.tokengs.head import FreeCenters, GaussianHead, LinearHead, OffsetCenters, posact
 from qgs.tokengs.optimizer import OneCycleAdamW
 from qgs.tokengs.supervision import LayerSupervision, OnePass
 
@@ -52,6 +52,7 @@ __all__ = [
     "LatentQueries",
     "LayerScale",
     "LayerSupervision",
+    "LinearHead",
     "Mlp",
     "MlpFeedForward",
     "MultiViewViT",

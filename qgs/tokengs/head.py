@@ -1,11 +1,11 @@
 """Head `qgs/gaussian_head` (TokenGS, LocusGS), and means of Gaussians: `qgs/free`, `qgs/offset`."""
 
 import math
+from abc import abstractmethod
 from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
-from einops import rearrange
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
@@ -27,7 +27,23 @@ CHANNELS = (3, 3, 3, 4, 1)
 """Channels per Gaussian: position, RGB, scale, rotation, opacity (TokenGS, LocusGS releases)."""
 
 
-class GaussianHead(Head):
+class LinearHead(Head):
+    """Base of heads in which a norm and a linear layer give C numbers for each Gaussian."""
+
+    norm: nn.Module
+    linear: nn.Linear
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        raw_BNC = self.linear(self.norm(state.features))
+        # One linear layer gives all K Gaussians of a query, Gaussian by Gaussian.
+        return self.activate(raw_BNC.unflatten(-1, (self.gaussians_per_query, -1)))
+
+    @abstractmethod
+    def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
+        """Convert raw channels (B, N, K, C) to attributes of Gaussians, in float32 or better."""
+
+
+class GaussianHead(LinearHead):
     """Linear head: a query's D features give 14 numbers for each of its K Gaussians.
 
     The activations of TokenGS and LocusGS follow, in float32.
@@ -81,12 +97,7 @@ class GaussianHead(Head):
         if not config.norm:
             yield from without_effect(config, ("norm_eps",), "`norm` is false")
 
-    def forward(self, state: QueryState) -> GaussianAttributes:
-        raw_BNC = self.linear(self.norm(state.features))
-        return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
-
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
-        """Convert raw channels (B, N, K, 14) to attributes of Gaussians, in float32 or better."""
         offsets, rgb, scale, rotation, opacity = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         cap = self.config.scale_cap
         limit = self.config.scale_input_limit

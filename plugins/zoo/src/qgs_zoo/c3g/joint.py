@@ -6,14 +6,13 @@ the M image tokens, then the N queries.
 
 import torch
 import torch.nn.functional as F
-from einops import rearrange
 from pydantic import Field, PositiveFloat, PositiveInt
-from torch import nn
+from torch import Tensor, nn
 
-from qgs.contracts import DecoderLayer, Head, LayerParts, ModelDims, memory_fields
+from qgs.contracts import DecoderLayer, LayerParts, ModelDims, memory_fields
 from qgs.geometry.harmonics import SH_C0
 from qgs.precision import at_least_float32
-from qgs.tokengs import Mlp, NormConfig
+from qgs.tokengs import LinearHead, Mlp, NormConfig
 from qgs.types import GaussianAttributes, ImageMemory, QueryState
 from qgs_zoo.parts import Decaying, self_attention
 
@@ -66,7 +65,7 @@ CHANNELS = (3, 1, 3, 4, 3)
 """Channels per Gaussian: position, opacity, scale, rotation, colour (C3G release)."""
 
 
-class C3GHead(Decaying, Head):
+class C3GHead(Decaying, LinearHead):
     """Head with LayerNorm, a linear layer, and the activations of the C3G release.
 
     The linear layer maps the D features of a query to K Gaussians of 14 raw channels.
@@ -90,11 +89,7 @@ class C3GHead(Decaying, Head):
         self.norm = nn.LayerNorm(dims.width, config.norm_eps)
         self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
 
-    def forward(self, state: QueryState) -> GaussianAttributes:
-        """Return attributes of (B, N, K) Gaussians, at least float32, from features (B, N, D)."""
-        raw_BNC = self.linear(self.norm(state.features))
-        # One linear layer gives all K Gaussians of a query, Gaussian by Gaussian.
-        raw_BNKC = rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS))
+    def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
         offsets, opacity, scale, rotation, sh = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         return GaussianAttributes(
             offsets=offsets,

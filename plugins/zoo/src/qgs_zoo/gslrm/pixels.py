@@ -17,7 +17,6 @@ from qgs.contracts import (
     ComponentConfig,
     Fields,
     FieldSpec,
-    Head,
     ModelDims,
     PatchEncoder,
     Queries,
@@ -28,7 +27,7 @@ from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.geometry.transforms import unit
 from qgs.precision import at_least_float32, full_precision
-from qgs.tokengs import NORM_EPS
+from qgs.tokengs import NORM_EPS, LinearHead
 from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
 from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, self_attention
 
@@ -182,7 +181,7 @@ class AlongRays(Centers):
         return origins + ((1 - w_BNK1) * config.near + w_BNK1 * config.far) * directions
 
 
-class PixelHead(Head):
+class PixelHead(LinearHead):
     """Head with a LayerNorm and a linear layer to K Gaussians of 12 or 14 channels, without biases.
 
     The number of channels follows from `position_channels`.
@@ -220,12 +219,9 @@ class PixelHead(Head):
         """Return whether a parameter has weight decay: True only for the linear layer (paper)."""
         return parameter.ndim != 1
 
-    def forward(self, state: QueryState) -> GaussianAttributes:
-        """Return attributes of (B, N, K) Gaussians from features (B, N, D)."""
-        raw_BNC = at_least_float32(self.linear(self.norm(state.features)))
-        raw_BNKC = rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(self.channels))
-        # Rows are ordered Gaussian by Gaussian, as in the weights of the public code.
-        position, rgb, scale, rotation, opacity = raw_BNKC.split(self.channels, -1)
+    def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
+        raw = at_least_float32(raw_BNKC)
+        position, rgb, scale, rotation, opacity = raw.split(self.channels, -1)
         scale = scale + self.config.scale_bias
         if self.config.scale_limit is not None:
             # Without a limit one Gaussian can cover an image and stop the others from learning.
