@@ -84,12 +84,8 @@ class GaussianHead(LinearHead):
         # Small weights: all Gaussians of a query start at one place, near one size and grey.
         nn.init.zeros_(self.linear.bias)
         nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
+        spread_positions(self.linear, config.gaussians_per_query, config.position_std)
         with torch.no_grad():
-            # Spread initial positions divide the scene sooner.
-            if config.position_std is not None:
-                rows_K3D = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
-                nn.init.trunc_normal_(rows_K3D, std=config.position_std)
-                self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows_K3D
             self.linear.bias.unflatten(0, (-1, sum(CHANNELS)))[:, CHANNELS[0] - 1] = config.z_init
 
     @classmethod
@@ -113,6 +109,20 @@ class GaussianHead(LinearHead):
             opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
             colors=(torch.tanh(rgb) + 1) / 2,
         )
+
+
+@torch.no_grad()
+def spread_positions(linear: nn.Linear, count: int, std: float | None) -> None:
+    """Draw the rows of a head's initial weights that give positions; None leaves them as they are.
+
+    count: number of Gaussians of a query; each has as many rows, the first three for its position.
+    std: standard deviation (truncated normal).
+    """
+    # Spread initial positions divide the scene sooner.
+    if std is not None:
+        rows_K3D = torch.empty(count, 3, linear.in_features)
+        nn.init.trunc_normal_(rows_K3D, std=std)
+        linear.weight.unflatten(0, (count, -1))[:, :3] = rows_K3D
 
 
 @full_precision

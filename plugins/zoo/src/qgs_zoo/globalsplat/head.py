@@ -24,6 +24,7 @@ from qgs.contracts import (
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import SH_C0
 from qgs.precision import full_precision
+from qgs.tokengs.head import spread_positions
 from qgs.types import GaussianAttributes, QueryState
 from qgs_zoo.globalsplat.streams import TEXTURE, TEXTURE_FIELD
 from qgs_zoo.parts import quaternions
@@ -85,12 +86,8 @@ class MergingHead(Head):
         for linear in (self.geometry, self.texture):
             nn.init.zeros_(linear.bias)
             nn.init.trunc_normal_(linear.weight, std=config.init_std)
-        if config.position_std is not None:
-            # Positions may start with a wider spread than scales and opacities.
-            rows_C3D = torch.empty(config.candidates, CHANNELS[0], dims.width)
-            nn.init.trunc_normal_(rows_C3D, std=config.position_std)
-            with torch.no_grad():
-                self.geometry.weight.unflatten(0, (config.candidates, -1))[:, :3] = rows_C3D
+        # Positions may start with a wider spread than scales and opacities.
+        spread_positions(self.geometry, config.candidates, config.position_std)
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
