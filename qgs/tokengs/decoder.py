@@ -113,11 +113,16 @@ class ContentSelfAttention(SelfAttention):
         self.norm = nn.LayerNorm(dims.width, config.norm_eps)
         self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
 
+    def read(self, state: QueryState) -> tuple[Tensor, Tensor | None]:
+        """Return what attention reads: normalised features, and a mask as of SelfAttentionCore."""
+        return self.norm(state.features), state.mask
+
     def forward(self, state: QueryState) -> Tensor:
-        return self.attention(self.norm(state.features), state.mask)
+        return self.attention(*self.read(state))
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        return self.attention.explain(self.norm(state.features), queries, state.mask)
+        features, mask = self.read(state)
+        return self.attention.explain(features, queries, mask)
 
 
 class MlpFeedForward(FeedForward):

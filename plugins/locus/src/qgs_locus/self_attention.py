@@ -7,7 +7,7 @@ import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from qgs.contracts import AttentionWeights, ModelDims
+from qgs.contracts import ModelDims
 from qgs.precision import full_precision
 from qgs.tokengs import ContentSelfAttention, Mlp
 from qgs.types import QueryState
@@ -58,20 +58,12 @@ class AnchorAwareSelfAttention(ContentSelfAttention):
         super().__init__(config, dims)
         self.position_mlp = Mlp(3 * config.features, dims.width, dims.width)
 
-    def placed(self, state: QueryState) -> QueryState:
-        """Return the state with features x + p, with p the embedding of the anchor centres."""
+    def read(self, state: QueryState) -> tuple[Tensor, Tensor | None]:
+        """Read features x + p, with p the embedding of the anchor centres."""
         position_BN3 = state[CENTER]
         c = self.config
         # The sines expect [-1, 1], but centres are unbounded.
         if c.position == "tanh":
             position_BN3 = torch.tanh(position_BN3)
         sines = sine_embedding(position_BN3, c.features, c.temperature, c.divisor_eps)
-        return state.replace(features=state.features + self.position_mlp(sines))
-
-    def forward(self, state: QueryState) -> Tensor:
-        """Return the update (B, N, D) of the queries' features."""
-        return super().forward(self.placed(state))
-
-    def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        """Return the attention of the queries with indices `queries` to all queries."""
-        return super().explain(self.placed(state), queries)
+        return self.norm(state.features + self.position_mlp(sines)), state.mask

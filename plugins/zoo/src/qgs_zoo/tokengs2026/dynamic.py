@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from qgs.containers import map_tensors
 from qgs.contracts import (
-    AttentionWeights,
     ComponentConfig,
     Fields,
     FieldSpec,
@@ -115,11 +114,12 @@ class BlockCausalSelfAttention(ContentSelfAttention):
     name = "block_causal"
     reads = _FIELDS
 
-    def forward(self, state: QueryState) -> Tensor:
-        return self.attention(self.norm(state.features), _readable(state))
-
-    def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        return self.attention.explain(self.norm(state.features), queries, _readable(state))
+    def read(self, state: QueryState) -> tuple[Tensor, Tensor]:
+        features_BND, mask = super().read(state)
+        moves_BN = state[MOVES]
+        # Static queries read only static ones, so that they are the same at all times.
+        readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]
+        return features_BND, readable_BNN if mask is None else readable_BNN & mask[:, None]
 
 
 class DynamicObjective(Objective):
@@ -170,11 +170,3 @@ def _alone(layer: LayerPrediction) -> LayerPrediction:
         map_tensors(lambda x: x[:, of_gaussians], layer.gaussians),
         map_tensors(lambda x: x[:, moves_N], layer.state),
     )
-
-
-def _readable(state: QueryState) -> Tensor:
-    """Return a mask (B, N, N): True where the row's query may attend to the column's query."""
-    moves_BN = state[MOVES]
-    # Static queries read only static ones, so that they are the same at all times.
-    readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]
-    return readable_BNN if state.mask is None else readable_BNN & state.mask[:, None]
