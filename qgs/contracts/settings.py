@@ -31,6 +31,20 @@ Ascending: TypeAlias = Annotated[tuple[float, float], AfterValidator(ascending)]
 """Range [min, max] of positive numbers."""
 
 
+def rising(numbers: tuple[int, ...]) -> tuple[int, ...]:
+    """Return numbers unchanged. Raises OptionError unless each is above 0 and above the last."""
+    fixed = sorted({max(number, 1) for number in numbers})
+    if list(numbers) != fixed:
+        raise OptionError(
+            f"must be distinct, ascending and at least 1, got {list(numbers)}", f"write {fixed}"
+        )
+    return numbers
+
+
+Rising: TypeAlias = Annotated[tuple[int, ...], Field(min_length=1), AfterValidator(rising)]
+"""Numbers from 1 on, at least one, in ascending order."""
+
+
 def behind_near(far: float, info: ValidationInfo) -> float:
     """Return `far` unchanged. Raises OptionError unless it is more than the option `near`."""
     near = info.data.get("near")

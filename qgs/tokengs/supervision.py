@@ -7,13 +7,13 @@ from pydantic import Field, field_validator
 from qgs.contracts import (
     ComponentConfig,
     Objective,
-    OptionError,
     Outcome,
     Passes,
     Problem,
     RecipeContext,
     Supervision,
 )
+from qgs.contracts.settings import rising
 from qgs.types import Views
 
 
@@ -33,13 +33,7 @@ class LayerSupervision(Supervision):
         @field_validator("layers")
         @classmethod
         def _ascending(cls, layers: tuple[int, ...]) -> tuple[int, ...]:
-            ascending = sorted({max(number, 1) for number in layers})
-            if layers != (0,) and list(layers) != ascending:
-                raise OptionError(
-                    f"layers must be distinct, ascending and at least 1, got {list(layers)}",
-                    f"write {ascending}",
-                )
-            return layers
+            return layers if layers == (0,) else rising(layers)
 
     config: Config
 

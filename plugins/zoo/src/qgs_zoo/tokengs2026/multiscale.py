@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -20,11 +20,11 @@ from qgs.contracts import (
     Fields,
     FieldSpec,
     ModelDims,
-    OptionError,
     Problem,
     RecipeContext,
     memory_fields,
 )
+from qgs.contracts.settings import Rising
 from qgs.geometry.rays import plucker_rays
 from qgs.precision import full_precision
 from qgs.tokengs.blocks import CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
@@ -83,21 +83,11 @@ class MultiscaleReadout(PatchViT):
     """
 
     class Config(PatchViT.Config):
-        blocks: tuple[int, ...] = Field(default=(1, 2, 3), min_length=1)
+        blocks: Rising = (1, 2, 3)
         """Numbers of the ViT blocks whose outputs are read, in ascending order. The first block is
         1. The largest number must be `depth`."""
         time_channels: int = Field(default=0, ge=0, multiple_of=2)
         """Number of channels that encode the time of a photo. 0 ignores the times of photos."""
-
-        @field_validator("blocks")
-        @classmethod
-        def _ascending(cls, blocks: tuple[int, ...]) -> tuple[int, ...]:
-            if list(blocks) != sorted(set(blocks)) or blocks[0] < 1:
-                raise OptionError(
-                    f"blocks must be distinct, ascending and at least 1, got {list(blocks)}",
-                    f"write {sorted({max(number, 1) for number in blocks})}",
-                )
-            return blocks
 
     config: Config
 
@@ -212,7 +202,7 @@ class LatentBottleneck(MultiscaleReadout):
     class Config(MultiscaleReadout.Config):
         depth: PositiveInt = 12
         """Number of ViT blocks."""
-        blocks: tuple[int, ...] = Field(default=(6, 8, 10, 12), min_length=1)
+        blocks: Rising = (6, 8, 10, 12)
         """Numbers of the ViT blocks whose outputs are read, in ascending order. The first block is
         1. The largest number must be `depth`."""
         latents: PositiveInt
