@@ -60,12 +60,13 @@ TEXTURE = np.dtype(
 # light that throws none, or the number of its first map plus 1.
 LIGHT = np.dtype([("lamp", "f8"), ("place", "f8", 3), ("color", "f8", 3), ("shadows", "i8")])
 # Light from above and from below; the sky overhead and at the horizon; fog per metre; clouds;
-# strength and reach of the ambient occlusion.
+# strength of the ambient occlusion; seed of the clouds; reach of the ambient occlusion.
 AIR = np.dtype(
     [
         *[(name, "f8", 3) for name in ("above", "below", "zenith", "horizon")],
-        *[(name, "f8") for name in ("fog", "clouds", "occlusion", "reach")],
+        *[(name, "f8") for name in ("fog", "clouds", "occlusion")],
         ("seed", "i8"),
+        ("reach", "f8"),
     ]
 )
 # A map of what a light sees: where its pixels begin, its side and focal length in pixels, its pose.

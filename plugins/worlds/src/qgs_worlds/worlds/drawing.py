@@ -133,19 +133,20 @@ def _lamp(rng: Random, place: Place, shadows: bool) -> Light:
 
 
 def _air(rng: Random, above: ArrayLike, below: ArrayLike, occlusion: float) -> np.ndarray:
-    air = np.zeros(1, s.AIR)
     blue = np.array([0.45, 0.7, 1.15]) if rng.random() < 0.7 else _tinted(rng, 0.3)
     bright = spread(rng, 0.6, 2.2)
-    air["above"] = above
-    air["below"] = below
-    air["zenith"] = bright * rng.uniform(0.4, 1) * blue
-    air["horizon"] = bright * (0.6 + 0.4 * blue)
-    air["fog"] = rng.choice((0.0005, spread(rng, 0.0005, 0.02)))
-    air["clouds"] = rng.choice((0.0, rng.uniform(0.2, 1.0), rng.uniform(0.2, 1.0)))
-    air["seed"] = rng.randrange(1 << 16)
-    air["occlusion"] = occlusion
-    air["reach"] = rng.uniform(0.12, 0.4)
-    return air
+    row = (
+        above,
+        below,
+        bright * rng.uniform(0.4, 1) * blue,  # zenith
+        bright * (0.6 + 0.4 * blue),  # horizon
+        rng.choice((0.0005, spread(rng, 0.0005, 0.02))),  # fog
+        rng.choice((0.0, rng.uniform(0.2, 1.0), rng.uniform(0.2, 1.0))),  # clouds
+        occlusion,
+        rng.randrange(1 << 16),  # seed
+        rng.uniform(0.12, 0.4),  # reach
+    )
+    return np.array([row], s.AIR)
 
 
 def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> Effects:
