@@ -1,6 +1,7 @@
 """Random plan of a room: walls, window, furniture and lights."""
 
 import math
+from itertools import product
 from random import Random
 
 import numpy as np
@@ -85,10 +86,9 @@ class Furnisher:
 
         low, high: lowest and highest corner of the box.
         """
-        half_x = self.size[0] / 2
-        half_y = self.size[1] / 2
-        if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
-            return False
+        for extent, a, b in zip(self.size[:2], low, high, strict=False):
+            if a < -extent / 2 or b > extent / 2:
+                return False
         for (x0, y0, _), (x1, y1, _) in self._taken:
             beside_x = low[0] >= x1 + _GAP or high[0] <= x0 - _GAP
             if not (beside_x or low[1] >= y1 + _GAP or high[1] <= y0 - _GAP):
@@ -117,8 +117,9 @@ def turned(low: Point, high: Point, to: Point, turn: float) -> tuple[Point, Poin
     x, y, _ = to
     cos = math.cos(turn)
     sin = math.sin(turn)
-    xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
-    ys = [y + sin * a + cos * b for a in (low[0], high[0]) for b in (low[1], high[1])]
+    corners = [*product((low[0], high[0]), (low[1], high[1]))]
+    xs = [x + cos * a - sin * b for a, b in corners]
+    ys = [y + sin * a + cos * b for a, b in corners]
     return (min(xs), min(ys), low[2]), (max(xs), max(ys), high[2])
 
 
