@@ -91,22 +91,15 @@ class DepthSplatConfig(ComponentConfig):
             )
         return blocks
 
-    def level(self, scale: int) -> int:
-        """Return the level of the cost volume in sweep number `scale`. The first sweep is number 0.
+    @property
+    def levels(self) -> list[int]:
+        """Levels of the CNN's three stages, of each sweep, and of the last sweep's depth.
 
         Level 0, 1 or 2 means 1/2, 1/4 or 1/8 of the image size.
         """
-        return self.stride.bit_length() - 2 - scale
-
-    @property
-    def finest(self) -> int:
-        """Level of the last sweep's cost volume: 0, 1, 2 mean 1/2, 1/4, 1/8 of the image size."""
-        return self.level(self.scales - 1)
-
-    @property
-    def cnn_levels(self) -> tuple[int, int, int]:
-        """Levels of the CNN's three stages: 0, 1, 2 mean 1/2, 1/4, 1/8 of the image size."""
-        return (0, 0, 1) if self.stride == 4 else (0, 1, 2)
+        first = self.stride.bit_length() - 2
+        sweeps = [first - scale for scale in range(self.scales)]
+        return [0, first - 1, first, *sweeps, sweeps[-1]]
 
 
 class Depths(NamedTuple):
@@ -163,8 +156,7 @@ class DepthPredictor(nn.Module):
         self.sizes = sizes
         width = sizes.features
         vit = sizes.vit
-        strides = (1, 2) if sizes.stride == 4 else (2, 2)
-        self.backbone = CNN(width, strides, sizes.cnn)
+        self.backbone = CNN(width, (sizes.stride // 4, 2), sizes.cnn)
         self.transformer = WindowTransformer(width)
         self.pretrained = DinoV2(vit.width, vit.depth, vit.heads)
         if sizes.scales > 1:
@@ -259,13 +251,11 @@ class DepthPredictor(nn.Module):
         # The order of the release: CNN, ViT, transformer, depth. If its CNN ends at 1/4, nothing
         # joins at 1/8.
         found: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in range(LEVELS)]
-        for x, level in zip(cnn, self.sizes.cnn_levels, strict=True):
-            found[level][0].append(x)
-        levels = [*map(self.sizes.level, range(len(multi))), self.sizes.finest]
-        for x, level in zip([*multi, depth], levels, strict=True):
-            # At 1/2 the release puts the ViT's own map last instead.
+        maps = [*cnn, *multi, depth]
+        for place, (x, level) in enumerate(zip(maps, self.sizes.levels, strict=True)):
             if x is not None:
-                found[level][level > 0].append(x)
+                # At 1/2 the release puts the ViT's own map last instead.
+                found[level][place >= len(cnn) and level > 0].append(x)
         return found
 
 
@@ -276,11 +266,10 @@ def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
     """
     # Channels that join at each level, for the sizes of the projections.
     others = [0] * LEVELS
-    for width, level in zip((*sizes.cnn[:2], sizes.features), sizes.cnn_levels, strict=True):
+    sweeps = [sizes.features // 2**scale for scale in range(sizes.scales)]
+    widths = [*sizes.cnn[:2], sizes.features, *sweeps, depth]
+    for width, level in zip(widths, sizes.levels, strict=True):
         others[level] += width
-    for scale in range(sizes.scales):
-        others[sizes.level(scale)] += sizes.features // 2**scale
-    others[sizes.finest] += depth
     features = sizes.full_features // 2 if depth else sizes.full_features
     return DptHead(sizes.vit.width, sizes.dpt, features, others, depth)
 
