@@ -25,12 +25,17 @@ _EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "re
 
 
 def _recipe(model: dict[str, Any]) -> dict[str, Any]:
-    fixed = {"heads": 1, "queries": {"type": "mvsplat/pixels"}}
+    common = {
+        "heads": 1,
+        "queries": {"type": "mvsplat/pixels"},
+        "decoder": {"depth": 0, **_EMPTY},
+        "supervision": {"type": "qgs/layers", "layers": [0]},
+    }
     photometric = {"type": "qgs/photometric", "mse_weight": 1.0, "ssim_weight": 0.0}
     return {
         "recipe": 1,
         "plugins": ["mvsplat"],
-        "model": fixed | model,
+        "model": common | model,
         "views": {"frame": "given", "scale": "constant", "scale_factor": 1.0},
         "losses": {"photometric": photometric},
     }
@@ -72,10 +77,8 @@ def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
             # The memory has depth and opacity before the channels of a raw Gaussian.
             "width": raw + 2,
             "encoder": encoder,
-            "decoder": {"depth": 0, **_EMPTY},
             "head": {"type": "mvsplat/gaussians"},
             "centers": {"type": "mvsplat/on_rays"},
-            "supervision": {"type": "qgs/layers", "layers": [0]},
         }
     )
 
@@ -124,20 +127,18 @@ def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
         raise LayoutError(
             f"{_HEAD} has {raw} channels, expected 10 + 3 (degree + 1)^2 for a degree from 1 to 4"
         )
-    # One layer for each depth, so that both depths can be supervised.
-    decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
-    supervision = {"type": "mvsplat/decayed", "layers": [1, 2]}
-    return _recipe(
-        {
-            # The depths come first.
-            "width": raw + 1 + two,
-            "encoder": encoder,
-            "decoder": {**decoder, **_EMPTY},
-            "head": {"type": "mvsplat/depthsplat_gaussians"},
-            "centers": {"type": "mvsplat/on_rays", "measure": "depth"},
-            "supervision": supervision if two else {"type": "qgs/layers", "layers": [0]},
-        }
-    )
+    model = {
+        # The depths come first.
+        "width": raw + 1 + two,
+        "encoder": encoder,
+        "head": {"type": "mvsplat/depthsplat_gaussians"},
+        "centers": {"type": "mvsplat/on_rays", "measure": "depth"},
+    }
+    if two:
+        # One layer for each depth, so that both depths can be supervised.
+        model["decoder"] = {"depth": 2, "layer": {"type": "mvsplat/exchange"}, **_EMPTY}
+        model["supervision"] = {"type": "mvsplat/decayed", "layers": [1, 2]}
+    return _recipe(model)
 
 
 MVSPLAT = layout("mvsplat", _read_mvsplat)
