@@ -40,8 +40,7 @@ def seen_from_above(shapes, points, sun=(), ambient=0.0):
     c2w = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (len(points), 1, 1))
     c2w[:, :3, 3] = [(x, y, 1.0) for x, y in points]
     lens = np.array([100.0, 100.0, 0.5, 0.5])
-    images = np.empty((len(points), 1, 1, 3), np.float32)
-    cast(world, c2w, lens, (1, 1), 1, paint, images)
+    _, images = cast(world, c2w, lens, (1, 1), 1, paint)
     return images[:, 0, 0, 0].tolist()
 
 

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -77,21 +77,17 @@ class DrawnScene(Scene):
 
         A depth of 0 marks the sky, which has no depth.
         """
-        from qgs_worlds.caster.casting import cast
-
-        depths = cast(self.tables, self.c2w[list(frames)], self.lens, self._config.image_size)
+        depths, _ = self.rendered(frames)
         return torch.from_numpy(np.nan_to_num(depths, posinf=0))[:, None] * self.scale
 
-    def painted(
-        self, frames: list[int], paint: Callable[..., None], kind: type[np.number]
-    ) -> np.ndarray:
-        """Return images (len(frames), H, W, 3) of type `kind` that the kernel `paint` colours."""
+    def rendered(self, frames: Sequence[int], *how: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return depths and images of F frames, as `cast` does.
+
+        how: arguments of `cast` from `samples` on.
+        """
         from qgs_worlds.caster.casting import cast
 
-        size = self._config.image_size
-        images = np.empty((len(frames), *size, 3), kind)
-        cast(self.tables, self.c2w[frames], self.lens, size, self._config.samples, paint, images)
-        return images
+        return cast(self.tables, self.c2w[list(frames)], self.lens, self._config.image_size, *how)
 
     @abstractmethod
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:

@@ -63,7 +63,7 @@ class RoomScene(DrawnScene):
         """Return rendered images (len(frames), H, W, 3) uint8."""
         from qgs_worlds.caster.interiors import paint_room
 
-        return self.painted(frames, paint_room, np.uint8)
+        return self.rendered(frames, self._config.samples, paint_room, np.uint8)[1]
 
 
 class RoomsSource(DrawnSource):

@@ -71,8 +71,7 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     lights, air = draw_lights(shine, place, lit)
     lights, shadows = shadow_maps(shapes, maps, lights, *rig.sight(place))
     world = World(shapes, maps, skins, lights, air, shadows)
-    light = np.empty((len(rig.c2w), *_THUMB, 3), np.float32)
-    depths = cast(world, rig.c2w, rig.lens(_THUMB), _THUMB, 1, paint, light)
+    depths, light = cast(world, rig.c2w, rig.lens(_THUMB), _THUMB, 1, paint)
     effects = draw_effects(camera, light, config.effects)
     scale = 1.0
     if config.depth is not None:

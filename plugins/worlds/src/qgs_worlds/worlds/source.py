@@ -97,7 +97,7 @@ class WorldScene(DrawnScene):
         """Return a rendered image (H, W, 3) uint8 for each of `frames`."""
         from qgs_worlds.caster.shading import paint
 
-        light = self.painted(frames, paint, np.float32)
+        _, light = self.rendered(frames, self._config.samples, paint)
         photo = self.drawn.effects.photo
         return [photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
 
