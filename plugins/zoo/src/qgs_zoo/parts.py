@@ -1,6 +1,6 @@
 """Parts that several systems share: attention, rays of pixels, rotations, weight files."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -9,6 +9,7 @@ from einops import rearrange
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from qgs.containers import concatenated
 from qgs.contracts import MissingExtraError, Outcome
 from qgs.precision import full_precision
 from qgs.tokengs.blocks import merge_heads, split_heads
@@ -110,23 +111,21 @@ def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
     All outcomes must have the same losses. terms: further losses by name, already weighted, 0-d.
     Raises ValueError if an outcome has a loss with the name of one of the `terms`.
     """
-    first = outcomes[0]
-    share = 1 / len(outcomes)
     # Of two equal names, the log would lose one.
-    if taken := sorted(first.terms.keys() & terms.keys()):
+    if taken := sorted(outcomes[0].terms.keys() & terms.keys()):
         raise ValueError(
             f"the recipe's losses have terms {taken} already, which the objective adds itself; "
             "rename these losses"
         )
-    judged = {n: share * _sum(o.terms[n] for o in outcomes) for n in first.terms}
-    signs = {n: share * _sum(o.signs[n] for o in outcomes) for n in first.signs}
+    parts = [(outcome.total, outcome.terms, outcome.signs) for outcome in outcomes]
+    total, judged, signs = concatenated(parts, 0, _mean)
     # The maximum, because a mean would hide a single collapsed pass.
     signs["deviation"] = torch.stack([o.signs["deviation"] for o in outcomes]).amax()
-    total = share * _sum(o.total for o in outcomes) + _sum(terms.values())
     # Detached for the log: a graph would keep the memory of the step.
     detached = {n: term.detach() for n, term in terms.items()}
-    return Outcome(total, judged | detached, signs)
+    total = total + torch.stack([*terms.values()]).sum()
+    return Outcome(total, {**judged, **detached}, signs)
 
 
-def _sum(terms: Iterable[Tensor]) -> Tensor:
-    return torch.stack([*terms]).sum()
+def _mean(tensors: list[Tensor], dim: int) -> Tensor:
+    return torch.stack(tensors).mean(dim)
