@@ -17,6 +17,7 @@ from qgs.contracts import (
     ComponentConfig,
     Fields,
     FieldSpec,
+    ModelComponent,
     ModelDims,
     PatchEncoder,
     Queries,
@@ -215,9 +216,8 @@ class PixelHead(LinearHead):
         self.linear = nn.Linear(dims.width, outputs, bias=False)
         nn.init.normal_(self.linear.weight, std=config.init_std)
 
-    def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Return whether a parameter has weight decay: True only for the linear layer (paper)."""
-        return parameter.ndim != 1
+    # Weight decay only for the linear layer (paper), as components that are no heads have it.
+    decays = ModelComponent.decays
 
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
         raw = at_least_float32(raw_BNKC)
