@@ -59,8 +59,7 @@ class Results(Scores):
         for run, evaluation in product(plan.runs, plan.evaluations):
             # Only complete evaluations count: one that is being written would change the means.
             if run.evaluated(evaluation):
-                found = read_results(run.evaluation(evaluation))
-                stored[run.variant, evaluation][run.seed] = found
+                stored[run.variant, evaluation][run.seed] = read_results(run.evaluation(evaluation))
         super().__init__(stored=stored, reference=settings.reference, metric=settings.metric)
         self.plan = plan
         self.settings = settings

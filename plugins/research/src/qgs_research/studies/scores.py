@@ -20,7 +20,7 @@ from qgs.contracts import Column
 from qgs.metrics.baselines import BASELINES
 from qgs.wording import counted
 from qgs_research.studies.stored import StoredResults, common_scenes
-from qgs_research.studies.study import MAIN
+from qgs_research.studies.study import MAIN, Terms
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
@@ -157,10 +157,6 @@ def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     spread = first**2 + own * (second**2 * (trainings - 1) + noise**2) / (scenes - 1)
     freedom = (trainings - 1) * whole**2 / np.where(spread, spread, 1.0)
     return np.sqrt(whole / (trainings * scenes)), np.maximum(freedom, min(trainings, scenes) - 1)
-
-
-Terms: TypeAlias = Mapping[tuple[str, str], int]
-"""Weighted sum of mean scores: the weight of each mean, by (model, evaluation)."""
 
 
 @dataclass

@@ -164,6 +164,10 @@ class StudySettings(ComponentConfig):
         return seeds
 
 
+Terms: TypeAlias = Mapping[tuple[str, str], int]
+"""Weighted sum of mean scores: the weight of each mean, by (variant, evaluation)."""
+
+
 class Contrast(NamedTuple):
     """Hypothesis as a weighted sum of mean scores: left side minus right side.
 
@@ -171,7 +175,7 @@ class Contrast(NamedTuple):
     hypothesis is true, 1 for `>` and -1 for `<`.
     """
 
-    terms: Mapping[tuple[str, str], int]
+    terms: Terms
     sign: int
 
 
