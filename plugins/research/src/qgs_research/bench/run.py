@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from functools import partial
 from multiprocessing import get_context
 from operator import truediv
 from pathlib import Path
@@ -254,7 +255,7 @@ def measure_recipes(
         first = entries[0]["parameters"]
         entry["parameters"]["ratio"] = entry["parameters"]["count"] / first["count"]
     for operation in operations:
-        tasks = [make_task(operation, *given) for given in zip(recipes, models, works, strict=True)]
+        tasks = [*map(partial(make_task, operation), recipes, models, works)]
         say(f"measuring seconds of the {operation}")
         columns = in_turn(tasks, rounds, warmup)
         for entry, samples in zip(entries, columns, strict=True):

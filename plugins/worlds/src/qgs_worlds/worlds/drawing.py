@@ -126,7 +126,7 @@ def _sun(rng: Random) -> Light:
 
 
 def _lamp(rng: Random, place: Place, shadows: bool) -> Light:
-    x, y, _ = (rng.uniform(low, high) for low, high in zip(place.low, place.high, strict=True))
+    x, y, _ = map(rng.uniform, place.low, place.high)
     z = min(rng.uniform(0.6, 1.0) * place.top, place.top - 0.15)
     return 1.0, (x, y, z), spread(rng, 0.6, 4) * _tinted(rng, 0.4), int(shadows)
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from random import Random
 
 import numpy as np
@@ -17,6 +18,8 @@ _WALL = 0.1
 _FAR = 600.0
 # half of a terrain's width
 _TERRAIN = 24.0
+
+_box = partial(Primitive, s.BOX)
 
 
 @dataclass
@@ -44,10 +47,6 @@ class Place:
 def _toward(angle: float, away: float) -> tuple[float, float]:
     """Return x and y of the point at the distance `away` from the origin, in direction `angle`."""
     return away * math.cos(angle), away * math.sin(angle)
-
-
-def _box(center: Point, half: Point) -> Primitive:
-    return Primitive(s.BOX, center, half)
 
 
 def _ground(things: Things, scale: float, height: float = 0.0) -> Shape:

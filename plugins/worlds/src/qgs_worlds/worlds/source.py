@@ -98,8 +98,7 @@ class WorldScene(DrawnScene):
         from qgs_worlds.caster.shading import paint
 
         _, light = self.rendered(frames, self._config.samples, paint)
-        photo = self.drawn.effects.photo
-        return [photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
+        return [*map(self.drawn.effects.photo, light, frames)]
 
 
 def world_or_room(name: str, index: int, config: WorldsConfig, cache: ImageCache) -> DrawnScene:

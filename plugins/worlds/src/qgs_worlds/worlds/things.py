@@ -1,6 +1,7 @@
 """Random objects: composites of primitives, cut primitives, rows, frames, bars and wires."""
 
 import math
+from operator import add
 from random import Random
 from typing import NamedTuple
 
@@ -129,7 +130,7 @@ class Things:
             return None
         rng = self.rng
         way = rotated(body.turn, tuple(rng.uniform(-0.8, 0.8) * h for h in body.half))
-        center = tuple(a + b for a, b in zip(body.center, way, strict=True))
+        center = tuple(map(add, body.center, way))
         kind = rng.choice((s.BOX, s.ELLIPSOID, s.FRUSTUM))
         half = tuple(h * rng.uniform(0.35, 0.9) for h in body.half)
         turn = body.turn if rng.random() < 0.5 else any_turn(rng)

@@ -185,5 +185,5 @@ class Lpips(_WithNetwork, Metric):
     def distance(self, images: Tensor, truth: Tensor) -> Tensor:
         """Return the LPIPS (...) of pairs of images (..., 3, H, W), after clipping to [0, 1]."""
         # pair by pair, so that memory does not grow with the number of views
-        pairs = zip(*(x.clamp(0, 1).flatten(0, -4).split(1) for x in (images, truth)), strict=True)
-        return torch.cat([self.network(*pair) for pair in pairs]).reshape(images.shape[:-3])
+        single = (x.clamp(0, 1).flatten(0, -4).split(1) for x in (images, truth))
+        return torch.cat([*map(self.network, *single)]).reshape(images.shape[:-3])
