@@ -18,7 +18,7 @@ from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.files import merge
 from qgs.recipe.recipe import annotated, differing_options
-from qgs.recipe.yaml_text import MapNode, dump, from_plain
+from qgs.recipe.yaml_text import dump, from_plain
 from qgs.train.folder import RunFolder
 from qgs.wording import listed
 from qgs_research.studies.study import MAIN, Study
@@ -118,11 +118,6 @@ def recipe_file(folder: Path, variant: str, evaluation: str = MAIN) -> Path:
     return folder / "variants" / f"{name}.yaml"
 
 
-def changed_recipe(recipe: Recipe, changes: MapNode) -> Recipe:
-    """Return `recipe` with the changes of an evaluation. Raises RecipeError for invalid options."""
-    return resolve(merge(from_plain(recipe.tree, Origin("the variant")), changes))
-
-
 def write_plan(plan: Plan) -> None:
     """Write the checked recipes of all variants, which the training processes read."""
     for place, recipe in plan.recipes.items():
@@ -174,7 +169,8 @@ def composed(study: Study) -> dict[tuple[str, str], Recipe]:
         for label, node in study.evaluations.items():
             for name, recipe in recipes.items():
                 with _collected(problems, f"evaluations.{label}, of {name}", node.origin):
-                    found[name, label] = changed_recipe(recipe, node)
+                    tree = from_plain(recipe.tree, Origin("the variant"))
+                    found[name, label] = resolve(merge(tree, node))
     problems.raise_any()
     for name, recipe in recipes.items():
         try:
