@@ -7,19 +7,6 @@ from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder
 from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries, RayHead, WorldHead
 from qgs_zoo.mvsplat.two_depths import DecayedSupervision, DepthError, Exchange
 
-_SMALL = DepthSplatEncoder.Config(
-    near=0.2,
-    far=3.0,
-    features=32,
-    cnn=(4, 8, 8),
-    candidates=16,
-    vit=VitConfig(width=16, depth=4, heads=2),
-    blocks=(0, 1, 2, 3),
-    dpt=(8, 8, 8, 16),
-    full_features=8,
-    regressor=8,
-)
-
 _BIASES = "instance norms remove the effect of biases in the CNN, so these biases learn nothing"
 
 plugin = Plugin(
@@ -40,7 +27,18 @@ plugin = Plugin(
             cost_levels=1,
             depth_levels=1,
         ),
-        _SMALL,
+        DepthSplatEncoder.Config(
+            near=0.2,
+            far=3.0,
+            features=32,
+            cnn=(4, 8, 8),
+            candidates=16,
+            vit=VitConfig(width=16, depth=4, heads=2),
+            blocks=(0, 1, 2, 3),
+            dpt=(8, 8, 8, 16),
+            full_features=8,
+            regressor=8,
+        ),
         RayHead.Config(opacity_exponent=1.0),
         OnRays.Config(measure="depth"),
         WorldHead.Config(scale_max=0.1),
