@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeAlias
+from typing import Any
 
 from rich.filesize import decimal
 
 from qgs.wording import listed
 
-AnyPath: TypeAlias = str | os.PathLike[str]
+AnyPath = str | os.PathLike[str]
 """Path as a string or a path object."""
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)

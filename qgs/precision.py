@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import wraps
-from typing import Any, Literal, TypeAlias, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from qgs.containers import map_tensors, named_tensors
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-Precision: TypeAlias = Literal["float32", "bf16"]
+Precision = Literal["float32", "bf16"]
 """Precisions for `training.precision` and `qgs bench`. Weights are float32 in both."""
 
 

@@ -1,6 +1,6 @@
 """SSIM, the structural similarity of images (Wang et al. 2004), as a map and as a mean."""
 
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ _WEIGHTS = torch.from_numpy(_BELL / _BELL.sum())
 _C1 = 0.01**2
 _C2 = 0.03**2
 
-Padding: TypeAlias = Literal["same", "valid"]
+Padding = Literal["same", "valid"]
 
 
 def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1.0) -> Tensor:

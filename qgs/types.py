@@ -14,16 +14,16 @@ Containers are frozen. A component returns a new container and never changes its
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self, TypeAlias
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from qgs.containers import TensorContainer, check_shapes, concatenated, map_tensors
 
-Size: TypeAlias = tuple[int, int]
+Size = tuple[int, int]
 """Height and width in pixels."""
-World: TypeAlias = tuple[Tensor, Tensor]
+World = tuple[Tensor, Tensor]
 """Reference pose (4, 4) and 0-d scale of a coordinate frame, see `qgs.data.samples.own_world`."""
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any, Self
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -18,9 +18,9 @@ from qgs.files import AnyPath, replacing
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.wording import name_shown
 
-Weights: TypeAlias = Mapping[str, Tensor]
+Weights = Mapping[str, Tensor]
 """Parameters and buffers of a model, by name."""
-Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
+Shapes = Mapping[str, tuple[int, ...]]
 """Shapes of tensors by name."""
 RECIPE = "qgs.recipe"
 """Name of the metadata entry with the complete recipe."""

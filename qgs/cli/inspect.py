@@ -2,14 +2,14 @@
 
 from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from qgs.cli.options import Overrides
 
-RecipeFile: TypeAlias = Annotated[
+RecipeFile = Annotated[
     Path, typer.Argument(help="Recipe file, or the name of a recipe that comes with qgs.")
 ]
 

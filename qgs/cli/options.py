@@ -1,33 +1,33 @@
 """Options that several commands share."""
 
 import re
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
 
-Checkpoint: TypeAlias = Annotated[
+Checkpoint = Annotated[
     str,
     typer.Argument(
         help="Run folder, checkpoint file, URL of a checkpoint, or model of a plug-in: PLUGIN/NAME."
     ),
 ]
-Overrides: TypeAlias = Annotated[
+Overrides = Annotated[
     list[str] | None,
     typer.Option(
         "--set", help="Change an option of the recipe, such as model.queries.count=128. Repeatable."
     ),
 ]
-Threads: TypeAlias = Annotated[
+Threads = Annotated[
     int | None, typer.Option(min=1, help="Number of CPU threads. Default: all cores.")
 ]
-Device: TypeAlias = Annotated[
+Device = Annotated[
     str,
     typer.Option(
         help="Device: auto, cpu or cuda. auto is cuda if there is a GPU and gsplat is installed, "
         "else cpu."
     ),
 ]
-Size: TypeAlias = Annotated[
+Size = Annotated[
     str | None,
     typer.Option(
         metavar="HxW",
@@ -36,14 +36,14 @@ Size: TypeAlias = Annotated[
         "try 256 pixels too.",
     ),
 ]
-Inputs: TypeAlias = Annotated[
+Inputs = Annotated[
     int | None,
     typer.Option(
         min=1,
         help="Number of input views. Default: as in the recipe, and one more if it is between two.",
     ),
 ]
-Gaussians: TypeAlias = Annotated[
+Gaussians = Annotated[
     int | None,
     typer.Option(
         min=1,
@@ -51,14 +51,14 @@ Gaussians: TypeAlias = Annotated[
         "queries (option `least` of landmark/observed). Default: as in the recipe.",
     ),
 ]
-Frames: TypeAlias = Annotated[
+Frames = Annotated[
     str | None,
     typer.Option(help="Numbers or file names of input photos: 0,8,x.jpg. Default: qgs chooses."),
 ]
-SceneName: TypeAlias = Annotated[
+SceneName = Annotated[
     str | None, typer.Option("--scene", help="Scene to use, by name. Needed if there are several.")
 ]
-ViewsSettings: TypeAlias = Annotated[
+ViewsSettings = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
@@ -66,14 +66,14 @@ ViewsSettings: TypeAlias = Annotated[
         "Repeatable.",
     ),
 ]
-Scale: TypeAlias = Annotated[
+Scale = Annotated[
     float | None,
     typer.Option(
         help="Factor for all camera positions. Default: search for the factor with which the model "
         "renders your photos best."
     ),
 ]
-Tune: TypeAlias = Annotated[
+Tune = Annotated[
     str | None,
     typer.Option(
         metavar="[WHAT:]STEPS",

@@ -4,7 +4,7 @@ from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict
@@ -68,7 +68,7 @@ class FieldSpec:
         return f"{shape} {str(self.dtype).removeprefix('torch.')}{frame}{encoding}"
 
 
-Fields: TypeAlias = Mapping[str, FieldSpec]
+Fields = Mapping[str, FieldSpec]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import PositiveInt
@@ -16,8 +16,8 @@ from qgs.types import Cameras, Size
 from qgs.wording import numbered
 
 Split = Literal["train", "test"]
-Frames: TypeAlias = tuple[int, ...]
-Window: TypeAlias = tuple[Frames, Frames]
+Frames = tuple[int, ...]
+Window = tuple[Frames, Frames]
 """Indices of the input frames, and of the target frames with which renderings are compared."""
 
 
@@ -94,7 +94,7 @@ class SceneSource(Component):
     The constructor raises FileNotFoundError or ValueError; the message names the path and a fix.
     """
 
-    slot: ClassVar[str] = "data"
+    slot = "data"
     not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path"})
     """Options that change no scene, image or camera, such as paths and caching. They are not part
     of an evaluation protocol's hash."""
@@ -168,7 +168,7 @@ class ViewSampler(Component):
     arguments and `config`, and all randomness must come from `rng`.
     """
 
-    slot: ClassVar[str] = "view_sampler"
+    slot = "view_sampler"
 
     @abstractmethod
     def draw(self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int) -> Window:

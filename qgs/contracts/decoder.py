@@ -8,7 +8,7 @@ refinement runs after each layer.
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -16,9 +16,9 @@ from qgs.containers import TensorContainer
 from qgs.contracts.component import ComponentConfig, ModelComponent, ModelDims
 from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Rendering, Views
 
-Decode: TypeAlias = Callable[[QueryState], Gaussians]
+Decode = Callable[[QueryState], Gaussians]
 """Function of a model that decodes a query state into Gaussians."""
-Render: TypeAlias = Callable[[Gaussians, Cameras], Rendering]
+Render = Callable[[Gaussians, Cameras], Rendering]
 """Function of a model that renders Gaussians (B, G) from cameras (B, V)."""
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
@@ -67,7 +67,7 @@ class DecoderLayer(ModelComponent):
         this option is refused if no layer uses it.
     """
 
-    slot: ClassVar[str] = "layer"
+    slot = "layer"
     sublayers: ClassVar[tuple[str, ...]] = ()
     reads_layer_scale: ClassVar[bool] = True
 
@@ -90,7 +90,7 @@ class CrossAttention(ModelComponent):
         memory must not change the update.
     """
 
-    slot: ClassVar[str] = "cross_attention"
+    slot = "cross_attention"
     ordered_views: ClassVar[bool] = False
 
     @abstractmethod
@@ -116,7 +116,7 @@ class SelfAttention(ModelComponent):
     Permuting the queries, with their fields, permutes the update.
     """
 
-    slot: ClassVar[str] = "self_attention"
+    slot = "self_attention"
 
     @abstractmethod
     def forward(self, state: QueryState) -> Tensor:
@@ -137,7 +137,7 @@ class FeedForward(ModelComponent):
     width than D.
     """
 
-    slot: ClassVar[str] = "feed_forward"
+    slot = "feed_forward"
 
     @abstractmethod
     def forward(self, features: Tensor) -> Tensor:  # (B, N, D)
@@ -151,7 +151,7 @@ class Refinement(ModelComponent):
         False, every layer has a module of its own.
     """
 
-    slot: ClassVar[str] = "refinement"
+    slot = "refinement"
     shared_by_layers: ClassVar[bool] = True
 
     @abstractmethod
@@ -170,7 +170,7 @@ class Feedback(ModelComponent):
     rounds: number of rounds in an evaluation; it may be changed on a built model.
     """
 
-    slot: ClassVar[str] = "feedback"
+    slot = "feedback"
     reads_cameras: ClassVar[bool] = True
     layers: int = 0
     rounds: int = 0

@@ -45,7 +45,7 @@ class Encoder(ModelComponent):
     tunable: True if the encoder implements `project`, which test-time tuning needs.
     """
 
-    slot: ClassVar[str] = "encoder"
+    slot = "encoder"
     ordered_views: ClassVar[bool] = False
     reads_cameras: ClassVar[bool] = True
     tunable: ClassVar[bool] = False

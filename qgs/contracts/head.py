@@ -1,7 +1,6 @@
 """Contracts of the slots `head` and `centers`, which turn query features into Gaussians."""
 
 from abc import abstractmethod
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -24,7 +23,7 @@ class Head(ModelComponent):
     GAUSSIAN_FIELDS, so that losses can require them.
     """
 
-    slot: ClassVar[str] = "head"
+    slot = "head"
 
     @property
     def gaussians_per_query(self) -> int:
@@ -48,7 +47,7 @@ class Centers(ModelComponent):
     field that the state lacks; model construction prevents this by checking `reads`.
     """
 
-    slot: ClassVar[str] = "centers"
+    slot = "centers"
 
     @abstractmethod
     def forward(

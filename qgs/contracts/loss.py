@@ -31,9 +31,9 @@ class Loss(Component, torch.nn.Module):
         if any.
     """
 
-    slot: ClassVar[str] = "losses"
+    slot = "losses"
     renderings: ClassVar[Literal["each", "all", "none"]] = "all"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    scheduled = frozenset({"weight"})
     reads_depths: ClassVar[bool] = False
 
     class Config(ComponentConfig):
@@ -72,7 +72,7 @@ class Loss(Component, torch.nn.Module):
 class Supervision(Component):
     """Choice of the decoder layers to which the losses apply, and the weights of these layers."""
 
-    slot: ClassVar[str] = "supervision"
+    slot = "supervision"
 
     @abstractmethod
     def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:

@@ -92,7 +92,7 @@ class Metric(Component, torch.nn.Module):
         metric has values.
     """
 
-    slot: ClassVar[str] = "metrics"
+    slot = "metrics"
     definition: ClassVar[str]
     not_in_protocol: ClassVar[frozenset[str]] = frozenset()
     needs: ClassVar[tuple[Literal["masks", "gaussians", "depth", "true_depth"], ...]] = ()

@@ -60,7 +60,7 @@ class Objective(Component):
         `training.judge_inputs` demands.
     """
 
-    slot: ClassVar[str] = "objective"
+    slot = "objective"
     judges_inputs: ClassVar[bool] = True
 
     @abstractmethod

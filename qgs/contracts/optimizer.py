@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, TypedDict
+from typing import Any, TypedDict
 
 import torch
 from pydantic import Field, NonNegativeFloat
@@ -48,8 +48,8 @@ class Optimizer(Component):
     The kinds of schedules that a recipe can use are in `qgs.tokengs.schedules`.
     """
 
-    slot: ClassVar[str] = "optimizer"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"learning_rate"})
+    slot = "optimizer"
+    scheduled = frozenset({"learning_rate"})
 
     class Config(OptimizerConfig):
         """Options of the optimiser. A subclass may add options to those of every optimiser."""

@@ -25,7 +25,7 @@ class Queries(ModelComponent):
     reads_cameras: True if the component reads `views.cameras`. If False, it accepts `Photos` too.
     """
 
-    slot: ClassVar[str] = "queries"
+    slot = "queries"
     reads_cameras: ClassVar[bool] = True
 
     @property

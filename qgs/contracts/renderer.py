@@ -1,7 +1,7 @@
 """Contract of the slot `renderer`, and helpers that check and prepare a renderer's inputs."""
 
 from abc import abstractmethod
-from typing import Annotated, ClassVar, TypeAlias
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat
@@ -14,7 +14,7 @@ from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import seen_colors
 from qgs.types import Cameras, Gaussians, Rendering
 
-Channel: TypeAlias = Annotated[float, Field(ge=0, le=1)]
+Channel = Annotated[float, Field(ge=0, le=1)]
 
 
 class RendererConfig(ComponentConfig):
@@ -54,8 +54,8 @@ class Renderer(Component, torch.nn.Module):
         a gradient, `forward` raises ValueError.
     """
 
-    slot: ClassVar[str] = "renderer"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"near", "far", "dilation"})
+    slot = "renderer"
+    scheduled = frozenset({"near", "far", "dilation"})
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     camera_gradients: ClassVar[tuple[str, ...]] = ("c2w", "intrinsics")
 

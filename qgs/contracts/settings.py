@@ -1,6 +1,6 @@
 """Sections of a recipe that are not components: views, training, evaluation."""
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal
 
 from pydantic import (
     AfterValidator,
@@ -27,7 +27,7 @@ def ascending(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-Ascending: TypeAlias = Annotated[tuple[float, float], AfterValidator(ascending)]
+Ascending = Annotated[tuple[float, float], AfterValidator(ascending)]
 """Range [min, max] of positive numbers."""
 
 
@@ -41,7 +41,7 @@ def rising(numbers: tuple[int, ...]) -> tuple[int, ...]:
     return numbers
 
 
-Rising: TypeAlias = Annotated[tuple[int, ...], Field(min_length=1), AfterValidator(rising)]
+Rising = Annotated[tuple[int, ...], Field(min_length=1), AfterValidator(rising)]
 """Numbers from 1 on, at least one, in ascending order."""
 
 
@@ -57,7 +57,7 @@ def behind_near(far: float, info: ValidationInfo) -> float:
     return far
 
 
-Far: TypeAlias = Annotated[PositiveFloat, AfterValidator(behind_near), Field(validate_default=True)]
+Far = Annotated[PositiveFloat, AfterValidator(behind_near), Field(validate_default=True)]
 """Option `far`, above 0 and above the option `near`, which comes before it."""
 
 
@@ -71,9 +71,7 @@ def dividing_width(heads: int, info: ValidationInfo) -> int:
     return heads
 
 
-Heads: TypeAlias = Annotated[
-    int, Field(ge=1, validate_default=True), AfterValidator(dividing_width)
-]
+Heads = Annotated[int, Field(ge=1, validate_default=True), AfterValidator(dividing_width)]
 """Option `heads`, from 1 on. It divides the option `width`, which comes before it."""
 
 

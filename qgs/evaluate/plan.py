@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -14,7 +14,7 @@ from qgs.data.view_samplers import evenly, gap_range, moments, spread
 from qgs.paths import opened_path, read_json
 from qgs.wording import listed
 
-FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
+FrameList = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
 
 
 class IndexEntry(BaseModel):
@@ -31,10 +31,10 @@ class IndexEntry(BaseModel):
     """Target frames, which are rendered and scored."""
 
 
-EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
+EvaluationIndex = Mapping[str, IndexEntry | None]
 """Frames by scene name; None for a scene that is listed but not scored."""
 
-ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
+ViewsOf = Callable[[Scene, Frames, Frames], ViewsConfig]
 """Function of a scene, its input frames and its target frames that returns view settings."""
 
 _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'

@@ -1,7 +1,7 @@
 """The metrics PSNR and SSIM, computed as in the evaluation of the LocusGS release."""
 
 from collections.abc import Mapping
-from typing import Literal, TypeAlias
+from typing import Literal
 
 from torch import Tensor
 
@@ -9,7 +9,7 @@ from qgs.contracts import Column, ComponentConfig, Metric, MetricInput
 from qgs.precision import full_precision
 from qgs.similarity import WINDOW, similarity_map
 
-SsimCovariance: TypeAlias = Literal["population", "sample"]
+SsimCovariance = Literal["population", "sample"]
 
 # Identical images get 100 dB.
 _MSE_FLOOR = 1e-10

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -63,7 +63,7 @@ class Chosen(Place):
         return str(self.node.origins.get("type", "default of the slot"))
 
 
-Parts: TypeAlias = Mapping[KeyPath, Chosen]
+Parts = Mapping[KeyPath, Chosen]
 """Components by their paths in a recipe."""
 
 

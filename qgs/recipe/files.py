@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from qgs.paths import open_file
 from qgs.recipe.errors import Origin, Problems
@@ -23,9 +23,9 @@ from qgs.wording import nearest
 
 KINDS = ("kind", "schedule")
 """Options that decide which other options a mapping without `type` has."""
-_Trees: TypeAlias = dict[Path, MapNode | None]
+_Trees = dict[Path, MapNode | None]
 """Merged recipe of each file, by resolved path; None while the file is being read."""
-_Merge: TypeAlias = Callable[[MapNode, MapNode], MapNode]
+_Merge = Callable[[MapNode, MapNode], MapNode]
 """Function that merges the second of two mappings, a file's, into the first, which it extends."""
 
 

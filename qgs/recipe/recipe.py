@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from torch import nn
@@ -177,7 +177,7 @@ def resolve(
 
 
 _DEFAULT = "default"
-_Spelled: TypeAlias = Iterator[tuple[KeyPath, Any, Origin | str]]
+_Spelled = Iterator[tuple[KeyPath, Any, Origin | str]]
 """Path, value and origin of each value of a recipe."""
 
 

@@ -6,13 +6,13 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from itertools import count
-from typing import Any, TypeAlias
+from typing import Any
 
 import yaml
 
 from qgs.recipe.errors import Origin, Problems
 
-KeyPath: TypeAlias = tuple[str, ...]
+KeyPath = tuple[str, ...]
 
 # A few lines of aliases can expand to billions of nodes, so limits count expanded nodes.
 MAX_DEPTH = 64
@@ -90,7 +90,7 @@ class ListNode(list[Any]):
         self.origins = dict(enumerate(origin for _, origin in entries))
 
 
-Node: TypeAlias = MapNode | ListNode | str | int | float | None
+Node = MapNode | ListNode | str | int | float | None
 
 
 def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from os import fspath
-from typing import TypeAlias, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ LARGEST = 256
 """Shorter side of photos in pixels, at most, that no --size asks for."""
 HOLDOUT = 8
 """Every HOLDOUT-th photo of a user's scene is held out to score the result (Mip-NeRF 360)."""
-FrameNames: TypeAlias = str | Sequence[int | str]
+FrameNames = str | Sequence[int | str]
 
 
 def read_photos(

@@ -1,7 +1,7 @@
 """`qgs/cpu`, a renderer for CPUs, compiled by numba, that blends tiles of 16 x 16 pixels."""
 
 from itertools import pairwise, product
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ _CHUNK = 512
 # Units of work per call, so that a few large images still fill a few cores.
 _MIN_UNITS = 8
 
-_Part: TypeAlias = tuple[int, tuple[int, int]]
+_Part = tuple[int, tuple[int, int]]
 
 
 class CpuRenderer(Renderer):

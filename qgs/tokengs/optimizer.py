@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch.optim import AdamW
@@ -12,7 +12,7 @@ from qgs.contracts import Optimizer, OptimizerConfig, ParameterGroup, TrainingCo
 WARMUP_TIME = 0.1
 """Largest fraction of a time budget that is used for warm-up."""
 
-Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
+Decay = Annotated[float, Field(ge=0, lt=1)]
 
 
 class OneCycleAdamW(Optimizer):

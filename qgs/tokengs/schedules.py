@@ -54,7 +54,7 @@ class _Listed(Schedule):
 class Steps(_Listed):
     """Step function: `values[0]` at first, and `values[i + 1]` from step `at[i]` on."""
 
-    more: ClassVar[int] = 1
+    more = 1
     schedule: Literal["steps"]
     """Step function: one constant number for each range of training steps."""
     values: tuple[float, ...]

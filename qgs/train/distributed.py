@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from importlib.util import find_spec
 from types import FrameType
-from typing import TypeAlias
 
 import torch
 from accelerate import Accelerator
@@ -80,7 +79,7 @@ def choose_device(wanted: str, say: Callable[[str], None] = print) -> str:
     return "cuda" if available else "cpu"
 
 
-StopRequest: TypeAlias = list[signal.Signals]
+StopRequest = list[signal.Signals]
 """Signals that asked the run to stop. The list is empty until a signal arrives."""
 
 

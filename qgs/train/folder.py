@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from accelerate import PartialState
 from accelerate.utils import wait_for_everyone
@@ -29,7 +29,7 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.recipe.recipe import differing_options
 
-State: TypeAlias = Mapping[str, Any]
+State = Mapping[str, Any]
 """Tensors, JSON values, and nested mappings of such values, by name."""
 
 HISTORY = "history.jsonl"

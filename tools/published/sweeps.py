@@ -138,7 +138,8 @@ def of_mvsplat(found: Tensors, numbers: Tensor) -> None:
 def mvsplat_name(name: str) -> str:
     """Return the name in files of MVSplat for a name in files of DepthSplat."""
     for line in MVSPLAT_NAMES.strip().splitlines():
-        name = name.replace(*line.split())
+        own, released = line.split()
+        name = name.replace(own, released)
     return name
 
 

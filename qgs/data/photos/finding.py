@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from typing import TypeAlias
 
 from PIL import Image
 from upath import UPath
@@ -16,7 +15,7 @@ from qgs.data.photos.reader import Listing, PhotoFrame, image_folder
 from qgs.paths import listing
 from qgs.wording import listed, name_shown, warn_once
 
-_Index: TypeAlias = Mapping[object, list[UPath]]
+_Index = Mapping[object, list[UPath]]
 """Files and subfolders of a folder; the keys are the `_spellings` of their names."""
 
 

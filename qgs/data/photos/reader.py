@@ -5,7 +5,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Self, TypeAlias
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from qgs.paths import listing
 from qgs.types import Size
 from qgs.wording import listed, numbered, warn_once
 
-Intrinsics: TypeAlias = tuple[float, float, float, float]
+Intrinsics = tuple[float, float, float, float]
 GROUP = "qgs.photo_readers"
 """Entry-point group in which plug-ins list their subclasses of `PhotoReader` by format name."""
 UNLESS = (

@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from operator import attrgetter
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -247,9 +246,9 @@ class PhotosSource(LazySource):
 
     name = "photos"
     Config = PhotosConfig
-    tells_times: ClassVar[bool] = True
-    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "outside"})
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
+    tells_times = True
+    not_in_protocol = frozenset({"path", "outside"})
+    split_options = frozenset({"holdout", "max_frames"})
 
     def __init__(self, config: PhotosConfig) -> None:
         super().__init__(config)

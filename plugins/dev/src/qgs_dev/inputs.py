@@ -4,7 +4,7 @@ import math
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +19,7 @@ from qgs.types import Cameras, Gaussians, ImageMemory, LayerPrediction, QuerySta
 from qgs_dev.case import Case
 
 # Arguments of a component's forward pass by name, in order.
-Inputs: TypeAlias = dict[str, Any]
+Inputs = dict[str, Any]
 
 # Side in pixels of a patch in the image memory for decoder components.
 PATCH = 8

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from typing import Literal, NamedTuple, get_args
 
 from qgs.contracts import Component, ComponentConfig, MissingExtraError, ModelComponent, ModelDims
 from qgs.recipe.registry import InstalledPlugin, PluginError, default_config, load_plugin
@@ -15,7 +15,7 @@ from qgs.wording import did_you_mean
 from qgs_dev.case import SMALL, CannotCheck, Case, ContractError
 from qgs_dev.inputs import FACTS, data_file
 
-Tier: TypeAlias = Literal["core", "construction", "extended"]
+Tier = Literal["core", "construction", "extended"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
 
 # Checks that no plugin may expect to fail: without them the other checks mean nothing.
@@ -85,7 +85,7 @@ def checks_for(case: Case, tiers: Iterable[Tier] = TIERS, variant: bool = False)
     return sorted(found, key=lambda check: [check.name != name for name in FIRST])
 
 
-Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
+Verdict = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
 
 
 @dataclass(frozen=True)

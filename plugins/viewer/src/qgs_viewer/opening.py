@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
@@ -119,7 +119,7 @@ class ModelSource:
         return explained(self.model, inputs, picked, place)
 
 
-Source: TypeAlias = FixedSource | ModelSource
+Source = FixedSource | ModelSource
 """Content of the viewer."""
 
 

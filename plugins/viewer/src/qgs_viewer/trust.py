@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,7 +48,7 @@ class Part(NamedTuple):
         return "" if self.psnr > self.copied else WRONG
 
 
-ScoredView: TypeAlias = tuple[str, Mapping[str, Part]]
+ScoredView = tuple[str, Mapping[str, Part]]
 """Name of a scored view, and its parts by name. The part WHOLE is the whole view."""
 
 

@@ -116,8 +116,8 @@ class DrawnSource(LazySource):
     Config = DrawnConfig
     scene: ClassVar[Callable[..., DrawnScene]]
     """Function that makes a scene from its name, index, config and cache."""
-    not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
-    split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
+    not_in_protocol = SceneSource.not_in_protocol | {"cache_mb"}
+    split_options = frozenset({"scenes", "test_scenes"})
 
     def __init__(self, config: DrawnConfig) -> None:
         super().__init__(config)

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import import_module
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -26,7 +26,7 @@ from qgs.precision import full_precision
 from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 
 T = TypeVar("T")
-Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]
+Block = tuple[int, slice, tuple[Tensor, ...]]
 """Block: index of the scene, slice of its queries, and buffers (n, M) for these n queries."""
 
 BLOCK = {"cpu": 2**22, "cuda": 2**25}

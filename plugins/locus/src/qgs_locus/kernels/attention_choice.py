@@ -11,7 +11,7 @@ import os
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from qgs.wording import warn_once
 if TYPE_CHECKING:
     from qgs_locus.kernels.attention_bias import AttentionBias
 
-AttentionKernel: TypeAlias = Literal["auto", "plain", "blocks", "triton"]
+AttentionKernel = Literal["auto", "plain", "blocks", "triton"]
 """Code that computes attention with a bias.
 
 auto: chosen by size. plain: torch's attention with the bias of all pairs of query and token.

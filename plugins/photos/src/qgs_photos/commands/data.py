@@ -1,6 +1,6 @@
 """The commands `qgs data check` and `qgs data pack`."""
 
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -11,7 +11,7 @@ from qgs.wording import counted
 
 app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
 
-Quality: TypeAlias = Annotated[
+Quality = Annotated[
     int | None,
     typer.Option(
         help="JPEG quality of photos that cannot be copied unchanged. Default: write them as PNG.",
@@ -19,49 +19,49 @@ Quality: TypeAlias = Annotated[
         max=100,
     ),
 ]
-EveryNth: TypeAlias = Annotated[
+EveryNth = Annotated[
     int | None,
     typer.Option(
         help="Make every Nth scene a test scene. Default: keep the splits of the data set.", min=2
     ),
 ]
-Geometry: TypeAlias = Annotated[
+Geometry = Annotated[
     int,
     typer.Option(
         help="Number of scenes whose poses are checked by matching photos. 0: check none.", min=0
     ),
 ]
-Format: TypeAlias = Annotated[
+Format = Annotated[
     str,
     typer.Option(
         help="Check only scenes in this format, such as colmap or chunks. auto: any format."
     ),
 ]
-SourceOptions: TypeAlias = Annotated[
+SourceOptions = Annotated[
     list[str] | None,
     typer.Option(
         "--set", help="Option of the reader of the data set, such as images=images_4. Repeatable."
     ),
 ]
-ImageSize: TypeAlias = Annotated[
+ImageSize = Annotated[
     tuple[int, int] | None,
     typer.Option(
         help="Height and width to which all images are resized. Default: no resizing.", min=1
     ),
 ]
-TestScenes: TypeAlias = Annotated[
+TestScenes = Annotated[
     str | None,
     typer.Option(
         help="File of test scenes: an evaluation index or a list. Default: keep the splits."
     ),
 ]
-LeaveOutBroken: TypeAlias = Annotated[
+LeaveOutBroken = Annotated[
     bool,
     typer.Option(
         help="Leave out unreadable scenes, and list them at the end. Default: stop at the first."
     ),
 ]
-Quick: TypeAlias = Annotated[
+Quick = Annotated[
     bool,
     typer.Option("--quick", help="Read only image headers: decode and match no images."),
 ]

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal
 
 import typer
 
@@ -11,7 +11,7 @@ from qgs.terminal import print_lines
 
 app = typer.Typer(help="Find camera poses of photos or a video.")
 
-VideoFrames: TypeAlias = Annotated[
+VideoFrames = Annotated[
     int | None,
     typer.Option(
         min=3,
@@ -19,7 +19,7 @@ VideoFrames: TypeAlias = Annotated[
         "second of the video and more in fast motion.",
     ),
 ]
-Matching: TypeAlias = Annotated[
+Matching = Annotated[
     Literal["auto", "exhaustive", "sequential"],
     typer.Option(
         help="exhaustive: match all pairs of photos. sequential: match neighbours in the order "
@@ -27,15 +27,13 @@ Matching: TypeAlias = Annotated[
         "20, else pairs of photos that look alike."
     ),
 ]
-Side: TypeAlias = Annotated[
+Side = Annotated[
     int,
     typer.Option(
         min=200, help="Longer side in pixels to which photos are reduced to find features."
     ),
 ]
-Features: TypeAlias = Annotated[
-    int, typer.Option(min=100, help="Largest number of features in a photo.")
-]
+Features = Annotated[int, typer.Option(min=100, help="Largest number of features in a photo.")]
 
 
 @app.command()

@@ -1,7 +1,7 @@
 """The command `qgs refine`."""
 
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
 
@@ -12,13 +12,13 @@ from qgs_photos.commands import refuse_no_time
 
 app = typer.Typer(help="Fit a reconstruction to the photos of its scene.")
 
-Count: TypeAlias = Annotated[
+Count = Annotated[
     int | None,
     typer.Option(
         min=1, help="Number of Gaussians in the result. Default: that of the reconstruction."
     ),
 ]
-PhotoSize: TypeAlias = Annotated[
+PhotoSize = Annotated[
     str | None,
     typer.Option(
         metavar="HxW",
@@ -26,7 +26,7 @@ PhotoSize: TypeAlias = Annotated[
         "the reconstruction was made.",
     ),
 ]
-InputsOnly: TypeAlias = Annotated[
+InputsOnly = Annotated[
     bool,
     typer.Option(
         "--inputs-only",

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
 
@@ -21,21 +21,21 @@ class Adjustment(StrEnum):
     EXPOSURE = "exposure"
 
 
-Minutes: TypeAlias = Annotated[
+Minutes = Annotated[
     float,
     typer.Option(
         help="Time in minutes, from the start of the command to the last file. The first run takes "
         "up to a minute more, in which it compiles."
     ),
 ]
-Model: TypeAlias = Annotated[
+Model = Annotated[
     str | None,
     typer.Option(
         help="Trained model that makes the Gaussians to start from; none: start from depth "
         "estimated from the photos. Default: a shipped model for fewer than four photos, else none."
     ),
 ]
-From: TypeAlias = Annotated[
+From = Annotated[
     Path | None,
     typer.Option(
         "--from",
@@ -43,7 +43,7 @@ From: TypeAlias = Annotated[
         "Default: none; with it, --size and --gaussians are as in that scene.",
     ),
 ]
-PhotoSize: TypeAlias = Annotated[
+PhotoSize = Annotated[
     str | None,
     typer.Option(
         metavar="HxW",
@@ -51,7 +51,7 @@ PhotoSize: TypeAlias = Annotated[
         "optimisation fits into --minutes (or --seconds).",
     ),
 ]
-Count: TypeAlias = Annotated[
+Count = Annotated[
     int | None,
     typer.Option(
         min=1,
@@ -59,18 +59,18 @@ Count: TypeAlias = Annotated[
         "(or --seconds).",
     ),
 ]
-Seconds: TypeAlias = Annotated[
+Seconds = Annotated[
     float | None,
     typer.Option(help="Time of the optimisation alone in seconds; --minutes then has no effect."),
 ]
-Holdout: TypeAlias = Annotated[
+Holdout = Annotated[
     str,
     typer.Option(
         help="Hold out every Nth photo: leave it out of the optimisation and score the result on "
         "it. none: optimise on all photos."
     ),
 ]
-Degree: TypeAlias = Annotated[
+Degree = Annotated[
     int,
     typer.Option(
         min=0,
@@ -79,14 +79,14 @@ Degree: TypeAlias = Annotated[
         "directions.",
     ),
 ]
-Adjust: TypeAlias = Annotated[
+Adjust = Annotated[
     list[Adjustment] | None,
     typer.Option(
         help="Optimise a property of each photo together with the Gaussians. poses: its camera. "
         "exposure: an affine map of its colours. Repeatable. Default: neither."
     ),
 ]
-Masks: TypeAlias = Annotated[
+Masks = Annotated[
     bool,
     typer.Option("--masks", help="Treat pixels outside the masks of photos as background."),
 ]

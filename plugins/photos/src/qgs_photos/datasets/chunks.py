@@ -4,7 +4,7 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from itertools import islice
-from typing import ClassVar, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -178,9 +178,9 @@ class ChunksSource(LazySource):
 
     name = "chunks"
     Config = ChunksConfig
-    tells_times: ClassVar[bool] = True
-    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
+    tells_times = True
+    not_in_protocol = frozenset({"path", "max_scenes", "min_frames"})
+    split_options = frozenset({"holdout"})
 
     def __init__(self, config: ChunksConfig) -> None:
         super().__init__(config)

@@ -14,7 +14,7 @@ from fnmatch import fnmatch
 from functools import cache
 from itertools import chain
 from pathlib import PurePosixPath
-from typing import IO, Any, TypeAlias
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -167,9 +167,9 @@ def models(folder: UPath) -> Iterator[tuple[UPath, str, set[str]]]:
                     break
 
 
-Camera: TypeAlias = tuple[int, tuple[str, float, float, Sequence[float]]]
+Camera = tuple[int, tuple[str, float, float, Sequence[float]]]
 """Number of the camera; name of its camera model, width and height in pixels, parameters."""
-Image: TypeAlias = tuple[str, list[float], int]
+Image = tuple[str, list[float], int]
 """Name, world-to-camera as quaternion (w, x, y, z) and translation (x, y, z), camera's number."""
 
 

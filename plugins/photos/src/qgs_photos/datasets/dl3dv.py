@@ -4,7 +4,7 @@ import re
 import zipfile
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 from pydantic import NonNegativeInt
 from upath import UPath
@@ -52,8 +52,8 @@ class Dl3dvSource(LazySource):
 
     name = "dl3dv"
     Config = Dl3dvConfig
-    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "test_scenes", "max_scenes"})
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
+    not_in_protocol = frozenset({"path", "test_scenes", "max_scenes"})
+    split_options = frozenset({"holdout"})
 
     def __init__(self, config: Dl3dvConfig) -> None:
         super().__init__(config)

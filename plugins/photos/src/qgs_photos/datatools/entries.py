@@ -3,7 +3,7 @@
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from qgs_photos.datasets.intrinsics import as_intrinsics
 from qgs_photos.datatools.candidates import chunk_photo, source_photo
 from qgs_photos.datatools.photos import Photo
 
-ChunkEntry: TypeAlias = dict[str, Any]
+ChunkEntry = dict[str, Any]
 
 # MPO: a JPEG with further pictures behind it.
 _KEPT_FORMATS = {"JPEG", "MPO", "PNG"}

@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 from qgs.wording import listed
 
-Severity: TypeAlias = Literal["error", "warning"]
+Severity = Literal["error", "warning"]
 
 _FEW = 3
 _ROWS = 40

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,9 +41,9 @@ _ADVICE = (
     "intrinsics (docs/photos.md), or make poses by `qgs poses`"
 )
 
-Features: TypeAlias = tuple[np.ndarray, np.ndarray]
+Features = tuple[np.ndarray, np.ndarray]
 """Features of one photo: points (P, 2), x and y in pixels, and SIFT descriptors (P, 128)."""
-Pairs: TypeAlias = Sequence[tuple[tuple[int, int], float]]
+Pairs = Sequence[tuple[tuple[int, int], float]]
 """Pairs of frames, and for each pair the median distance of matched points from the epipolar lines
 that the poses predict, as a fraction of the photo's diagonal."""
 

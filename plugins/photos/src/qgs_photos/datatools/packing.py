@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import IO, Any
 
 import torch
 from upath import UPath
@@ -20,11 +20,11 @@ from qgs_photos.datatools.entries import ChunkEntry, Encoding, chunk_entry, enco
 SETTINGS = "packing.json"
 """File in the output folder with the settings of the packing; deleted when it is finished."""
 
-Places: TypeAlias = Mapping[str, tuple[Split, int]]
+Places = Mapping[str, tuple[Split, int]]
 """Scenes by name: the scene's split in the source, and the scene's index in this split."""
 
 # What is packed into which split.
-Splits: TypeAlias = Mapping[Split, Places]
+Splits = Mapping[Split, Places]
 
 
 def chosen_splits(

@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 from PIL import Image
@@ -58,7 +57,7 @@ class Photo:
         return pixels, np.array(intrinsics)
 
 
-Photos: TypeAlias = tuple[Sequence[Photo], Sequence[str]]
+Photos = tuple[Sequence[Photo], Sequence[str]]
 """Photos of a scene, and names of listed images that do not exist and are not among them."""
 
 

@@ -5,14 +5,14 @@ COLMAP's own choice of a first pair asks for more matches and parallax than few 
 
 from collections.abc import Mapping
 from itertools import combinations
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from qgs_photos.poses.two_views import COLMAP, USUAL, Links, TwoViews, View, linked, two_views
 
 # By the numbers of two photos.
-Linked: TypeAlias = Mapping[tuple[int, int], Links]
+Linked = Mapping[tuple[int, int], Links]
 
 SEARCHED = 8
 """Largest number of photos whose pairs are searched by this module."""

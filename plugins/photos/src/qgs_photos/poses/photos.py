@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TypeAlias
 
 from PIL import Image, ImageOps
 from upath import UPath
@@ -30,7 +29,7 @@ _ORIENTATION, _SUB, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
 _LENS = (0x920A, 0xA405, 0xA434)
 
 
-Show: TypeAlias = Callable[[str, int, int], None]
+Show = Callable[[str, int, int], None]
 """Function that shows progress: name of the stage, number of steps done, number of all steps."""
 
 

@@ -12,13 +12,13 @@ Axes: K hypotheses, N matches.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-Array: TypeAlias = npt.NDArray[Any]
+Array = npt.NDArray[Any]
 # Takes dictionaries for options, which its types do not say.
 COLMAP: Any = pycolmap
 

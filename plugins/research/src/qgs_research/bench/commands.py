@@ -1,7 +1,7 @@
 """Command `qgs bench`: size, latency and memory of models, as tables and a JSON report."""
 
 from pathlib import Path
-from typing import Annotated, TypeAlias, get_args
+from typing import Annotated, get_args
 
 import typer
 
@@ -9,13 +9,13 @@ from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_th
 
 app = typer.Typer(help="Measure speed, memory and size of models.")
 
-InputViews: TypeAlias = Annotated[
+InputViews = Annotated[
     int | None, typer.Option(min=1, help="Number of input photos. Default: that of the recipe.")
 ]
-Memory: TypeAlias = Annotated[
+Memory = Annotated[
     bool, typer.Option("--memory", help="Measure peak memory too, each time in a new process.")
 ]
-Report: TypeAlias = Annotated[
+Report = Annotated[
     Path | None, typer.Option(metavar="FILE", help="New file for a JSON report with all times.")
 ]
 

@@ -13,7 +13,7 @@ from functools import partial
 from multiprocessing import get_context
 from operator import truediv
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -88,8 +88,8 @@ def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Vi
     return Views(images, Cameras(c2w, intrinsics, size), None, times, times[:, :1])
 
 
-Task: TypeAlias = Callable[[], object]
-Operation: TypeAlias = Literal["forward", "render", "step"]
+Task = Callable[[], object]
+Operation = Literal["forward", "render", "step"]
 
 
 def make_task(

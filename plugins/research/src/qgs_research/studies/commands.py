@@ -2,7 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -15,7 +15,7 @@ app = typer.Typer(help="Train variants of a model with several seeds, and compar
 compare_app = typer.Typer(help="Compare results of evaluations.")
 diff_app = typer.Typer(help="Compare recipes.")
 
-StudyFile: TypeAlias = Annotated[
+StudyFile = Annotated[
     str, typer.Argument(metavar="STUDY", help="Study file, or name of a study that comes with qgs.")
 ]
 

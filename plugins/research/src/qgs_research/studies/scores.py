@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from scipy.stats import bootstrap
@@ -26,7 +26,7 @@ RESAMPLES = 10_000
 CONFIDENCE = 0.95
 SEED = 0
 
-Runs: TypeAlias = Mapping[int, StoredResults]
+Runs = Mapping[int, StoredResults]
 """Results of one model, by training seed."""
 
 

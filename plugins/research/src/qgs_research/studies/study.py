@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import (
     AfterValidator,
@@ -66,9 +66,9 @@ def _evaluation_section(key: str) -> str:
     return key
 
 
-Name: TypeAlias = Annotated[str, AfterValidator(_folder_name)]
-VariantName: TypeAlias = Annotated[str, AfterValidator(_variant_name)]
-Section: TypeAlias = Annotated[str, AfterValidator(_evaluation_section)]
+Name = Annotated[str, AfterValidator(_folder_name)]
+VariantName = Annotated[str, AfterValidator(_variant_name)]
+Section = Annotated[str, AfterValidator(_evaluation_section)]
 
 
 class Budget(ComponentConfig):
@@ -164,7 +164,7 @@ class StudySettings(ComponentConfig):
         return seeds
 
 
-Terms: TypeAlias = Mapping[tuple[str, str], int]
+Terms = Mapping[tuple[str, str], int]
 """Weighted sum of mean scores: the weight of each mean, by (variant, evaluation)."""
 
 

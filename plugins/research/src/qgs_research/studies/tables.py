@@ -7,7 +7,7 @@ between scenes.
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -18,7 +18,7 @@ from qgs_research.studies.scores import Estimate, Runs, Scores, interval_shown, 
 from qgs_research.studies.stored import StoredResults, common_scenes, moved_scenes
 from qgs_research.studies.study import MAIN
 
-Rows: TypeAlias = Sequence[Sequence[str]]
+Rows = Sequence[Sequence[str]]
 """Rows of a table, as lists of cells. The first row has the headers."""
 
 

@@ -90,7 +90,8 @@ def blurred(values: np.ndarray) -> np.ndarray:
     """Return a blurred map (C, C): each cell is the mean of the 3 x 3 cells around it."""
     side = len(values)
     padded = np.pad(values, 1, "edge")
-    return sum(padded[a : a + side, b : b + side] for a in range(3) for b in range(3)) / 9
+    cells = [padded[a : a + side, b : b + side] for a in range(3) for b in range(3)]
+    return np.sum(cells, 0) / 9
 
 
 @inner

@@ -1,7 +1,7 @@
 """Random cameras: walks, orbits, turns on the spot, and cameras scattered around a point."""
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -69,7 +69,7 @@ class Path(NamedTuple):
     fov: float
 
 
-Motion: TypeAlias = tuple[np.ndarray, np.ndarray]
+Motion = tuple[np.ndarray, np.ndarray]
 """Camera centres (F, 3), and the points (F, 3), or one point, that the cameras look at."""
 
 

@@ -6,7 +6,7 @@ The compiled kernels are imported when the first scene is generated, because loa
 from collections.abc import Sequence
 from functools import cached_property
 from random import Random
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field, PositiveInt
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from qgs_worlds.caster.tables import World
     from qgs_worlds.worlds.drawing import Drawn
 
-Variety: TypeAlias = Literal["plain", "varied"]
+Variety = Literal["plain", "varied"]
 
 
 class WorldsConfig(DrawnConfig):

@@ -5,7 +5,7 @@ The U-Net is the one of latent diffusion, without the embedding of time.
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 HEAD_WIDTH = 32
 
-Padding: TypeAlias = Literal["zeros", "replicate"]
+Padding = Literal["zeros", "replicate"]
 
 
 def conv3(inputs: int, outputs: int, padding: Padding = "zeros") -> nn.Conv2d:
