@@ -99,5 +99,5 @@ def test_of_squares_a_warning_says_whose_cameras_they_have(tmp_path, caplog):
     assert "poses must belong to the stored pixels" in caplog.text
     photos = [SimpleNamespace(listed=frame, exists=True)] * 2
     squares = DecodedScene("squares", photos, [Decoded(size=(4, 4))] * 2)
-    (finding,) = geometry_findings(squares, Geometry(pairs=[((0, 1), 0.1)]))
+    (finding,) = geometry_findings(squares, Geometry(pairs={(0, 1): 0.1}))
     assert "turned by EXIF" in finding.fix

@@ -1,8 +1,9 @@
 """Check the cameras of photos by matching features in pairs of neighbouring photos."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ _INLIER_PIXELS = 1.5
 _RGB_TO_GREY = np.array([0.299, 0.587, 0.114]) / 255
 # Of consecutive frames, where not all are matched.
 _RUNS = 5
-_GAPS = (8, 4, 2, 1)
+_GAPS = (8, -8, 4, -4, 2, -2, 1, -1)
 # Of the cameras' extent: poses so close say nothing about their lines.
 _NO_BASELINE = 1e-4
 # Of the diagonal: no lens or rounding explains more.
@@ -43,8 +44,8 @@ _ADVICE = (
 
 Features = tuple[np.ndarray, np.ndarray]
 """Features of one photo: points (P, 2), x and y in pixels, and SIFT descriptors (P, 128)."""
-Pairs = Sequence[tuple[tuple[int, int], float]]
-"""Pairs of frames, and for each pair the median distance of matched points from the epipolar lines
+Pairs = Mapping[tuple[int, int], float]
+"""Pairs of frames, each with the median distance of matched points from the epipolar lines
 that the poses predict, as a fraction of the photo's diagonal."""
 
 
@@ -57,7 +58,7 @@ class Geometry:
     """
 
     unjudged: str = ""
-    pairs: Pairs = ()
+    pairs: Pairs = field(default_factory=dict)
     diagonal: float = 0.0
 
     @property
@@ -66,7 +67,7 @@ class Geometry:
 
         The median is over all pairs of photos; there must be some.
         """
-        return float(np.median([distance for _, distance in self.pairs]))
+        return float(np.median([*self.pairs.values()]))
 
     @property
     def pixels(self) -> float:
@@ -148,7 +149,7 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
     pairs = matcher.pairs()
     if not pairs:
         return Geometry(TOO_FEW)
-    (first, _), _ = pairs[0]
+    first, _ = next(iter(pairs))
     size = scene.decoded[first].size
     assert size is not None
     return Geometry(pairs=pairs, diagonal=float(np.hypot(*size)))
@@ -178,22 +179,18 @@ class _Matcher:
 
     def pairs(self) -> Pairs:
         """Match each frame with the next, and with the first of `partners` that has matches."""
-        found: dict[tuple[int, int], float | None] = {}
+        found = dict[tuple[int, int], float]()
+        distance = cache(self.distance)
         for start in range(len(self.frames)):
             # the next shares most and says least; a farther one has a baseline
             partners = list(self.partners(start))
-            for group in ([p for p in partners if p == start + 1], partners):
+            for group in ({start + 1}.intersection(partners), partners):
                 for place in group:
-                    both = (min(start, place), max(start, place))
-                    if both not in found:
-                        found[both] = self.distance(*both)
-                    if found[both] is not None:
+                    one, two = sorted((start, place))
+                    if (apart := distance(one, two)) is not None:
+                        found[self.frames[one], self.frames[two]] = apart
                         break
-        return [
-            ((self.frames[one], self.frames[two]), distance)
-            for (one, two), distance in found.items()
-            if distance is not None
-        ]
+        return found
 
     def distance(self, first: int, second: int) -> float | None:
         """Return the median distance of two photos' matched points from their epipolar lines.
@@ -222,14 +219,13 @@ class _Matcher:
 
     def partners(self, start: int) -> Iterator[int]:
         """Yield frames that may show what `start` shows: near in the list, then near in space."""
-        along = [place for gap in _GAPS for place in (start + gap, start - gap)]
-        along = [place for place in along if 0 <= place < len(self.frames)]
+        along = [start + gap for gap in _GAPS if 0 <= start + gap < len(self.frames)]
         forward = [place for place in along if place > start] or along
         distances = np.linalg.norm(self.centres - self.centres[start], axis=1)
         near = np.argsort(distances)[1:4].tolist()
         least = _NO_BASELINE * np.ptp(self.centres, axis=0).max()
         for place in dict.fromkeys([*forward, *near]):
-            if place != start and distances[place] > least:
+            if distances[place] > least:
                 yield place
 
 
@@ -245,9 +241,10 @@ def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Findi
     def severity(fraction: float) -> Severity:
         return "error" if fraction > _NONSENSE and not moves else "warning"
 
-    better = float(np.quantile([distance for _, distance in geometry.pairs], 0.25))
+    better = float(np.quantile([*geometry.pairs.values()], 0.25))
     off = frames_above(geometry.pairs, max(min(_FAR * better, _NONSENSE), TOLERANCE))
-    rest = [distance for frames, distance in geometry.pairs if off.keys().isdisjoint(frames)]
+    pairs = geometry.pairs.items()
+    rest = [distance for frames, distance in pairs if off.keys().isdisjoint(frames)]
     # a few wrong frames are in most of the pairs of a short scene: without them it must agree
     if off and rest and np.median(rest) <= TOLERANCE:
         reason = "the pose or the intrinsics do not fit those of the other frames"
@@ -277,7 +274,7 @@ def frames_above(values: Pairs, limit: float) -> dict[int, float]:
     found = dict[int, float]()
     while True:
         of_frame = defaultdict[int, list[float]](list)
-        for frames, value in values:
+        for frames, value in values.items():
             for frame in frames:
                 of_frame[frame].append(value)
         above = {f: v for f, v in of_frame.items() if len(v) > 1 and min(v) > limit}
@@ -285,4 +282,4 @@ def frames_above(values: Pairs, limit: float) -> dict[int, float]:
             return found
         worst = max(above, key=lambda frame: (len(above[frame]), sum(above[frame])))
         found[worst] = min(above[worst])
-        values = [item for item in values if worst not in item[0]]
+        values = {frames: value for frames, value in values.items() if worst not in frames}
