@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from warnings import catch_warnings
 
 import av
 import numpy as np
@@ -160,12 +161,14 @@ def shift(before: np.ndarray, after: np.ndarray) -> float:
 
     before, after: small grey pictures of size _THUMB.
     """
-    one, other = (np.fft.rfft2((x - x.mean()) * _WINDOW) for x in (before, after))
-    product = one * other.conj()
-    found = np.fft.irfft2(product / (np.abs(product) + 1e-9), s=_THUMB)
-    peak = np.array(np.unravel_index(found.argmax(), _THUMB))
-    sides = np.array(_THUMB)
-    return float(np.linalg.norm(((peak + sides // 2) % sides - sides // 2) / sides))
+    # imported for videos alone: photos need no motion
+    from skimage.registration import phase_cross_correlation
+
+    one, other = ((x - x.mean()) * _WINDOW for x in (before, after))
+    # it warns of pictures of one colour
+    with catch_warnings(action="ignore"):
+        moved, *_ = phase_cross_correlation(one, other)
+    return float(np.linalg.norm(moved / _THUMB))
 
 
 def _opened(video: Path) -> Any:
