@@ -244,7 +244,7 @@ def likelihood(errors: Array, matches: Matches) -> tuple[Array, Array]:
 
 
 def refined(poses: Poses, matches: Matches) -> Poses:
-    """Refine rotations, translations and focal lengths by Levenberg and Marquardt's method."""
+    """Refine `poses`, in place and returned, by Levenberg and Marquardt's method."""
     damping = np.full(len(poses.focals), 1e-3)
     for _ in range(STEPS):
         normal, slope = _normal(poses, matches)
@@ -255,12 +255,8 @@ def refined(poses: Poses, matches: Matches) -> Poses:
         gain = tried.scores - poses.scores
         better = gain > 0
         damping = np.where(better, damping / 5, damping * 8)
-        poses = Poses(
-            *(
-                np.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-                for old, new in zip(poses, tried, strict=True)
-            )
-        )
+        for old, new in zip(poses, tried, strict=True):
+            old[better] = new[better]
     return poses
 
 
