@@ -55,12 +55,11 @@ def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
 def walk(c2w: Tensor, frames: int) -> Tensor:
     """Return smoothed poses (frames, 4, 4) along the poses `c2w` (V, 4, 4) of photos, in order."""
     count = len(c2w)
-    # a mean of poses is none: `look_at` makes one of its axes
+    # a mean of poses is none: `mean_camera` makes one of its axes
     times = torch.linspace(0, count - 1, frames).to(c2w)
     gaps = times[:, None] - torch.arange(count).to(c2w)
     weights = torch.softmax(-0.5 * (gaps / min(_SMOOTH, count / 4)) ** 2, -1)
-    _, down, forward, centre = torch.einsum("tv,vij->tij", weights, c2w)[:, :3].unbind(-1)
-    return look_at(centre, forward, down)
+    return mean_camera(torch.einsum("tv,vij->tij", weights, c2w)[:, None])
 
 
 def read_path(file: Path, size: Size) -> tuple[Tensor, Tensor]:
