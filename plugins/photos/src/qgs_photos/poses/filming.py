@@ -153,8 +153,8 @@ def seen_depth(scene: FilmScene) -> float:
     # three views say enough, and each is rendered whole
     count = scene.cameras.shape[1]
     rendered = scene.renderer(scene.gaussians, scene.cameras[:, [0, count // 2, count - 1]])
-    depths = rendered.depth[rendered.alpha > 0.5]
-    return float(depths.median()) if depths.numel() else 1.0
+    # a median of nothing is NaN
+    return float(rendered.depth[rendered.alpha > 0.5].median().nan_to_num(1.0))
 
 
 def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmScene:
@@ -188,5 +188,4 @@ def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
     """Return the median depth of Gaussians in front of the camera `c2w` (4, 4); 1 if none is."""
     w2c = torch.linalg.inv(c2w)
     depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
-    ahead = depths[depths > 0]
-    return ahead.median() if ahead.numel() else torch.ones((), dtype=torch.float64)
+    return depths[depths > 0].median().nan_to_num(1.0)
