@@ -299,7 +299,5 @@ def _c2w(*cam_from_world: float) -> np.ndarray:
     """
     quaternion, translation = torch.tensor(cam_from_world, dtype=torch.float64).split([4, 3])
     rotation = quat_to_matrix(quaternion / quaternion.norm()).T
-    c2w = torch.eye(4, dtype=torch.float64)
-    c2w[:3, :3] = rotation
-    c2w[:3, 3] = -rotation @ translation
-    return c2w.numpy()
+    rows = torch.column_stack([rotation, -rotation @ translation])
+    return np.vstack([rows, [0, 0, 0, 1]])
