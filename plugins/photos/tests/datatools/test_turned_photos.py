@@ -80,7 +80,7 @@ def test_a_lens_turns_with_its_photo(written, shots):
 
 
 def test_packed_photos_are_upright(written, shots, tmp_path):
-    (frame, kept), *_ = encoded_frames(scene(written(8, "stored"), SIZE), Encoding())
+    frame, *_ = encoded_frames(scene(written(8, "stored"), SIZE), Encoding())
     assert_array_equal(frame.mask, 255 * (shots[0].image[..., 0] > 128))
     assert frame.listed.size == SIZE
     assert_allclose(frame.listed.c2w, shots[0].c2w, atol=1e-12)
@@ -88,7 +88,7 @@ def test_packed_photos_are_upright(written, shots, tmp_path):
     path.write_bytes(frame.data)
     image = Image.open(path)
     assert_array_equal(image, shots[0].image)
-    assert kept == (not image.getexif().get(0x0112))
+    assert frame.kept == (not image.getexif().get(0x0112))
 
 
 def test_of_squares_a_warning_says_whose_cameras_they_have(tmp_path, caplog):

@@ -52,16 +52,17 @@ class EncodedFrame(NamedTuple):
     """A photo as an encoded file.
 
     listed: its name, camera and size. data: bytes of the image file. mask: (H, W) uint8; None for a
-    photo without a mask.
+    photo without a mask. kept: whether the file is copied unchanged.
     """
 
     listed: PhotoFrame
     data: bytes
     mask: np.ndarray | None
+    kept: bool = False
 
 
-def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
-    """Yield each frame of a scene with its image file, and whether the file is copied unchanged.
+def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[EncodedFrame]:
+    """Yield each frame of a scene with its image file.
 
     Raises ValueError for an image that cannot be decoded, and the errors of reading the scene.
     """
@@ -69,7 +70,7 @@ def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFr
         if isinstance(scene, PhotoScene | ChunkScene) and not encoding.resized:
             yield _stored(scene, index, encoding)
         else:
-            yield _read(source_photo(scene, index, encoding.image)), False
+            yield _read(source_photo(scene, index, encoding.image))
 
 
 def _read(photo: Photo) -> EncodedFrame:
@@ -95,9 +96,7 @@ def _encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
     return EncodedFrame(listed, data, mask)
 
 
-def _stored(
-    scene: PhotoScene | ChunkScene, index: int, encoding: Encoding
-) -> tuple[EncodedFrame, bool]:
+def _stored(scene: PhotoScene | ChunkScene, index: int, encoding: Encoding) -> EncodedFrame:
     if isinstance(scene, PhotoScene):
         frame = _encoded_photo(scene, index)
     else:
@@ -110,13 +109,13 @@ def _stored(
             f"({error}): replace the file, or leave the scene out"
         ) from error
     if frame.listed.lens is not None:
-        return _straightened(frame, pixels, encoding), False
+        return _straightened(frame, pixels, encoding)
     with Image.open(io.BytesIO(frame.data)) as image:
         # every reader gets three channels out of it
         plain = image.mode == "RGB" and not image.has_transparency_data
         if plain and image.format in _KEPT_FORMATS:
-            return frame, True
-    return frame._replace(data=encoding.image(pixels)), False
+            return frame._replace(kept=True)
+    return frame._replace(data=encoding.image(pixels))
 
 
 def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -> EncodedFrame:

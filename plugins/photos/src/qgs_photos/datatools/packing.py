@@ -198,9 +198,9 @@ def pack(
 
 
 def _entry(name: str, scene: Any, encoding: Encoding, packed: Packed) -> ChunkEntry:
-    frames, kept = zip(*encoded_frames(scene, encoding), strict=True)
+    frames = [*encoded_frames(scene, encoding)]
     packed.frames += len(frames)
-    packed.kept += sum(kept)
+    packed.kept += sum(frame.kept for frame in frames)
     return chunk_entry(name, frames, scene.held_out, scene.times)
 
 
