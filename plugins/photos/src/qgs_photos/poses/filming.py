@@ -45,6 +45,7 @@ class FilmScene(NamedTuple):
     world: World
 
 
+@torch.no_grad()
 def film(scene: FilmScene, path: Cameras, file: Path, rate: int, console: Console) -> None:
     """Render a scene from the cameras (1, T) of a path of T frames, and write a video.
 
@@ -52,13 +53,9 @@ def film(scene: FilmScene, path: Cameras, file: Path, rate: int, console: Consol
     """
     path = path.to(scene.gaussians.means.device)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        cameras = bar.track(range(path.shape[1]), description="rendering")
-        write_film((_picture(scene, path[:, [place]]) for place in cameras), file, rate)
-
-
-@torch.no_grad()
-def _picture(scene: FilmScene, camera: Cameras) -> np.ndarray:
-    return rgb_picture(scene.renderer(scene.gaussians, camera).rgb[0, 0])
+        places = bar.track(range(path.shape[1]), description="rendering")
+        rendered = (scene.renderer(scene.gaussians, path[:, [place]]) for place in places)
+        write_film((rgb_picture(each.rgb[0, 0]) for each in rendered), file, rate)
 
 
 def write_film(frames: Iterator[np.ndarray], file: Path, rate: int) -> None:
@@ -69,7 +66,9 @@ def write_film(frames: Iterator[np.ndarray], file: Path, rate: int) -> None:
     refuse_suffix(file)
     with replacing(file) as temporary:
         if file.suffix.lower() == ".webp":
-            _write_webp(frames, temporary, rate)
+            first, *rest = map(Image.fromarray, frames)
+            options = {"duration": round(1000 / rate), "loop": 0, "quality": 85, "method": 2}
+            first.save(temporary, "WEBP", save_all=True, append_images=rest, **options)
         else:
             _write_mp4(frames, temporary, rate)
 
@@ -95,12 +94,6 @@ def _write_mp4(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-
-
-def _write_webp(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
-    first, *rest = map(Image.fromarray, frames)
-    options = {"duration": round(1000 / rate), "loop": 0, "quality": 85, "method": 2}
-    first.save(path, "WEBP", save_all=True, append_images=rest, **options)
 
 
 def cameras_of(
