@@ -146,7 +146,15 @@ def two_views(one: View, other: View, links: Links, doubt: float = EXIF) -> TwoV
 
     doubt: deviation of the logarithm of known focal lengths, whose proportion is kept.
     """
-    matches = _placed(one, other, links, doubt)
+    if one.focal and other.focal:
+        scale = one.focal / other.focal
+        prior = np.log(one.focal), doubt
+    else:
+        scale = one.side / other.side
+        prior = np.log(USUAL[0] * one.side), USUAL[1]
+    points = one.points[links.indices[:, 0]].astype(float)
+    others = other.points[links.indices[:, 1]].astype(float) * scale
+    matches = Matches(links.indices, links.right, points, others, scale, one.side, prior)
     found = [*_proposed(matches)]
     if not found:
         return None
@@ -177,18 +185,6 @@ def linked(one: Array, other: Array) -> Links:
     return Links(np.stack([rows, best], 1)[order], right, SIFT)
 
 
-def _placed(one: View, other: View, links: Links, doubt: float) -> Matches:
-    if one.focal and other.focal:
-        scale = one.focal / other.focal
-        prior = np.log(one.focal), doubt
-    else:
-        scale = one.side / other.side
-        prior = np.log(USUAL[0] * one.side), USUAL[1]
-    points = one.points[links.indices[:, 0]].astype(float)
-    others = other.points[links.indices[:, 1]].astype(float) * scale
-    return Matches(links.indices, links.right, points, others, scale, one.side, prior)
-
-
 def _proposed(matches: Matches) -> Iterator[tuple[Array, Array, float]]:
     """Yield the rotation, translation and focal length of each pose that RANSAC finds."""
     known = matches.prior[1] == EXIF
@@ -208,15 +204,6 @@ def _proposed(matches: Matches) -> Iterator[tuple[Array, Array, float]]:
 
 
 def _scored(rotations: Array, translations: Array, focals: Array, matches: Matches) -> Poses:
-    errors = _errors(rotations, translations, focals, matches)
-    gains, weights = likelihood(errors, matches)
-    mean, deviation = matches.prior
-    scores = gains.sum(-1) - 0.5 * ((np.log(focals) - mean) / deviation) ** 2
-    return Poses(rotations, translations, focals, scores, errors, weights)
-
-
-def _errors(rotations: Array, translations: Array, focals: Array, matches: Matches) -> Array:
-    """Return signed Sampson errors (K, N) in pixels."""
     one = _rays(matches.one, focals)
     other = _rays(matches.other, focals)
     # of the cross product with the translation, times the rotation
@@ -224,7 +211,12 @@ def _errors(rotations: Array, translations: Array, focals: Array, matches: Match
     lines = one @ essential.mT
     back = other @ essential
     slope = (lines[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1)
-    return (other * lines).sum(-1) / np.sqrt(slope + 1e-24) * focals[:, None]
+    # Sampson errors
+    errors = (other * lines).sum(-1) / np.sqrt(slope + 1e-24) * focals[:, None]
+    gains, weights = likelihood(errors, matches)
+    mean, deviation = matches.prior
+    scores = gains.sum(-1) - 0.5 * ((np.log(focals) - mean) / deviation) ** 2
+    return Poses(rotations, translations, focals, scores, errors, weights)
 
 
 def _rays(points: Array, focals: Array) -> Array:
