@@ -336,10 +336,20 @@ def _largest_model(job: Job, start: Any, estimated: bool) -> Any:
 
 
 def _written(model: Any, job: Job) -> Mapping[str, int]:
-    """Write `model` for photos of their original sizes; return the points of each photo."""
+    """Scale `model` from reduced photos to the originals, write it; return points of each photo."""
+    scales = dict[int, Any]()
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        height, width = job.sizes[image.name]
+        # photos share cameras: each is scaled once
+        if image.camera_id not in scales:
+            scales[image.camera_id] = (width / camera.width, height / camera.height)
+            camera.rescale(width, height)
+        for point in image.points2D:
+            point.xy = point.xy * scales[image.camera_id]
     best = Path(job.models, "best")
     best.mkdir()
-    _scaled(model, job.sizes).write(best)
+    model.write(best)
     return {image.name: image.num_points3D for image in model.images.values()}
 
 
@@ -361,24 +371,6 @@ def _centred(model: Any, threads: int) -> Any:
     COLMAP.bundle_adjustment(moved, options)
     before = model.compute_mean_reprojection_error()
     return moved if moved.compute_mean_reprojection_error() < BETTER * before else model
-
-
-def _scaled(model: Any, sizes: Mapping[str, tuple[int, int]]) -> Any:
-    """Scale the cameras and points of `model` from reduced photos to the sizes of the originals.
-
-    sizes: (H, W) of the originals by name.
-    """
-    scales = dict[int, Any]()
-    for image in model.images.values():
-        camera = model.cameras[image.camera_id]
-        height, width = sizes[image.name]
-        # photos share cameras: each is scaled once
-        if image.camera_id not in scales:
-            scales[image.camera_id] = (width / camera.width, height / camera.height)
-            camera.rescale(width, height)
-        for point in image.points2D:
-            point.xy = point.xy * scales[image.camera_id]
-    return model
 
 
 if __name__ == "__main__":
