@@ -137,39 +137,31 @@ def _read_mask(scene: Scene, frame: int) -> np.ndarray | None:
     return None if masks is None else rgb_picture(masks[0])[..., 0]
 
 
-def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
+def photo_folders(
+    root: UPath, wanted: str, images: str | None, name: str = ""
+) -> Iterator[Candidate | Finding]:
     """Yield the scenes in `root`: `root` itself, its subfolders, or those in train/ and test/.
 
-    wanted: name of a format, or auto. images: folder of photos inside each scene; None takes the
-    format's default. A subfolder that lists no cameras, beside others that do, yields a warning.
+    wanted: name of a format; scenes in other formats are left out. "auto" reads each scene in the
+    first format that it has. images: folder of photos inside each scene; None takes the format's
+    default. name: name of the scene if `root` is one; "" takes that of the folder. A subfolder that
+    lists no cameras, beside others that do, yields a warning.
     """
-    if formats_of(root):
-        yield from _listed(root, folder_name(root), wanted, images)
+    if held := formats_of(root):
+        kind = held[0] if wanted == "auto" else wanted
+        if kind in held:
+            photos = partial(_of_folder, root, kind, images)
+            yield Candidate(name or folder_name(root), kind, photos)
         return
     inside = sorted((item for item in root.iterdir() if item.is_dir()), key=str)
     scenes = [item for item in inside if formats_of(item)]
-    for folder in scenes:
-        yield from _listed(folder, folder.name, wanted, images)
     for folder in inside:
-        if folder in scenes or folder.name.startswith("."):
-            continue
-        if scenes:
+        if folder in scenes or (not scenes and folder.name in ("train", "test")):
+            yield from photo_folders(folder, wanted, images, folder.name)
+        elif scenes and not folder.name.startswith("."):
             reason = "the folder lists no cameras, and is not checked"
             fix = f"run `qgs data check {folder}` if it is another data set, else move it away"
             yield Finding(folder.name, reason, fix, severity="warning")
-        elif folder.name in ("train", "test"):
-            yield from photo_folders(folder, wanted, images)
-
-
-def _listed(folder: UPath, name: str, wanted: str, images: str | None) -> Iterator[Candidate]:
-    """Yield the scene of a folder in the format `wanted`, or nothing if it has another format.
-
-    With "auto", the first format that the folder has is read.
-    """
-    held = formats_of(folder)
-    kind = held[0] if wanted == "auto" else wanted
-    if kind in held:
-        yield Candidate(name, kind, partial(_of_folder, folder, kind, images))
 
 
 def dl3dv_scenes(path: UPath, images: str | None) -> Iterator[Candidate]:
