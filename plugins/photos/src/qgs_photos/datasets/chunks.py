@@ -18,7 +18,7 @@ from qgs.data.images import CropResize, decode_rgb, to_tensor
 from qgs.data.photos.reader import Size, size_problems
 from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
 from qgs.data.view_samplers import held_out_frames
-from qgs.paths import opened_path
+from qgs.paths import listing, opened_path
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 from qgs_photos.datasets.chunk_files import (
@@ -194,8 +194,8 @@ class ChunksSource(LazySource):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Return whether `path` holds chunks, or its train/ or test/ holds chunks or index.json."""
-        inside = [path, *path.iterdir()] if path.is_dir() else []
+        """Return whether `path` is or holds chunks, or its train/ or test/ has any or an index."""
+        inside = [path, *listing(path)]
         splits = [item for item in inside if item.name in ("train", "test")]
         return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
 
@@ -234,7 +234,8 @@ def first_scenes(
 def _folders(path: UPath) -> dict[Split, UPath]:
     if not path.is_dir():
         raise FileNotFoundError(
-            f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
+            f"the chunks' folder {path} does not exist or is no folder: give the folder that holds "
+            "train/ and test/"
         )
     found: dict[Split, UPath] = {s: path / s for s in get_args(Split) if has_chunks(path / s)}
     if found:

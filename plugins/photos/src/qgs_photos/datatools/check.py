@@ -128,8 +128,7 @@ def _items(path: UPath, options: Options) -> Iterator[Candidate | Finding]:
     """Yield the scenes to check, and findings about files of the data set."""
     kind = options.format
     if kind == "auto":
-        is_chunk = path.is_file() and path.suffix == ".torch"
-        kind = "chunks" if is_chunk else recognised(path, sources())
+        kind = recognised(path, sources())
         for plugin in OF_FILES:
             kind = kind.removeprefix(f"{plugin}/")
     if kind == "chunks":
