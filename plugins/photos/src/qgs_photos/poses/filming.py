@@ -172,13 +172,10 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
     gaussians = load_ply(file)
     cameras = photo_scene(photos, None, name).cameras.to(torch.float64)
     # near of renderers is made for worlds in which what is seen is about 1 away
-    world = (cameras.c2w[0], 1 / _median_depth(gaussians, cameras.c2w[0]))
+    w2c = torch.linalg.inv(cameras.c2w[0])
+    depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
+    # a median of nothing is NaN
+    depth = depths[depths > 0].median().nan_to_num(1.0)
+    world = (cameras.c2w[0], 1 / depth)
     inside = in_world(world, cameras)[None]
     return FilmScene(in_own_world(world, gaussians), inside, VIEWER, world)
-
-
-def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
-    """Return the median depth of Gaussians in front of the camera `c2w` (4, 4); 1 if none is."""
-    w2c = torch.linalg.inv(c2w)
-    depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
-    return depths[depths > 0].median().nan_to_num(1.0)
