@@ -265,8 +265,11 @@ class Overlapping(ViewSampler):
         usable = _enough(scene, views.inputs if scene.held_out else views.inputs + 1)
         frusta = self._frusta(scene)
         targets = sorted(scene.held_out) or evenly(usable, _JUDGED)
-        chosen = [frusta.window(target, usable, views.inputs)[1] for target in targets]
-        return [(tuple(sorted(i)), (target,)) for i, target in zip(chosen, targets, strict=True)]
+        windows = list[Window]()
+        for target in targets:
+            _, inputs = frusta.window(target, usable, views.inputs)
+            windows.append((tuple(sorted(inputs)), (target,)))
+        return windows
 
     def _frusta(self, scene: Scene, factor: float = 1.0) -> Frusta:
         """Return the view frusta of a scene's cameras, from which inputs are chosen.
