@@ -56,11 +56,12 @@ def photo_files(folder: Path) -> list[Path]:
     Photos are sorted by the numbers in their names, so that 2 precedes 10. Raises PosesError for
     fewer than LEAST photos.
     """
-    found = next((f for f in (folder, folder / "images") if image_files(UPath(f))), folder)
-    inside = sorted(item for item in found.iterdir() if item.is_dir() and item.name[0] != ".")
-    own = image_files(UPath(found)) and [found]
-    listings = (image_files(UPath(place)) for place in own or inside)
-    files = [Path(str(file)) for file in chain.from_iterable(listings) if file.is_file()]
+    root = UPath(folder)
+    own = image_files(root) or image_files(root / "images")
+    inside = sorted(item for item in root.iterdir() if item.is_dir() and item.name[0] != ".")
+    photos = own or chain.from_iterable(map(image_files, inside))
+    files = [Path(str(file)) for file in photos if file.is_file()]
+    found = Path(str(own[0].parent)) if own else folder
     if len(files) >= LEAST:
         return sorted(files, key=lambda file: _by_number(str(file)))
     text = f"{found} holds {counted(len(files), 'photo')}, but poses need at least {LEAST}"
