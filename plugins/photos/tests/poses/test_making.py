@@ -37,10 +37,6 @@ def assert_close(folder, shots):
     assert np.median(np.abs(found - true).max((1, 2))) < 0.0175
 
 
-def record_in(folder):
-    return read_json(folder / "poses.json")
-
-
 def test_photos_get_the_poses_they_were_taken_with(made, shots):
     folder, poses = made
     names = ["0 Fo’to #{} %20 'ä'.JPG", "1.jpg", "2.png", "3.tif.png", "4.avif.png", "5.png"]
@@ -53,7 +49,7 @@ def test_photos_get_the_poses_they_were_taken_with(made, shots):
     assert counts == f"{PHOTOS} of {PHOTOS + 1} photos have poses, in an arbitrary unit"
     assert "a.DNG" in remark
     assert "other.png; to get more" in advice
-    assert "3.tif" in record_in(folder)["source"]
+    assert "3.tif" in read_json(folder / "poses.json")["source"]
     assert names_in(folder) == {"images", "poses.json", "sparse"}
     # points of the model lie on the photos as they are kept, not on the copies that COLMAP saw
     size = shots[0].image.shape[:2]
@@ -66,7 +62,7 @@ def test_photos_get_the_poses_they_were_taken_with(made, shots):
 def test_a_video_gets_poses_of_its_frames_where_it_is_read(shots, images, tmp_path):
     views = qgs.read_photos(write_video(tmp_path / "phone.mp4", images), size=(36, 54))
     assert views.images.shape == (1, PHOTOS, 3, 36, 54)
-    assert record_in(tmp_path / "phone_poses")["made_by"] == "qgs poses"
+    assert read_json(tmp_path / "phone_poses/poses.json")["made_by"] == "qgs poses"
     assert_close(tmp_path / "phone_poses", shots)
 
 
