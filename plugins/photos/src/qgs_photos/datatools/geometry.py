@@ -1,7 +1,7 @@
 """Check the cameras of photos by matching features in pairs of neighbouring photos."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -44,7 +44,7 @@ _ADVICE = (
 
 Features = tuple[np.ndarray, np.ndarray]
 """Features of one photo: points (P, 2), x and y in pixels, and SIFT descriptors (P, 128)."""
-Pairs = Mapping[tuple[int, int], float]
+Pairs = dict[tuple[int, int], float]
 """Pairs of frames, each with the median distance of matched points from the epipolar lines
 that the poses predict, as a fraction of the photo's diagonal."""
 
@@ -58,7 +58,7 @@ class Geometry:
     """
 
     unjudged: str = ""
-    pairs: Pairs = field(default_factory=dict)
+    pairs: Pairs = field(default_factory=Pairs)
     diagonal: float = 0.0
 
     @property
@@ -179,7 +179,7 @@ class _Matcher:
 
     def pairs(self) -> Pairs:
         """Match each frame with the next, and with the first of `partners` that has matches."""
-        found = dict[tuple[int, int], float]()
+        found = Pairs()
         distance = cache(self.distance)
         for start in range(len(self.frames)):
             # the next shares most and says least; a farther one has a baseline

@@ -13,6 +13,7 @@ from qgs_photos.poses.two_views import COLMAP, USUAL, Links, TwoViews, View, lin
 
 # By the numbers of two photos.
 Linked = Mapping[tuple[int, int], Links]
+Pairs = dict[tuple[int, int], TwoViews]
 
 SEARCHED = 8
 """Largest number of photos whose pairs are searched by this module."""
@@ -78,12 +79,12 @@ def beginning(database: Any, links: Linked) -> tuple[Any, list[str], bool]:
     return model(database, (one, other), pair), remarks, estimated
 
 
-def pairs(seen: Mapping[int, View], links: Linked) -> Mapping[tuple[int, int], TwoViews]:
+def pairs(seen: Mapping[int, View], links: Linked) -> Pairs:
     """Return pairs of photos far enough apart. Raises RefusedError if there are none.
 
     seen: features of all photos, by number.
     """
-    sure = dict[tuple[int, int], TwoViews]()
+    sure = Pairs()
     for (one, other), matches in links.items():
         pair = two_views(seen[one], seen[other], matches)
         if pair and pair.score >= matches.limits.score:
