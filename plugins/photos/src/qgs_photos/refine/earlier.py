@@ -4,7 +4,6 @@ from dataclasses import replace
 
 from pydantic import BaseModel, PositiveInt, ValidationError
 
-from qgs.containers import map_tensors
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.types import Size
 from qgs_photos.refine.initial import Initialisation, chosen_initialisation, photos_world
@@ -54,7 +53,7 @@ def chosen_start(photos: ScenePhotos, options: Options) -> tuple[Initialisation,
     world = photos_world(photos)
     every = in_own_world(world, load_ply(file)).to(options.device)
     # surroundings come first
-    gaussians = map_tensors(lambda part: part[:, -record.optimised :], every)
+    gaussians = every[:, -record.optimised :]
     count = options.gaussians or gaussians.count
     size = options.size or record.size
     start = Initialisation(None, world, gaussians)
