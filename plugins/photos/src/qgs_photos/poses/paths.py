@@ -19,8 +19,6 @@ from qgs.reconstruction.saving import SWAY, orbit
 from qgs.types import Cameras, Size
 
 KINDS = ("orbit", "spiral", "walk")
-# Signs of a pose's columns.
-_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
 # Photos over which a walk is smoothed.
 _SMOOTH = 1.5
 # Of a spiral.
@@ -90,7 +88,8 @@ def read_path(file: Path, size: Size) -> tuple[Tensor, Tensor]:
 def _keyframe(entry: Mapping[str, Any], size: Size) -> tuple[np.ndarray, float]:
     """Return the OpenCV camera-to-world pose (4, 4) and fy in pixels of nerfstudio's keyframe."""
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
-    return pose * _OPENGL, focal_length(float(entry.get("fov") or 50.0), size[0])
+    # OpenGL's axes y and z point the other way
+    return pose * [1, -1, -1, 1], focal_length(float(entry.get("fov") or 50.0), size[0])
 
 
 def _photo(frame: PhotoFrame, size: Size) -> tuple[np.ndarray, float]:
