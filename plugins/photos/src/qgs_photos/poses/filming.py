@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 from rich.console import Console
 from rich.progress import Progress
-from torch import Tensor
 
 from qgs.contracts import Renderer
+from qgs.data.images import CropResize
 from qgs.data.samples import in_world
 from qgs.drawing.images import rgb_picture
 from qgs.files import replacing
@@ -111,11 +111,16 @@ def cameras_of(
         photos = scene.cameras
         c2w = path_of(path, photos, seen_depth(scene), max(frames, 2))
         # all of the shorter side is seen
-        factor = max(size[0] / photos.size[0], size[1] / photos.size[1])
+        factor = CropResize(photos.size, size).scale
         focal = factor * photos.intrinsics[0, :1, :2].expand(len(c2w), 2)
-        return Cameras(c2w, _centred(focal, size, fov), size)[None]
-    c2w, focal = read_path(Path(path), size)
-    return in_world(scene.world, Cameras(c2w, _centred(focal, size, fov), size))[None]
+    else:
+        c2w, focal = read_path(Path(path), size)
+    height, width = size
+    if fov is not None:
+        focal = torch.full_like(focal, focal_length(fov, height))
+    centres = focal.new_tensor([width / 2, height / 2]).expand_as(focal)
+    cameras = Cameras(c2w, torch.cat([focal, centres], -1), size)
+    return (cameras if path in KINDS else in_world(scene.world, cameras))[None]
 
 
 def _film_size(photos: Size) -> Size:
@@ -123,18 +128,6 @@ def _film_size(photos: Size) -> Size:
     factor = max(_HEIGHT / min(photos), 1.0)
     height, width = (round(side * factor / 2) * 2 for side in photos)
     return height, width
-
-
-def _centred(focal: Tensor, size: Size, fov: float | None) -> Tensor:
-    """Return intrinsics (T, 4) for pictures of `size` (H, W), with centred principal points.
-
-    focal: fx and fy (T, 2) in pixels. fov: vertical angle of view in degrees, which replaces them;
-    None keeps them.
-    """
-    height, width = size
-    if fov is not None:
-        focal = torch.full_like(focal, focal_length(fov, height))
-    return torch.cat([focal, focal.new_tensor([width / 2, height / 2]).expand_as(focal)], -1)
 
 
 @torch.no_grad()
