@@ -68,16 +68,16 @@ class FreeGaussians:
 
     def gaussians(self) -> Gaussians:
         """Return the Gaussians (1, G); gradients flow to `values`."""
-        values = {name: value[None] for name, value in self.values.items()}
+        values = self.values
         return Gaussians(
             means=values["means"],
             scales=values["log_scales"].exp(),
             quats=F.normalize(values["quats"], dim=-1),
             opacities=values["opacity_logits"].sigmoid(),
             colors=values["colors"] if "colors" in values else values["color_logits"].sigmoid(),
-            sh=values["sh"][:, :, : self.active] if self.active else None,
+            sh=values["sh"][:, : self.active] if self.active else None,
             features=values.get("features"),
-        )
+        )[None]
 
     @torch.no_grad()
     def grow(self, count: int, generator: torch.Generator) -> None:
