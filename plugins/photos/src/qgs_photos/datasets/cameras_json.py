@@ -28,7 +28,6 @@ from qgs.data.photos.reader import (
 )
 from qgs.paths import open_file, read_json
 from qgs.wording import warn_once
-from qgs_photos.datasets.intrinsics import as_intrinsics
 from qgs_photos.image_files import image_files
 
 _LISTS = ("frames", "cameras", "views")
@@ -243,7 +242,7 @@ class _Camera:
             self.problems += wrong
         pose = self._pose()
         # may read the size of the file
-        intrinsics = as_intrinsics(self._intrinsics())
+        fx, fy, cx, cy = self._intrinsics().tolist()
         folder = self.file.parent
         name = "" if self.path == folder else "/".join(inside(folder, self.path))
         if not name:
@@ -252,7 +251,7 @@ class _Camera:
             name=name,
             path=self.path,
             c2w=pose,
-            intrinsics=intrinsics,
+            intrinsics=(fx, fy, cx, cy),
             size=self.size,
             problems=(*self.problems,),
         )

@@ -37,7 +37,6 @@ from qgs_photos.datasets.chunk_files import (
     unit_problems,
 )
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
-from qgs_photos.datasets.intrinsics import as_intrinsics
 from qgs_photos.datatools.findings import Finding, Severity
 from qgs_photos.datatools.photos import Candidate, Photo, Photos
 
@@ -116,12 +115,13 @@ def source_photo(
     encode: function that returns the file's bytes from pixels (H, W, 3), uint8.
     """
     camera = scene.cameras[frame]
+    fx, fy, cx, cy = camera.intrinsics.tolist()
     name = scene.frame_name(frame)
     listed = PhotoFrame(
         name=name,
         path=UPath(name),
         c2w=camera.c2w.double().numpy(),
-        intrinsics=as_intrinsics(camera.intrinsics),
+        intrinsics=(fx, fy, cx, cy),
         size=camera.size,
         time=None if scene.times is None else float(scene.times[frame]),
     )

@@ -17,7 +17,6 @@ from qgs.data.photos.source import PhotoScene, turned, whole_mask
 from qgs.drawing.images import png_bytes
 from qgs.paths import read_file
 from qgs_photos.datasets.chunks import ChunkScene
-from qgs_photos.datasets.intrinsics import as_intrinsics
 from qgs_photos.datatools.candidates import chunk_photo, source_photo
 from qgs_photos.datatools.photos import Photo
 
@@ -129,9 +128,10 @@ def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -
     def straight(image: np.ndarray) -> np.ndarray:
         return crop.image(Image.fromarray(lens.undistorted(image, own.intrinsics)))
 
-    cropped = crop.intrinsics(torch.tensor(own.intrinsics, dtype=torch.float64))
+    given = torch.tensor(own.intrinsics, dtype=torch.float64)
+    fx, fy, cx, cy = crop.intrinsics(given).tolist()
     return EncodedFrame(
-        replace(own, intrinsics=as_intrinsics(cropped), lens=None),
+        replace(own, intrinsics=(fx, fy, cx, cy), lens=None),
         encoding.image(straight(pixels)),
         None if frame.mask is None else straight(frame.mask),
     )
