@@ -66,7 +66,7 @@ def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
     height, width, focal = lens.tolist()
     c2w = np.eye(4)
     # OpenCV's axes
-    c2w[:3] = np.stack([right, down, -back, centre], 1)
+    c2w[:3] = np.c_[right, down, -back, centre]
     size, problems = listed_size(height, width)
     return PhotoFrame(
         name=f"{path.parent.name}/{path.name}",

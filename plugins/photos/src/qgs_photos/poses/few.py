@@ -161,7 +161,7 @@ def model(database: Any, images: tuple[int, int], pair: TwoViews) -> Any:
     """Return a model of two photos. The median depth of its points in the first photo is 1."""
     built = COLMAP.Reconstruction()
     scale = 1 / pair.depth
-    second = np.concatenate([pair.rotation, scale * pair.translation[:, None]], 1)
+    second = np.c_[pair.rotation, scale * pair.translation]
     for image, focal, pose in zip(images, pair.focals, (np.eye(3, 4), second), strict=True):
         photo = database.read_image(image)
         camera = database.read_camera(photo.camera_id)

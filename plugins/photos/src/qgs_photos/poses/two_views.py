@@ -182,7 +182,7 @@ def linked(one: Array, other: Array) -> Links:
     order = ratios.argsort(kind="stable")[:MOST_MATCHES]
     order = order[ratios[order] < WORST_RATIO]
     right = 0.01 + 0.9 / (1 + np.exp((ratios[order] - 0.82) / 0.04))
-    return Links(np.stack([rows, best], 1)[order], right, SIFT)
+    return Links(np.c_[rows, best][order], right, SIFT)
 
 
 def _proposed(matches: Matches) -> Iterator[tuple[Array, Array, float]]:
@@ -222,7 +222,7 @@ def _scored(rotations: Array, translations: Array, focals: Array, matches: Match
 def _rays(points: Array, focals: Array) -> Array:
     """Return directions (K, N, 3) of points (N, 2), with z = 1."""
     scaled = points / focals[:, None, None]
-    return np.concatenate([scaled, np.ones_like(scaled[..., :1])], -1)
+    return np.c_[scaled, np.ones_like(scaled[..., :1])]
 
 
 def likelihood(errors: Array, matches: Matches) -> tuple[Array, Array]:
