@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import track
 
 from qgs.contracts import Renderer
 from qgs.data.images import CropResize
@@ -52,10 +52,11 @@ def film(scene: FilmScene, path: Cameras, file: Path, rate: int, console: Consol
     rate: frames per second.
     """
     path = path.to(scene.gaussians.means.device)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        places = bar.track(range(path.shape[1]), description="rendering")
-        rendered = (scene.renderer(scene.gaussians, path[:, [place]]) for place in places)
-        write_film((rgb_picture(each.rgb[0, 0]) for each in rendered), file, rate)
+    frames = range(path.shape[1])
+    hidden = not console.is_terminal
+    places = track(frames, "rendering", console=console, transient=True, disable=hidden)
+    rendered = (scene.renderer(scene.gaussians, path[:, [place]]) for place in places)
+    write_film((rgb_picture(each.rgb[0, 0]) for each in rendered), file, rate)
 
 
 def write_film(frames: Iterator[np.ndarray], file: Path, rate: int) -> None:
