@@ -70,8 +70,8 @@ def test_a_training_widens_the_gap_and_resumes_where_it_was():
     recipe = small("view_sampler.warm_up_steps=5", "view_sampler.initial_max_gap=2")
 
     def gaps(start, count):
-        found = [x for batch in in_steps(recipe, start, count) for x in batch.input_frames]
-        return [frames[-1] - frames[0] for frames in found]
+        found = [w for batch in in_steps(recipe, start, count) for w in batch.windows]
+        return [inputs[-1] - inputs[0] for inputs, _ in found]
 
     whole = gaps(0, 14)
     assert gaps(9, 5) == whole[18:]
