@@ -139,16 +139,14 @@ def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, l
     remarks_on_all(walk, tmp_path / "made")
 
 
-class Sift:
-    """A network that finds the features of SIFT, as ALIKED does."""
-
-    def __call__(self, pixels):
-        extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
-        grey = (255 * pixels[0].mean(0)).byte().numpy()
-        points, found = extractor.extract_from_uint8_array(grey)
-        places = torch.tensor([(point.x - 0.5, point.y - 0.5) for point in points])
-        data = F.normalize(torch.from_numpy(found.data.astype(np.float32)), dim=-1)
-        return [SimpleNamespace(keypoints=places.reshape(-1, 2), descriptors=data.reshape(-1, 128))]
+def detector(pixels):
+    """The features of SIFT, as ALIKED finds its own."""
+    extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
+    grey = (255 * pixels[0].mean(0)).byte().numpy()
+    points, found = extractor.extract_from_uint8_array(grey)
+    places = torch.tensor([(point.x - 0.5, point.y - 0.5) for point in points])
+    data = F.normalize(torch.from_numpy(found.data.astype(np.float32)), dim=-1)
+    return [SimpleNamespace(keypoints=places.reshape(-1, 2), descriptors=data.reshape(-1, 128))]
 
 
 def matcher(given):
@@ -167,7 +165,7 @@ def matcher(given):
 def learning(monkeypatch, tmp_path, alone):
     monkeypatch.setattr(worker, "weights", lambda: tmp_path)
     monkeypatch.setattr(learned, "SIDE", 200)
-    monkeypatch.setattr(learned, "ALIKED", lambda *_, **__: Sift())
+    monkeypatch.setattr(learned, "ALIKED", lambda *_, **__: detector)
     monkeypatch.setattr(learned, "LightGlue", lambda *_, **__: matcher)
     monkeypatch.setattr(learned, "_load", lambda *_: None)
 
