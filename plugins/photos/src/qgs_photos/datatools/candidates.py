@@ -44,6 +44,9 @@ OF_FILES = ("qgs", "datasets")
 """Plugins whose data sets are checked file by file. For a data set of another plugin, the scenes
 that its data source loads are checked."""
 
+Items = Iterator[Candidate | Finding]
+"""Scenes to check, and findings about files of the data set."""
+
 # Of the images that a source is asked for.
 _SIZE = (256, 256)
 
@@ -137,9 +140,7 @@ def _read_mask(scene: Scene, frame: int) -> np.ndarray | None:
     return None if masks is None else rgb_picture(masks[0])[..., 0]
 
 
-def photo_folders(
-    root: UPath, wanted: str, images: str | None, name: str = ""
-) -> Iterator[Candidate | Finding]:
+def photo_folders(root: UPath, wanted: str, images: str | None, name: str = "") -> Items:
     """Yield the scenes in `root`: `root` itself, its subfolders, or those in train/ and test/.
 
     wanted: name of a format; scenes in other formats are left out. "auto" reads each scene in the
@@ -200,7 +201,7 @@ def _depth(frame: PhotoFrame) -> np.ndarray | None:
 _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
 
 
-def chunk_scenes(path: UPath) -> Iterator[Candidate | Finding]:
+def chunk_scenes(path: UPath) -> Items:
     """Yield the scenes of a data set of chunks, and faults of its files.
 
     path: folder with train/ and test/, folder of chunks, or one chunk.
@@ -214,9 +215,7 @@ def chunk_scenes(path: UPath) -> Iterator[Candidate | Finding]:
         yield Finding(key, reason, "remove it from train or from test", severity="warning")
 
 
-def _folder_scenes(
-    split: str, folder: UPath, found: dict[str, str]
-) -> Iterator[Candidate | Finding]:
+def _folder_scenes(split: str, folder: UPath, found: dict[str, str]) -> Items:
     """Yield the scenes and faults of one folder of chunks, or of one chunk.
 
     found: mapping to which the file name of each scene's chunk is added, by the scene's name.
@@ -250,7 +249,7 @@ def _folder_scenes(
         yield Finding(label, reason, "add the scenes to the index", severity=severity)
 
 
-def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Iterator[Candidate | Finding]:
+def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Items:
     label = join(split, file.name)
     try:
         entries = load_chunk(file)

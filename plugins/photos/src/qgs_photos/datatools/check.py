@@ -15,6 +15,7 @@ from qgs.geometry.poses import look_at_depth
 from qgs.wording import listed
 from qgs_photos.datatools.candidates import (
     OF_FILES,
+    Items,
     chunk_scenes,
     dl3dv_scenes,
     photo_folders,
@@ -124,7 +125,7 @@ def _refuse_unknown(format: str) -> None:
         raise ValueError(f"there is no format {format!r}: use one of {usable}")
 
 
-def _items(path: UPath, options: Options) -> Iterator[Candidate | Finding]:
+def _items(path: UPath, options: Options) -> Items:
     """Yield the scenes to check, and findings about files of the data set."""
     kind = options.format
     if kind == "auto":
