@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 from contract_mutants import sound
-from contract_mutants.mutant import MUTANTS, Mutant
+from contract_mutants.mutant import MUTANTS, SOUND, Mutant
 from qgs_dev import CHECKS, Case, CaseRun, run_check
 
-from qgs.contracts import Component, ModelDims
+from qgs.contracts import ModelDims
 from qgs.renderers import TorchRenderer
 from qgs.tokengs import ContentCrossAttention
 
@@ -24,25 +24,17 @@ def test_every_check_has_a_mutant() -> None:
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=str)
 def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None:
-    case = Case(mutant.component.Config(**mutant.options), **mutant.case)
     meant = CHECKS[mutant.check]
-    result = run_check(meant, case)
+    result = run_check(meant, mutant.case)
     assert result.verdict == "failed", result
     assert mutant.seen in result.message
-    assert mutant.component.name in result.message
+    assert mutant.case.component.name in result.message
     assert meant.contract in result.message
 
 
-SOUND = [
-    component
-    for component in vars(sound).values()
-    if getattr(component, "__module__", "") == sound.__name__ and "name" in vars(component)
-]
-
-
-@pytest.mark.parametrize("component", SOUND)
-def test_a_sound_component_passes(component: type[Component]) -> None:
-    CaseRun(Case(component.Config())).check(["core"])
+@pytest.mark.parametrize("case", SOUND)
+def test_a_sound_component_passes(case: Case) -> None:
+    CaseRun(case).check(["core"])
 
 
 GRID = ("tokens_are_those_of_the_grid",)

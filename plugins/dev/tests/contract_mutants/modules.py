@@ -60,7 +60,7 @@ class ViewsAField(PlacesByALayer):
         return self.attention(self.norm(state.features + place), state.mask)
 
 
-@mutant("construction", "is read back as", options={"z_offset": 0.3})
+@mutant("construction", "is read back as", z_offset=0.3)
 class RoundsAnOption(FreeCenters):
     class Config(FreeCenters.Config):
         @field_serializer("z_offset")
@@ -145,7 +145,7 @@ class KeepsARandomBufferUnsaved(AddsToItsOutput):
         self.register_buffer("summand", torch.randn(dims.width), persistent=False)
 
 
-@mutant("state_dict_keys", "'norm.bias'", case={"state_dict": PINNED})
+@mutant("state_dict_keys", "'norm.bias'", state_dict=PINNED)
 class RenamesItsNorm(ExtendedMlp):
     def add(self, dims):
         self.layer_norm = self.norm

@@ -42,7 +42,7 @@ class GivesLongQuaternions(GaussianHead):
         return replace(good, quats=2 * good.quats)
 
 
-@mutant("queries_are_shared_by_scenes", "scene 1 of 3", options={"count": 6})
+@mutant("queries_are_shared_by_scenes", "scene 1 of 3", count=6)
 class NumbersScenes(LatentQueries):
     def start(self, batch_size):
         state = super().start(batch_size)
@@ -50,20 +50,20 @@ class NumbersScenes(LatentQueries):
         return state.replace(features=state.features + scene)
 
 
-@mutant("queries_resize", "cannot be loaded", options={"count": 6})
+@mutant("queries_resize", "cannot be loaded", count=6)
 class NeverResizes(LatentQueries):
     def resized(self, learned, generator):
         return dict(learned)
 
 
-@mutant("supervision_weights", "weights sum to 2", options={"layers": (1, 2)})
+@mutant("supervision_weights", "weights sum to 2", layers=(1, 2))
 class WeighsTwice(LayerSupervision):
     def weights(self, rounds=()):
         factor = 1 if rounds else 2
         return {layer: factor * weight for layer, weight in super().weights(rounds).items()}
 
 
-@mutant("supervision_weights", "and rounds that end at [3, 4]", options={"layers": (1, 2)})
+@mutant("supervision_weights", "and rounds that end at [3, 4]", layers=(1, 2))
 class IgnoresRounds(LayerSupervision):
     def weights(self, rounds=()):
         return super().weights()
@@ -196,13 +196,13 @@ class IgnoresImages(ChangedEncoder):
 LATENTS = {"depth": 1, "blocks": (1,), "latents": 5, "latent_depth": 1}
 
 
-@mutant("project_makes_the_memory_again", "`project` of the memory's own features", options=LATENTS)
+@mutant("project_makes_the_memory_again", "`project` of the memory's own features", **LATENTS)
 class ProjectsDoubles(LatentBottleneck):
     def project(self, features, memory):
         return super().project(2 * features, memory)
 
 
-@mutant("project_makes_the_memory_again", "does not declare `tunable`", options=LATENTS)
+@mutant("project_makes_the_memory_again", "does not declare `tunable`", **LATENTS)
 class ProjectsInSecret(LatentBottleneck):
     tunable = False
 

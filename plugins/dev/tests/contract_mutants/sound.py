@@ -5,7 +5,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from contract_mutants.mutant import named
+from contract_mutants.mutant import sound
 from contract_mutants.renderers import ChangedResult, RefusesWhatItDeclares
 from contract_mutants.spatial import BiasedAttention, Extended, PlacesByALayer
 from einops import rearrange
@@ -19,13 +19,13 @@ from qgs.tokengs.encoder import keys_and_values
 from qgs.types import ImageMemory, Views
 
 
-@named
+@sound
 class DropsOut(MlpFeedForward):
     def forward(self, features):
         return F.dropout(super().forward(features), 0.2, self.training)
 
 
-@named
+@sound
 class TurnsAutocastOff(PlacesByALayer):
     """PyTorch's own idiom for float32 geometry, which torch refuses on meta."""
 
@@ -39,7 +39,7 @@ class TurnsAutocastOff(PlacesByALayer):
         return None
 
 
-@named
+@sound
 class FusesInHalf(ContentCrossAttention):
     """Attention by one kernel in half precision, spelled out in any other."""
 
@@ -67,7 +67,7 @@ class ChangedEncoder(ChangedResult, MultiViewViT):
         return super().forward(self.given(views))
 
 
-@named
+@sound
 class SeesFar(Extended, ChangedEncoder):
     """Convolutions over 19 pixels, before patches of 8 are cut."""
 
@@ -109,22 +109,22 @@ class StridedConvolutions(Extended, PatchEncoder):
         return ImageMemory(features, keys, values, rays, self.grid(views))
 
 
-@named
+@sound
 class ConvolvesByThree(StridedConvolutions): ...
 
 
-@named
+@sound
 class ConvolvesByFour(StridedConvolutions):
     class Config(StridedConvolutions.Config):
         kernel: int = 4
 
 
-@named
+@sound
 class RefusesIntrinsics(RefusesWhatItDeclares):
     camera_gradients = ("c2w",)
 
 
-@named
+@sound
 class EachHeadSeesASide(BiasedAttention):
     """A bias for each head that hides what lies left, or right, of the camera's axis."""
 
