@@ -14,9 +14,10 @@ from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.refinement import AnchorRefinement
 from small_parts import made, shaken
 from torch.testing import assert_close
+from walk import arc
 
 from qgs.geometry.rays import camera_rays
-from qgs.geometry.transforms import quat_to_matrix, to_camera
+from qgs.geometry.transforms import to_camera
 from qgs.recipe import resolve
 from qgs.tokengs.blocks import split_heads
 from qgs.train.initial import initialise
@@ -35,9 +36,7 @@ def drawn(seed, *shape):
 
 
 LENS = torch.tensor([20.0, 20.0, 12.5, 7.5]).double()
-C2W = torch.eye(4).double().repeat(2, 2, 1, 1)
-C2W[..., :3, :3] = quat_to_matrix(F.normalize(drawn(6, 2, 2, 4), dim=-1))
-C2W[..., :3, 3] = drawn(7, 2, 2, 3)
+C2W = arc([10, 50, 120, 200], 3, 0.2).unflatten(0, (2, 2))
 VIEWS = Views(drawn(0, 2, 2, 3, *SIZE).sigmoid(), Cameras(C2W, LENS.expand(2, 2, 4), SIZE))
 """Two scenes of two photos, the cameras turned and moved."""
 HALVED = Views(
