@@ -1,11 +1,12 @@
 """LocusGS's published layout: sizes and variants are read off names and shapes."""
 
-import pytest
 import yaml
 from qgs_research.published.tokengs import LOCUSGS
 from qgs_research.published.weight_layout import LayoutError
+from tables import must_refuse
 
-import qgs
+from qgs.checkpoint.tensors import shapes_of
+from qgs.recipe import resolve
 
 RECIPE = yaml.safe_load("""
 recipe: 1
@@ -30,15 +31,11 @@ FIXED_CENTERS = ("model.queries.radius=false", "model.decoder.refinement.radius=
                  "model.centers={type: locus/anchor_offset}")  # fmt: skip
 
 
-def published_shapes(model):
-    state = model.state_dict()
-    shapes = {LOCUSGS.published_name(ours): tuple(tensor.shape) for ours, tensor in state.items()}
-    assert None not in shapes
-    return shapes
-
-
-def composed(*overrides):
-    return qgs.compose(RECIPE, overrides, device="meta")
+def published(*overrides):
+    """A recipe, and the shapes of its model's weights by their published names."""
+    recipe = resolve(RECIPE, overrides)
+    shapes = shapes_of(recipe.build_model("meta").state_dict())
+    return recipe, {LOCUSGS.published_name(ours): shape for ours, shape in shapes.items()}
 
 
 def test_the_recipe_that_is_read_makes_the_same_model():
@@ -50,20 +47,17 @@ def test_the_recipe_that_is_read_makes_the_same_model():
         ("model.decoder.self_attention={type: qgs/content}",),
         ("model.encoder.depth=0", "model.encoder.mlp_ratio=4"),
     ):
-        own = composed(*overrides)
-        shapes = published_shapes(own)
-        read = qgs.compose(LOCUSGS.read(shapes), device="meta")
-        assert published_shapes(read) == shapes
-        assert read.recipe["model"] == own.recipe["model"]
+        recipe, shapes = published(*overrides)
+        assert None not in shapes
+        assert resolve(LOCUSGS.read(shapes)).tree["model"] == recipe.tree["model"]
 
 
 def test_shapes_without_a_recipe_are_refused():
-    shapes = published_shapes(composed())
+    _, shapes = published()
     for changes, why in (
         ({"gs_tokens": None}, "gs_tokens is missing"),
         ({"activation_head.deconv.weight": (71, 48)}, "head: 71 must be a multiple of 14"),
         ({"gs_tokens": (10,)}, "without axis"),
     ):
         given = {name: shape for name, shape in (shapes | changes).items() if shape}
-        with pytest.raises(LayoutError, match=why):
-            LOCUSGS.read(given)
+        must_refuse(why, LOCUSGS.read, given, kind=LayoutError)
