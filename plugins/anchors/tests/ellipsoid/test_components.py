@@ -148,11 +148,8 @@ def _model(recipe, *overrides):
     return compose(yaml.safe_load(recipe), [f"model.{each}" for each in overrides]).eval()
 
 
-def _pair(refined=True, bound="floor"):
+def _pair(*options):
     """LocusGS whose radii differ from anchor to anchor, and its ellipsoidal equal."""
-    reading = ["queries", "centers", "decoder.cross_attention"] + ["decoder.refinement"] * refined
-    options = [f"{part}.radius_bound={bound}" for part in reading]
-    options.append(f"decoder.refinement.radius={refined}")
     locus = _model(LOCUS, *options)
     with torch.no_grad():
         locus.queries.raw_radius.normal_(-1.0, 1.0)
@@ -169,9 +166,14 @@ def _shared(layer):
     return {**own, **dict(named_tensors(layer.gaussians))}
 
 
-@pytest.mark.parametrize(("radius_refined", "bound"), [(False, "floor"), (True, "offset")])
-def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined, bound):
-    models = _pair(radius_refined, bound)
+READING = ("queries", "centers", "decoder.cross_attention", "decoder.refinement")
+OFFSETS = [f"{part}.radius_bound=offset" for part in READING]
+"""Options of all that read a radius."""
+
+
+@pytest.mark.parametrize("options", [["decoder.refinement.radius=false"], OFFSETS])
+def test_every_tensor_of_every_layer_is_that_of_locusgs(options):
+    models = _pair(*options)
     theirs, ours = (model(PHOTOS, layers=(1, 2, 3)) for model in models)
     for number, expected in theirs.layers.items():
         seen = ours.layers[number]
