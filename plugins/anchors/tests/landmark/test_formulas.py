@@ -39,6 +39,8 @@ LENS = torch.tensor([20.0, 20.0, 12.5, 7.5]).double()
 C2W = arc([10, 50, 120, 200], 3, 0.2).unflatten(0, (2, 2))
 VIEWS = Views(drawn(0, 2, 2, 3, *SIZE).sigmoid(), Cameras(C2W, LENS.expand(2, 2, 4), SIZE))
 """Two scenes of two photos, the cameras turned and moved."""
+AXES = C2W[:, BY_PHOTO, :3, :3]
+"""Of the photos of the tokens."""
 HALVED = Views(
     F.avg_pool3d(VIEWS.images, (1, 2, 2)), Cameras(C2W, VIEWS.cameras.intrinsics / 2, (8, 12))
 )
@@ -57,10 +59,6 @@ def in_photos(state, view_N):
     local = to_camera(state[CENTER], VIEWS.cameras)[:, view_N, torch.arange(len(view_N))]
     z = local[..., 2:]
     return z, LENS[:2] * local[..., :2] / z + LENS[2:]
-
-
-def axes_of_photos():
-    return VIEWS.cameras.c2w[:, BY_PHOTO, :3, :3]
 
 
 def test_anchors_of_all_tokens_stand_on_the_rays_of_their_patches():
@@ -138,7 +136,7 @@ def test_centres_add_offsets_in_radii():
     offsets = drawn(3, 2, TOKENS, 4, 3)
     moved = centers(offsets, state) - centers(torch.zeros_like(offsets), state)
     radii = support_radius(state[RAW_RADIUS], centers.config)[..., None]
-    assert_close(moved, torch.einsum("bnij,bnkj->bnki", axes_of_photos(), radii * offsets))
+    assert_close(moved, torch.einsum("bnij,bnkj->bnki", AXES, radii * offsets))
 
 
 def test_refinement_steps_in_radii_along_the_axes_of_the_photo():
@@ -147,7 +145,7 @@ def test_refinement_steps_in_radii_along_the_axes_of_the_photo():
     ours.load_state_dict(theirs.state_dict())
     radii = support_radius(state[RAW_RADIUS], ours.config)
     steps = radii * (theirs(state)[CENTER] - state[CENTER])
-    expected = torch.einsum("bnij,bnj->bni", axes_of_photos(), steps)
+    expected = torch.einsum("bnij,bnj->bni", AXES, steps)
     assert_close(ours(state)[CENTER] - state[CENTER], expected)
     assert torch.equal(ours(state)[RAW_RADIUS], theirs(state)[RAW_RADIUS])
 
