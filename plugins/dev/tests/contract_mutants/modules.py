@@ -10,7 +10,7 @@ from small_parts import made
 from torch import Tensor, nn
 
 from qgs.checkpoint.tensors import shapes_of
-from qgs.contracts import ComponentConfig, ModelDims
+from qgs.contracts import ModelDims
 from qgs.losses import Opacity
 from qgs.tokengs import (
     ContentCrossAttention,
@@ -78,14 +78,10 @@ class Inner(BaseModel):
     depth: float = 1.0
 
 
-class Outer(ComponentConfig):
-    inners: tuple[Inner, ...] = ()
-
-
 @mutant("construction", "Inner accepts any option")
 class IgnoresUnknownInnerOptions(MlpFeedForward):
     class Config(MlpFeedForward.Config):
-        outer: Outer | None = None
+        inners: tuple[Inner, ...] | None = None
 
 
 @mutant("construction", "building changes the options from")

@@ -9,14 +9,13 @@ from contract_mutants.sound import ChangedEncoder, StridedConvolutions
 from contract_mutants.spatial import Extended
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck
 from torch import Tensor, nn
-from walk import pinhole
+from walk import Walk
 
 from qgs.contracts import (
     AttentionWeights,
     Column,
     CrossAttention,
     Loss,
-    Scene,
     SceneSource,
     memory_fields,
 )
@@ -81,17 +80,11 @@ class NeedsGradients(NoFeedback):
         return state.replace(features=state.features + torch.is_grad_enabled()), memory
 
 
-class NoiseScene(Scene):
-    """Two frames of another noise each time."""
-
-    name = "noise"
-
-    @property
-    def cameras(self):
-        return pinhole(torch.eye(4).expand(2, 4, 4), (16.0, 16.0, 12.0, 8.0), (16, 24))
+class NoiseScene(Walk):
+    """Another noise each time."""
 
     def images(self, frames):
-        return torch.rand(len(frames), 3, 16, 24)
+        return torch.rand_like(super().images(frames))
 
 
 @mutant("scenes_repeat", "opened a second time, scene 0 differs, 1: values differ")
@@ -100,11 +93,11 @@ class DrawsItsImages(SceneSource):
         return [NoiseScene()]
 
 
-@mutant("scenes_are_as_listed", "has 2 frames and holds out [2]")
+@mutant("scenes_are_as_listed", "has 6 frames and holds out [6]")
 class HoldsOutTooMuch(DrawsItsImages):
     def scenes(self, split):
         (scene,) = super().scenes(split)
-        scene.held_out = (1, 2)
+        scene.held_out = (1, 6)
         return [scene]
 
 

@@ -2,7 +2,7 @@
 
 import torch
 from contract_mutants.mutant import mutant
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, Loss, Refinement, memory_fields
 from qgs.renderers import TorchRenderer
@@ -42,23 +42,6 @@ class PlacesByALayer(Extended, AtPlaces, ContentSelfAttention):
 
     def add(self, dims):
         self.place = nn.Linear(3, dims.width)
-
-
-class Steps(Extended, AtPlaces, Refinement):
-    """Sound: it moves the centres by a layer."""
-
-    name = "steps"
-
-    def add(self, dims):
-        self.step = nn.Linear(dims.width, 3)
-
-    writes = PLACE
-
-    def moved(self, center: Tensor, step: Tensor) -> dict[str, Tensor]:
-        return {"place.center": center + step.to(center)}
-
-    def forward(self, state):
-        return state.replace(fields=self.moved(state["place.center"], self.step(state.features)))
 
 
 @mutant(CHECK, "reads some of memory.features, memory.grid, memory.patch_rays")
@@ -116,9 +99,6 @@ class LayerLosesFields(CrossSelfMlp):
 CHECK = "geometry_is_float32_under_autocast"
 
 
-TURN = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
-
-
 @mutant(CHECK, "bfloat16, not float32")
 class GivesHalf(FreeCenters):
     def forward(self, offsets, state):
@@ -126,12 +106,18 @@ class GivesHalf(FreeCenters):
 
 
 @mutant(CHECK, "place.center: values differ")
-class TurnsInHalf(Steps):
-    def turned(self, step: Tensor, center: Tensor) -> Tensor:
-        return (step.to(center) @ TURN.to(center)).to(center)
+class TurnsInHalf(Extended, AtPlaces, Refinement):
+    """Moves the centres by sums of what a layer gives."""
 
-    def moved(self, center, step):
-        return super().moved(center, self.turned(step, center))
+    def add(self, dims):
+        self.step = nn.Linear(dims.width, 3)
+
+    writes = PLACE
+
+    def forward(self, state):
+        center = state["place.center"]
+        step = self.step(state.features).to(center) @ torch.ones(3, 3).to(center)
+        return state.replace(fields={"place.center": center + step.to(center)})
 
 
 @mutant(CHECK, "opacities: values differ")
@@ -159,17 +145,6 @@ class BiasesInHalf(BiasedAttention):
     def bias(self, state, memory):
         center = state["place.center"]
         return (center @ memory.patch_rays[..., 3:].mT).to(center)
-
-
-@mutant("updates_are_explained", "of them is unexplained")
-class ExplainsNoBias(BiasesInHalf):
-    """What it says of itself leaves out what geometry adds."""
-
-    def bias(self, state, memory):
-        apart = state["place.center"][:, :, None] - memory.patch_rays[:, None, :, 3:]
-        return -apart.square().sum(-1)
-
-    explain = ContentCrossAttention.explain
 
 
 @mutant("forward_keeps_no_state", "in training changes a parameter or buffer")
