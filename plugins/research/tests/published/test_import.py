@@ -127,11 +127,10 @@ def test_every_difference_is_listed_at_once():
 def test_other_precisions_are_converted_and_told(tmp_path):
     for kind in ("float16", "bfloat16", "float64"):
         weights = {name: tensor.to(getattr(torch, kind)) for name, tensor in LOCUS.items()}
-        save_file(weights, tmp_path / f"{kind}.safetensors")
-        out = tmp_path / f"made_{kind}/x.safetensors"
-        words = ("import", tmp_path / f"{kind}.safetensors", "--recipe", "auto", "--out", out)
-        assert f"converted to float32: 109 of 109 are {kind}" in run_qgs(*words).output
-        assert_equal(load_file(out)["queries.center"], weights["gs_anchor_xyz_raw"].float())
+        told = imported(tmp_path / kind, weights)
+        assert f"converted to float32: 109 of 109 are {kind}" in "".join(told)
+        made = load_file(tmp_path / kind / "made.safetensors")
+        assert_equal(made["queries.center"], weights["gs_anchor_xyz_raw"].float())
 
 
 def test_parameters_that_share_memory_or_lie_in_strides(tmp_path):
@@ -178,7 +177,7 @@ def test_one_prefix_of_all_names_is_removed(tmp_path):
 
 def test_the_command_lists_every_tensor_and_setting(tmp_path):
     weights = tmp_path / "locus.safetensors"
-    out = tmp_path / "c.safetensors"
+    out = tmp_path / "made/c.safetensors"
     save_file(LOCUS, weights)
     option = "model.head.scale_cap=0.1"
     told = run_qgs("import", weights, "--recipe", "auto", "--out", out, "--set", option).output
