@@ -4,7 +4,7 @@ import torch
 from qgs_zoo.dinov2 import DinoMultiViewViT
 from qgs_zoo.dinov2.vit import GRID, DinoV2, VitConfig
 from safetensors.torch import save_file
-from small_parts import Code
+from small_parts import Code, made
 from tables import assert_equal, must_refuse
 
 from qgs.contracts import MissingExtraError, ModelDims
@@ -26,7 +26,7 @@ def test_weights_of_a_file_are_loaded(tmp_path):
         file = tmp_path / f"vit{suffix}"
         (save_file if suffix == ".safetensors" else torch.save)(published | others, file)
         vit = VitConfig(width=8, depth=2, heads=2, weights=str(file))
-        encoder = DinoMultiViewViT(DinoMultiViewViT.Config(patch_size=4, vit=vit), dims)
+        encoder = made(DinoMultiViewViT, dims, patch_size=4, vit=vit)
         encoder.load_pretrained()
         assert_equal(encoder.rgb_embedding.vit.state_dict(prefix=prefix), published)
 
