@@ -12,7 +12,7 @@ from qgs_anchors.landmark.sweep import mismatch
 from qgs_locus.fields import CENTER
 from small_parts import made
 from torch.testing import assert_close
-from walk import pinhole
+from walk import arc, pinhole
 
 from qgs.geometry.rays import camera_rays
 from qgs.types import ImageMemory, Views
@@ -96,20 +96,17 @@ def test_colours_are_means_of_squares():
 
 WALL_SIZE = (24, 32)
 WALL = 1.5
-"""H x W; depth of the wall z = WALL, that the first camera looks at."""
+"""H x W; depth of the wall z = 0, that the first camera looks at."""
 DEPTHS = torch.tensor([0.8, 1.1, WALL, 2.0, 3.0]).double()
 FIRST = torch.zeros(1, dtype=torch.long)
 
 
 def photos(count=2):
     """A wall with waves of colour, seen by cameras that are moved to the right and turned."""
-    number = torch.arange(count).double()
-    skew = torch.tensor([[0, 0, -0.08, 0], [0] * 4, [0.08, 0, 0, 0], [0] * 4]).double()
-    c2w = torch.linalg.matrix_exp(number[:, None, None] * skew)
-    c2w[:, 0, 3] = 0.2 * number
+    c2w = arc(-8 * torch.arange(count), WALL)
     cameras = pinhole(c2w, (30.0, 30.0, 16.0, 12.0), WALL_SIZE)[None]
     origin, direction = camera_rays(cameras)
-    far = (WALL - origin[..., 2:]) / direction[..., 2:]
+    far = -origin[..., 2:] / direction[..., 2:]
     x, y, _ = (origin + far * direction).unbind(-1)
     waves = torch.stack([9 * x + 3 * y, 8 * y - 5 * x, 11 * x], 2).sin()
     return Views(0.5 + 0.4 * waves, cameras)
@@ -140,5 +137,5 @@ def test_depths_that_no_other_photo_sees_do_not_count():
 def test_anchors_start_where_the_photos_agree():
     queries = made(ObservedQueries, count=None, near=0.5, far=4.5, sweep=25).double().eval()
     state = queries(ImageMemory(torch.randn(1, 96, 16).double(), grid=(2, 6, 8)), photos())
-    depth = state[CENTER][0, :48, 2].view(6, 8)[1:-1, 2:-2]
+    depth = WALL + state[CENTER][0, :48, 2].view(6, 8)[1:-1, 2:-2]
     assert_close(depth, torch.full_like(depth, WALL), rtol=0.05, atol=0.0)
