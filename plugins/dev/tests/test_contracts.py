@@ -45,9 +45,8 @@ def test_every_component_is_checked_and_its_weights_are_pinned() -> None:
     unchecked = set()
     for plugin, pinned in PINNED.items():
         runs = {run.case.label: run for run in runs_of(plugin) if run.case.has_parameters}
-        firsts = {label for label, run in runs.items() if not run.variant}
-        modules = {label: runs[label].case.build() for label in firsts - pinned.keys()}
-        missing = {label: shapes_of(module.state_dict()) for label, module in modules.items()}
+        new = [run.case for label, run in runs.items() if not run.variant and label not in pinned]
+        missing = {case.label: shapes_of(case.build().state_dict()) for case in new}
         assert not missing, f"add to {plugin} in state_dicts.json: {json.dumps(missing)}"
         assert pinned.keys() <= runs.keys(), plugin
         unchecked |= {component.name for component in without_case(load_plugin(plugin))}
