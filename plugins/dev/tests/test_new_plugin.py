@@ -12,14 +12,18 @@ import pytest
 import torch
 from commands import done, run_qgs
 from qgs_dev.new_command import check_name, rendered
+from small_parts import made
 from tables import names_in
 
-from qgs.contracts import ModelDims
 from qgs.recipe.errors import Problems
 from qgs.recipe.yaml_text import load_mapping
 from qgs.types import ImageMemory, QueryState
 
 LISTED = cache(packages_distributions)
+WRITTEN = """
+.gitignore README.md pyproject.toml recipe.yaml src/qgs_far_sighted/__init__.py
+src/qgs_far_sighted/abstaining.py src/qgs_far_sighted/py.typed tests/test_contract.py
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -30,16 +34,8 @@ def _in_an_empty_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
     done("new-plugin", "far-sighted")
     folder = tmp_path / "qgs-far-sighted"
-    assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == {
-        ".gitignore",
-        "README.md",
-        "pyproject.toml",
-        "recipe.yaml",
-        "src/qgs_far_sighted/__init__.py",
-        "src/qgs_far_sighted/abstaining.py",
-        "src/qgs_far_sighted/py.typed",
-        "tests/test_contract.py",
-    }
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert files == {*WRITTEN.split()}
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     assert project["name"] == "qgs-far-sighted"
     assert project["entry-points"]["qgs.plugins"] == {"far-sighted": "qgs_far_sighted:plugin"}
@@ -84,7 +80,7 @@ def test_its_component_computes_its_formula() -> None:
     keys, values = torch.randn(2, 2, 2, 6, 8)
     memory = ImageMemory(torch.randn(2, 6, 16), keys, values, torch.randn(2, 6, 6), (1, 2, 3))
     for sink in (-0.5, 1.5):
-        module = attention(attention.Config(sink_init=sink), ModelDims(16, 2, 1))
+        module = made(attention, sink_init=sink)
         logits = module.core.project(state.features) @ keys.mT / 8**0.5
         read = logits.exp() @ values / (math.exp(sink) + logits.exp().sum(-1, keepdim=True))
         expected = module.core.out_proj(read.transpose(1, 2).flatten(2))

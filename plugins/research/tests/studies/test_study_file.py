@@ -105,9 +105,10 @@ def study_with_indices(folder):
     folder.mkdir()
     for name in ("2views.json", "3views.json"):
         shutil.copy(RECIPES / "studies/rooms" / name, folder)
-    overlay = "overlay: {evaluation: {index: 2views.json}}\n"
-    more = "evaluations: {more: {evaluation: {index: 3views.json}}}\n"
-    return read(folder, SOUND + overlay + more)
+    judged = """overlay: {evaluation: {index: 2views.json}}
+evaluations: {more: {evaluation: {index: 3views.json}}}
+"""
+    return read(folder, SOUND + judged)
 
 
 def test_a_study_that_was_moved_knows_its_runs_by_what_the_index_holds(tmp_path):

@@ -15,13 +15,10 @@ from qgs.model_text import parameter_counts
 from qgs.recipe import resolve
 from qgs.types import ImageMemory
 
-SMALL = (
-    "model.width=16",
-    "model.heads=2",
-    "model.queries.count=6",
-    "model.decoder.depth=2",
-    "model.supervision.layers=[2]",
-)
+SMALL = """
+model.width=16 model.heads=2 model.queries.count=6
+model.decoder.depth=2 model.supervision.layers=[2]
+"""
 
 
 def test_the_published_recipe():
@@ -41,7 +38,7 @@ def test_the_published_recipe():
 def test_every_parameter_that_trains_is_read():
     """Processes that train together wait for a gradient of each of them."""
     for name, side in (("tiny/c3g", 16), ("c3g/re10k", 28)):
-        recipe = resolve(f"{name}.yaml", SMALL)
+        recipe = resolve(f"{name}.yaml", SMALL.split())
         model = recipe.build_model().train()
         gaussians = model(odd_views(2, side, side)).gaussians
         torch.stack([x.sum() for _, x in named_tensors(gaussians)]).sum().backward()

@@ -21,15 +21,11 @@ from qgs.recipe import resolve
 
 PUBLISHED = "globalsplat/re10k.yaml"
 TINY = "tiny/globalsplat.yaml"
-SMALL = (
-    "model.width=32",
-    "model.heads=2",
-    "model.decoder.depth=1",
-    "model.supervision.layers=[1]",
-    "model.queries.count=40",
-    "model.encoder.patch_size=4",
-    "data.image_size=[16, 16]",
-)
+SMALL = """
+model.width=32 model.heads=2 model.decoder.depth=1 model.supervision.layers=[1]
+model.queries.count=40 model.encoder.patch_size=4 data.image_size=[16,16] views.inputs=4
+training.steps=6 training.seconds=null optimizer.warmup=2 evaluation.scenes=2
+"""
 
 
 def test_parameters_of_the_published_size():
@@ -58,9 +54,8 @@ def test_published_training():
 
 def test_two_passes_train_a_head_that_grows(tmp_path):
     growing = "model.head.level={schedule: steps, values: [0, 0.5, 1, 3], at: [1, 2, 4]}"
-    two = ("objective={type: globalsplat/two_passes}", "views.inputs=4", growing)
-    brief = ("training.steps=6", "training.seconds=null", "optimizer.warmup=2")
-    recipe = resolve(TINY, [*SMALL, *two, *brief, "evaluation.scenes=2"])
+    two = "objective={type: globalsplat/two_passes}"
+    recipe = resolve(TINY, [*SMALL.split(), two, growing])
     folder = run(recipe, tmp_path / "run").folder
     assert [record["frustum"] > 0 for record in folder.history()] == [True] * 6
     model = qgs.load(folder.checkpoint)
