@@ -78,7 +78,7 @@ def test_a_picked_query_stands_out():
     plain = painted(scene, Choice())
     for others, part in (("faint", FAINT), ("hidden", 0.0), ("shown", 1.0)):
         shown = painted(scene, Choice(query=4, others=others))
-        assert_allclose(shown.opacities[~mine], part * plain.opacities[~mine], rtol=1e-6)
+        assert_near(shown.opacities[~mine], part * plain.opacities[~mine])
         assert (shown.opacities[mine] >= plain.opacities[mine]).all()
         assert (shown.colors[mine] == plain.colors[mine]).all()
     colored = painted(scene, Choice(by_query=True))

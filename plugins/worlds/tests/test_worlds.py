@@ -47,7 +47,7 @@ def test_scenes_are_scaled_to_their_depth():
     drawn = source(depth=None, image_size=(10, 10)).scenes("train")
     for index in range(3):
         scene = scaled[index]
-        factor = scaled[index].drawn.scale
+        factor = scene.drawn.scale
         depths = scene.depths(range(8))
         assert depths[depths > 0].median() == pytest.approx(2, rel=0.01)
         moved = scene.cameras.c2w[:, :3, 3]
