@@ -4,9 +4,10 @@ from functools import partial
 
 import torch
 from odd_views import odd_views
+from qgs_dev.vocabulary import scalar, tracked
 
 from qgs.containers import named_tensors
-from qgs.types import Cameras, Gaussians
+from qgs.types import Gaussians
 
 
 def make_scene(
@@ -43,15 +44,10 @@ def make_scene(
 
 def differentiate(renderer, gaussians, cameras):
     """The rendering, and gradients by name of a fixed random projection of all its images."""
-    names = dict(named_tensors(gaussians))
-    leaves = {**names, "c2w": cameras.c2w, "intrinsics": cameras.intrinsics}
+    gaussians, cameras = tracked((gaussians, cameras))
+    given = dict(named_tensors(gaussians)) | dict(named_tensors(cameras))
     if renderer.name == "gsplat":
-        del leaves["intrinsics"]
-    leaves = {name: value.detach().clone().requires_grad_() for name, value in leaves.items()}
-    lenses = Cameras(leaves["c2w"], leaves.get("intrinsics", cameras.intrinsics), cameras.size)
-    rendering = renderer(Gaussians(**{name: leaves[name] for name in names}), lenses)
-    images = [image for _, image in named_tensors(rendering)]
-    torch.manual_seed(1)
-    slopes = [torch.rand(image.shape, dtype=torch.float64).to(image) for image in images]
-    grads = torch.autograd.grad(images, [*leaves.values()], slopes)
-    return rendering, dict(zip(leaves, grads, strict=True))
+        given.pop("intrinsics").requires_grad_(False)
+    rendering = renderer(gaussians, cameras)
+    gradients = torch.autograd.grad(scalar(rendering), [*given.values()])
+    return rendering, dict(zip(given, gradients, strict=True))
