@@ -62,16 +62,12 @@ def test_a_weight_comes_before_everything_and_data_is_named_with_its_batch(step)
     assert told(step, f"weight model.{name} ({values})", 0)
 
 
-def spoiled(module, call, spoil, monkeypatch):
-    """Have one call of a module, from 1, return what `spoil` makes of its result."""
+def spoiled(module, call, spoil):
+    """A hook by which one call of a module, from 1, returns what `spoil` makes of its result."""
     calls = count(1)
-    forward = module.forward
-
-    def spoiling(*arguments):
-        result = forward(*arguments)
-        return spoil(result) if next(calls) == call else result
-
-    monkeypatch.setattr(module, "forward", spoiling)
+    return module.register_forward_hook(
+        lambda module, given, result: spoil(result) if next(calls) == call else None
+    )
 
 
 def poisoned(x):
@@ -80,7 +76,7 @@ def poisoned(x):
     return x
 
 
-def test_a_module_is_named_by_its_output_and_the_gradient_of_it(step, monkeypatch):
+def test_a_module_is_named_by_its_output_and_the_gradient_of_it(step):
     """The head runs twice in a batch, after each of two layers."""
     model = step.objective.model
     layer = model.decoder[1]
@@ -95,8 +91,7 @@ def test_a_module_is_named_by_its_output_and_the_gradient_of_it(step, monkeypatc
         (model.renderer, 1, blank, "output of model.renderer.depth", 0),
         (model.head, 3, scaled, "output of model.head.scales", 1),
     ):
-        with monkeypatch.context() as patch:
-            spoiled(module, call, spoil, patch)
+        with spoiled(module, call, spoil):
             assert told(step, tensor, batch)
 
 
