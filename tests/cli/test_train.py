@@ -1,8 +1,8 @@
 """`qgs train` as a user types it, and what `qgs eval` of its run leaves as it was."""
 
 import re
+import signal
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 from commands import ONE_LAYER, done, sets
@@ -10,7 +10,7 @@ from tables import contents, must_not_find, names_in
 
 from qgs.cli.train import with_absolute_path
 from qgs.recipe import resolve
-from qgs.train import training as engine
+from qgs.train.tracking import TrainingProgress
 
 FINETUNE = "locus/dl3dv_4096_2views.yaml"
 ROOMS = "data={type: rooms/procedural, image_size: [16, 16]}"
@@ -35,12 +35,7 @@ def test_a_finished_run_is_left_as_it_is(training, trained):
 
 
 def test_a_signal_ends_with_its_number(training, tmp_path, monkeypatch):
-    real = engine.train
-    monkeypatch.setattr(
-        engine,
-        "train",
-        lambda *words, **options: replace(real(*words, **options), stopped_by="SIGTERM"),
-    )
+    monkeypatch.setattr(TrainingProgress, "show", lambda *_: signal.raise_signal(signal.SIGTERM))
     assert training(tmp_path / "run").exit_code == 128 + 15
     assert not (tmp_path / "run/evaluation").exists()
 
