@@ -14,7 +14,6 @@ from varying_head import VaryingHead
 
 from qgs.containers import map_tensors
 from qgs.contracts import Loss
-from qgs.recipe import Recipe
 from qgs.train.training_pass import DetachedLayer, TrainingPass, signs_of
 
 TARGETS = 3
@@ -57,6 +56,11 @@ class Marked(Loss):
         return {"marked": (rendering.features - target.images.mean(2, True)).square().mean()}
 
 
+def begun(recipe):
+    """The training pass of a new model, and a batch for it."""
+    return TrainingPass(recipe, recipe.build_model().train()), first_batch(recipe)
+
+
 def setting(renderer, *kinds, dtype=torch.float32):
     """A training pass with losses of all kinds, input views, and targets with masks."""
     recipe = tiny(
@@ -66,14 +70,11 @@ def setting(renderer, *kinds, dtype=torch.float32):
         f"model.renderer.type={renderer}",
         f"views.targets={TARGETS}",
     )
-    batch = first_batch(recipe)
-    losses = recipe.build_losses() | {kind.name: kind(Loss.Config()) for kind in (Blind, *kinds)}
+    step, batch = begun(recipe)
+    step.model.to(dtype)
+    step.losses.update({kind.name: kind(Loss.Config()) for kind in (Blind, *kinds)})
     masks = (batch.targets.images.mean(2, keepdim=True) > 0.4).float()
-    model = recipe.build_model().train().to(dtype)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Recipe, "build_losses", lambda recipe: losses)
-        training_pass = TrainingPass(recipe, model)
-    return training_pass, batch.inputs.to(dtype), batch.targets.replace(masks=masks).to(dtype)
+    return step, batch.inputs.to(dtype), batch.targets.replace(masks=masks).to(dtype)
 
 
 def written_out(objective, inputs, targets):
@@ -143,13 +144,12 @@ def test_two_passes_have_the_terms_and_gradients_of_the_definition():
     weights = ("objective.alpha_weight=0.1", "objective.depth_weight=0.2")
     frustum = "losses.frustum={type: globalsplat/frustum, weight: 1}"  # of each pass's own cameras
     recipe = tiny("locus", *TWO, *weights, frustum)
-    model = recipe.build_model().train()
-    batch = first_batch(recipe)
-    step = TrainingPass(recipe, model)
+    step, batch = begun(recipe)
     parts = [batch.inputs.select(views) for views in ([0, 1, 3, 4], [0, 2, 4])]
     first, second = (written_out(step, part, batch.targets) for part in parts)
     terms = {name: (first[name] + second[name]) / 2 for name in first}
     total = sum(terms.values())
+    model = step.model
     seen = [model.render(model(part).gaussians, batch.targets.cameras) for part in parts]
     for name, factor in (("alpha", 0.1), ("depth", 0.2)):
         one, other = (getattr(rendering, name) for rendering in seen)
@@ -213,11 +213,9 @@ def test_a_term_named_as_a_number_of_a_step_is_refused(monkeypatch):
 
 def test_input_views_are_judged_too():
     recipe = tiny("tokengs", "training.judge_inputs=true", "losses.visibility=null")
-    model = recipe.build_model().train()
-    batch = first_batch(recipe)
+    step, batch = begun(recipe)
     inputs = batch.inputs
     targets = batch.targets.select([0])
-    step = TrainingPass(recipe, model)
     of_inputs, of_targets = (written_out(step, inputs, views) for views in (inputs, targets))
     wanted = {name: (2 * of_inputs[name] + term) / 3 for name, term in of_targets.items()}
     assert_close(step(inputs, targets).terms, wanted)
