@@ -1,6 +1,5 @@
 import threading
 import zipfile
-from functools import partialmethod
 
 from photo_formats import opened, scene, synthetic, uploaded, write_nerfstudio
 from tables import assert_equal, must_refuse
@@ -20,6 +19,18 @@ def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):
     must_refuse("nosuch://a", opened_path, "nosuch://a")
 
 
+def before_files_open(path, monkeypatch, act):
+    """Have the file system of `path` call `act` whenever it opens a file."""
+    system = type(path.fs)
+    whole = system._open
+
+    def acting(self, *given, **options):
+        act()
+        return whole(self, *given, **options)
+
+    monkeypatch.setattr(system, "_open", acting)
+
+
 def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
     folder = tmp_path / "scene"
     url = f"memory://{tmp_path.name}"
@@ -29,15 +40,8 @@ def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
     photos = scene(url)
     views = ViewsConfig(inputs=2, targets=1, gap=(1, 3))
     assert SampleStream(opened(url, holdout=0), views, 0).batch([0]).scenes
-    store = type(UPath(url).fs)
     together = threading.Barrier(3)
-    whole = store._open
-
-    def waiting(self, path, *given, **options):
-        together.wait(30)
-        return whole(self, path, *given, **options)
-
-    monkeypatch.setattr(store, "_open", partialmethod(waiting))
+    before_files_open(UPath(url), monkeypatch, lambda: together.wait(30))
     assert_equal(photos.images([0, 2, 1]), expected)
 
 
@@ -60,12 +64,5 @@ def test_files_that_are_read_whole_have_a_limit(tmp_path):
 
 def test_an_archive_that_another_thread_replaces_stays_open_while_it_is_read(tmp_path, monkeypatch):
     member = zeros_in(tmp_path / "a.zip", 10**5)
-    system = type(member.fs)
-    whole = system._open
-
-    def replaced(self, path, *given, **options):
-        del member._fs_cached
-        return whole(self, path, *given, **options)
-
-    monkeypatch.setattr(system, "_open", replaced)
+    before_files_open(member, monkeypatch, lambda: delattr(member, "_fs_cached"))
     assert len(read_file(member)) == 10**5
