@@ -24,13 +24,6 @@ def indexed(folder, index, **options):
     return EvaluationConfig(index=str(file), **options)
 
 
-def test_a_published_index_is_read(tmp_path):
-    told = {"a": {**entry([0, 12], [3, 6]), "overlap": 0.5}, "b": None}
-    index = read_index(indexed(tmp_path, told).index)
-    assert index["a"].model_dump() == entry([0, 12], [3, 6])
-    assert index["b"] is None
-
-
 REFUSED = """
 {"a": {"context": [0]}} | a.target: Field required
 {"a": {"context": [], "target": [1]}} | a.context: List should have at least 1 item
@@ -50,8 +43,10 @@ def test_other_files_are_refused_with_the_reason(tmp_path):
 
 
 def test_samples_are_those_of_the_index_in_its_order(tmp_path):
+    """Of a published one, with more numbers and scenes that cannot be judged."""
     source = Lines(*(Line(8, name=name) for name in ("one", "two", "three")))
-    index = {"three": entry([4, 1], [2, 3, 2]), "one": entry([0, 7], [5])}
+    three = {**entry([4, 1], [2, 3, 2]), "overlap": 0.5}
+    index = {"three": three, "two": None, "one": entry([0, 7], [5])}
     first, second = samples_of(source, VIEWS, indexed(tmp_path, index, scenes=1))
     assert (first.scene, second.scene) == ("three", "one")
     assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))
