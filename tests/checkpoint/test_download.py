@@ -13,7 +13,6 @@ from safetensors.torch import save
 from tables import must_refuse
 from upath import UPath
 
-from qgs.checkpoint import models
 from qgs.checkpoint.models import checkpoint_path
 from qgs.terminal import shown, without_secrets
 
@@ -56,8 +55,8 @@ def server():
     running = ThreadingHTTPServer(("127.0.0.1", 0), Server)
     Thread(target=running.serve_forever, args=(0.01,), daemon=True).start()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(models, "PATIENCE", 1.0)
-        patch.setattr(models, "LARGEST", 10 * len(CONTENT))
+        patch.setattr("qgs.checkpoint.models.PATIENCE", 1.0)
+        patch.setattr("qgs.checkpoint.models.LARGEST", 10 * len(CONTENT))
         yield f"127.0.0.1:{running.server_port}"
     Server.ended.set()
     running.shutdown()

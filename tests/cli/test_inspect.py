@@ -12,7 +12,7 @@ from size import ROOT
 from tables import rows
 
 from qgs.cli import app, main
-from qgs.recipe import RecipeError, files, resolve
+from qgs.recipe import RecipeError, resolve
 
 SMALL = """recipe: 1
 model:
@@ -117,7 +117,7 @@ def test_a_copy_brings_what_it_extends_and_overwrites_nothing():
 
 def test_the_recipes_of_a_wheel_come_first(tmp_path, monkeypatch):
     put(tmp_path / "qgs/recipes/tiny/locus.yaml", b"recipe: 1\nseed: 9\n")
-    monkeypatch.setattr(files, "__file__", str(tmp_path / "qgs/recipe/files.py"))
+    monkeypatch.setattr("qgs.recipe.files.__file__", str(tmp_path / "qgs/recipe/files.py"))
     assert resolve("tiny/locus.yaml").tree["seed"] == 9
 
 

@@ -10,11 +10,10 @@ from renderers.scenes import make_scene
 from tables import assert_equal, must_refuse
 from torch.testing import assert_close
 
-import qgs.renderers as auto_module
-import qgs.renderers.gsplat as gsplat_module
 from qgs.contracts import RendererConfig
 from qgs.geometry.harmonics import seen_colors
 from qgs.renderers import AutoRenderer, CpuRenderer, GsplatRenderer
+from qgs.renderers.gsplat import _check_supported
 
 
 @pytest.fixture
@@ -29,7 +28,7 @@ def calls(monkeypatch):
 
     kernels = Mock(wraps=rasterization)
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=kernels))
-    monkeypatch.setattr(gsplat_module, "_check_supported", lambda *_: None)
+    monkeypatch.setattr("qgs.renderers.gsplat._check_supported", lambda *_: None)
     return kernels.call_args_list
 
 
@@ -82,7 +81,7 @@ def test_tensors_elsewhere_and_intrinsics_that_want_a_gradient_are_refused():
     render = GsplatRenderer(RendererConfig())
     must_refuse("CUDA tensors, got Gaussians on cpu", render, gaussians, cameras)
     cameras.intrinsics.requires_grad_()
-    must_refuse("no gradient for intrinsics", gsplat_module._check_supported, ON_CUDA, cameras)
+    must_refuse("no gradient for intrinsics", _check_supported, ON_CUDA, cameras)
 
 
 def test_auto_goes_by_where_the_gaussians_are(monkeypatch):
@@ -90,5 +89,5 @@ def test_auto_goes_by_where_the_gaussians_are(monkeypatch):
     auto = AutoRenderer(RendererConfig())
     assert_equal(auto(*scene).rgb, CpuRenderer(RendererConfig())(*scene).rgb)
     gsplat = Mock()
-    monkeypatch.setattr(auto_module, "GsplatRenderer", gsplat)
+    monkeypatch.setattr("qgs.renderers.GsplatRenderer", gsplat)
     assert AutoRenderer(RendererConfig())(ON_CUDA, scene[1]) is gsplat.return_value.return_value

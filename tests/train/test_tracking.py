@@ -13,7 +13,6 @@ from training_runs import TRAINED, resume, run, tiny
 
 from qgs.contracts import MissingExtraError
 from qgs.recipe.recipe import flat
-from qgs.train import tracking
 from qgs.train.tracking import Trackers, TrainingProgress
 
 FILE_TRACKER = """
@@ -65,7 +64,7 @@ def test_distributions_offer_trackers_and_one_that_fails_is_left_out(tmp_path, i
 
 def test_a_missing_tracker_is_told_before_anything_is_made(tmp_path, monkeypatch):
     must_refuse("tensorboard, wandb", Trackers, ("linez",))
-    monkeypatch.setattr(tracking, "find_spec", lambda name: None)
+    monkeypatch.setattr("qgs.train.tracking.find_spec", lambda name: None)
     must_refuse(
         "pip install tensorboard",
         run,

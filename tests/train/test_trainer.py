@@ -24,7 +24,6 @@ from qgs.checkpoint.model_file import CheckpointFile
 from qgs.contracts import TrainingConfig
 from qgs.evaluate.evaluation import evaluate
 from qgs.recipe import Recipe, resolve
-from qgs.train import guard
 from qgs.train.guard import NonFiniteError
 
 
@@ -153,7 +152,7 @@ def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
 
 def test_skipping_comes_to_an_end(tmp_path, monkeypatch):
     spoil(monkeypatch, range(2, 100), nan=True)
-    monkeypatch.setattr(guard, "MAX_SKIPPED", 2)
+    monkeypatch.setattr("qgs.train.guard.MAX_SKIPPED", 2)
     recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
     must_refuse("most 2 steps in a row", run, recipe, tmp_path, kind=NonFiniteError)
     assert len(read_jsonl(tmp_path / "history.jsonl")) == 3
