@@ -4,66 +4,46 @@ import sys
 from types import SimpleNamespace
 from unittest.mock import Mock
 
-import pytest
 import torch
 from renderers.scenes import make_scene
 from tables import assert_equal, must_refuse
 from torch.testing import assert_close
 
+from qgs.containers import concatenated, named_tensors
 from qgs.contracts import RendererConfig
-from qgs.geometry.harmonics import seen_colors
-from qgs.renderers import AutoRenderer, CpuRenderer, GsplatRenderer
+from qgs.renderers import AutoRenderer, CpuRenderer, GsplatRenderer, TorchRenderer
 from qgs.renderers.gsplat import _check_supported
+from qgs.types import Cameras, Gaussians
 
 
-@pytest.fixture
-def calls(monkeypatch):
-    """Stand in for gsplat; return the list of keyword arguments it was called with."""
+def rasterization(
+    *, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d, backgrounds, **given
+):
+    """What gsplat's function of this name gives, by our renderer; colors: (B, V, G, C)."""
+    assert (given.pop("packed"), given.pop("render_mode")) == (False, "RGB+ED")
+    assert Ks[0, 0, 2].tolist() == [0, 0, 1]
+    assert colors.shape[2], "kernels divide by the number of Gaussians"
+    renderer = TorchRenderer(RendererConfig(near=near_plane, far=far_plane, dilation=eps2d))
+    c2w = torch.linalg.inv(viewmats)
+    cameras = Cameras(c2w, Ks.flatten(2)[..., [0, 4, 2, 5]], (height, width))
+    parts = []
+    for view in range(len(colors[0])):
+        seen = Gaussians(**given, colors=colors[:, view, :, :3], features=colors[:, view])
+        parts.append(renderer(seen, cameras[:, [view]]))
+    found = concatenated(parts, 1)
+    channels = found.features + (1 - found.alpha) * backgrounds[..., None, None]
+    images = torch.cat([channels, found.depth], 2)
+    return images.movedim(2, -1), found.alpha.movedim(2, -1), {}
 
-    def rasterization(**arguments):
-        images = (*arguments["viewmats"].shape[:2], arguments["height"], arguments["width"])
-        channels = arguments["colors"].shape[-1] + 1  # and depth
-        rgbd = torch.arange(float(channels)).expand(*images, channels)
-        return rgbd, torch.full((*images, 1), 0.25), {}
 
-    kernels = Mock(wraps=rasterization)
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=kernels))
+def test_images_are_those_of_the_function_that_gsplat_documents(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
     monkeypatch.setattr("qgs.renderers.gsplat._check_supported", lambda *_: None)
-    return kernels.call_args_list
-
-
-def test_arguments_are_what_gsplat_expects(calls):
-    config = RendererConfig(near=0.1, far=50.0, dilation=0.5, background=(0.1, 0.2, 0.3))
-    render = GsplatRenderer(config)
-    gaussians, cameras = make_scene(2, 3, 7, size=(12, 20), harmonics=8, features=2)
-    rendering = render(gaussians, cameras)
-    bare = render(gaussians.replace(sh=None, features=None), cameras)
-    found, of_bare = (call.kwargs for call in calls)
-    fx, fy, cx, cy = cameras.intrinsics[1, 2]
-    assert_equal(found.pop("Ks")[1, 2], torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    assert found.pop("render_mode") == "RGB+ED"
-    features = gaussians.features[:, None].expand(2, 3, 7, 2)
-    backdrop = torch.tensor([0.1, 0.2, 0.3, 0, 0]).expand(2, 3, 5)
-    expected = {
-        **{name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities")},
-        "colors": torch.cat([seen_colors(gaussians, cameras), features], -1),
-        "viewmats": torch.linalg.inv(cameras.c2w),
-        "width": 20,
-        "height": 12,
-        "near_plane": 0.1,
-        "far_plane": 50.0,
-        "eps2d": 0.5,
-        "packed": False,
-        "backgrounds": backdrop,
-    }
-    assert_close(found, expected)
-    assert_equal(of_bare["colors"], gaussians.colors[:, None].expand(2, 3, 7, 3))
-    assert_equal(of_bare["backgrounds"], backdrop[..., :3])
-    channels = torch.tensor([0, 1, 2, 3, 4, 5, 0.25, 3])[:, None, None].expand(2, 3, 8, 12, 20)
-    images = [rendering.rgb, rendering.features, rendering.depth, rendering.alpha, bare.depth]
-    assert_equal(torch.cat(images, 2), channels)
-    render(gaussians[:, :0], cameras)
-    assert len(calls) == 2, "kernels divide by the number of Gaussians"
+    config = RendererConfig(near=2.0, far=3.5, dilation=2.0, background=(0.1, 0.2, 0.3))
+    for more in ({"harmonics": 8, "features": 2}, {}, {"count": 0}):
+        scene = make_scene(2, 3, size=(12, 20), scale=0.2, **more)
+        found, expected = (kind(config)(*scene) for kind in (GsplatRenderer, TorchRenderer))
+        assert_close(*(dict(named_tensors(images)) for images in (found, expected)))
 
 
 def test_options_that_the_kernels_fix_are_refused():
