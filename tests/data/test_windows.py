@@ -3,23 +3,20 @@
 import pytest
 import torch
 import yaml
+from line_scenes import Line
 from tables import must_refuse
 from textured_room import photos_of, walk
-from walk import along_x, arc, pinhole
+from walk import along_x, arc
 
 from qgs.data.inputs import Frusta, ranked_windows, scene_depth, trained_ratios
 from qgs.domain import Domain
 from qgs.reconstruction.scenes import GivenScene
-from qgs.types import Views
 
 TRAINED = Domain(yaml.safe_load("{baseline: [0.1, 0.3], turn: [2.0, 20.0], depth: [1.0, 1.0]}"))
 
 
 def scene_of(c2w, held_out=()):
-    """Grey photos."""
-    scene = GivenScene(Views(torch.full((1, len(c2w), 3, 64, 64), 0.5), pinhole(c2w.float())[None]))
-    scene.held_out = held_out
-    return scene
+    return Line(len(c2w), held_out, c2w=c2w)
 
 
 def orbit(count, step, radius=4.0):
