@@ -51,8 +51,8 @@ def spoon(tmp_path):
                 put(folder / file.replace("N", number), encoded(Image.new("RGB", (40, 30))))
         content = row_of_frames(3, fl_x=40, w=40, h=30)
         for number, frame in enumerate(content["frames"]):
-            frame["file_path"] = listed.replace("N", str(number))
-            frame.update({key: text.replace("N", str(number)) for key, text in more.items()})
+            named = {"file_path": listed, **more}
+            frame |= {key: text.replace("N", str(number)) for key, text in named.items()}
         write_json(folder / "transforms.json", content)
         return folder
 
