@@ -8,7 +8,7 @@ import pytest
 import torch
 from photo_formats import put
 from safetensors import SafetensorError
-from tables import contents
+from tables import contents, must_refuse
 
 from qgs.checkpoint.tensors import write_tensors
 from qgs.files import is_leftover, replacing, replacing_entries, write_text
@@ -59,12 +59,12 @@ def test_a_disk_is_called_full_only_where_it_is(tmp_path, monkeypatch):
     ):
         failure = SafetensorError(words)
         monkeypatch.setattr("qgs.checkpoint.tensors.save_file", Mock(side_effect=failure))
-        with pytest.raises(OSError, match=r"a\.safetensors") as caught:
-            write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(1)}, {})
+        given = tmp_path / "a.safetensors", {"a": torch.ones(1)}, {}
+        error = must_refuse(r"a\.safetensors", write_tensors, *given, kind=OSError)
         full = number is None
-        assert ("free space" in str(caught.value)) == full
-        assert full or caught.value.errno == number
-        assert words in str(caught.value)
+        assert ("free space" in str(error)) == full
+        assert full or error.errno == number
+        assert words in str(error)
         assert not list(tmp_path.iterdir())
 
 

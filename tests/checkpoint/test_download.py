@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 from safetensors.torch import save
-from tables import must_refuse
+from tables import contents, must_refuse
 from upath import UPath
 
 from qgs.checkpoint.models import checkpoint_path
@@ -69,10 +69,6 @@ def cache(tmp_path, monkeypatch):
     return tmp_path
 
 
-def files(cache):
-    return sorted(file.name for file in cache.rglob("*") if file.is_file())
-
-
 FAILURES = yaml.safe_load("""
 404: "404"
 401: "401"
@@ -95,7 +91,7 @@ def test_failures(server, cache, capsys):
         assert not re.search("p%40ss|hidden", str(error) + capsys.readouterr().err)
         assert error.__suppress_context__
         assert error.__cause__ is None
-        assert files(cache) == []
+        assert contents(cache) == {}
 
 
 def test_no_server_and_no_url():
@@ -128,7 +124,7 @@ def test_a_url_is_downloaded_once_and_where_it_is_kept_is_told(cache, caplog):
     remote.unlink()
     assert checkpoint_path(str(remote)) == first
     assert f"kept as {first} (delete this file to download it again)" in caplog.text
-    assert files(cache) == ["a.safetensors"]
+    assert [file.name for file in contents(cache)] == ["a.safetensors"]
 
 
 def test_a_damaged_file_is_replaced(server, caplog):

@@ -9,7 +9,7 @@ import yaml
 from commands import done
 from photo_formats import put
 from size import ROOT
-from tables import rows
+from tables import must_refuse, rows
 
 from qgs.cli import app, main
 from qgs.recipe import RecipeError, resolve
@@ -61,9 +61,7 @@ def test_mistakes_are_printed_without_a_traceback(tmp_path, monkeypatch, capsys)
     (tmp_path / "slow.yaml").write_text(SMALL + "optimizer:\n  parts:\n    encodr: 0.1\n")
     for words, reason in rows(MISTAKES, "; "):
         monkeypatch.setattr(sys, "argv", ["qgs", *words.split()])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        assert caught.value.code == 2
+        assert must_refuse(None, main, kind=SystemExit).code == 2
         shown = capsys.readouterr()
         assert reason in shown.err
         assert "Traceback" not in shown.err
@@ -93,8 +91,8 @@ def test_a_name_stands_for_a_recipe_that_no_file_hides(name):
 
 def test_other_names_are_refused():
     for name in ("tiny/lotus.yaml", "../README.md", "../recipes/../README.md"):
-        with pytest.raises(RecipeError, match=r"does not exist[^?]*a recipe from `qgs recipes`"):
-            resolve(name)
+        reason = r"does not exist[^?]*a recipe from `qgs recipes`"
+        must_refuse(reason, resolve, name, kind=RecipeError)
 
 
 def test_a_copy_brings_what_it_extends_and_overwrites_nothing():
@@ -109,8 +107,7 @@ def test_a_copy_brings_what_it_extends_and_overwrites_nothing():
     copy.unlink()
     other = Path("mine/tiny/locus.yaml")
     other.write_text("mine")
-    with pytest.raises(FileExistsError):
-        done(*words)
+    must_refuse(None, done, *words, kind=FileExistsError)
     assert other.read_text() == "mine"
     assert not copy.exists()
 
