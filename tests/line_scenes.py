@@ -4,9 +4,11 @@ import numpy as np
 import torch
 from walk import along_x, pinhole
 
-from qgs.contracts import Scene, SceneSource, SceneSourceConfig
+from qgs.contracts import SceneSource, SceneSourceConfig
 from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import EvaluationPlan
+from qgs.reconstruction.scenes import GivenScene
+from qgs.types import Views
 
 DOWN = torch.tensor([0.0, 1, 0])
 SPAN = Span(Span.Config())
@@ -22,24 +24,19 @@ def values(frames):
     return torch.tensor(list(frames)).view(-1, 1, 1, 1) / 100
 
 
-class Line(Scene):
-    """Cameras along a line; frame f is an image of the value f / 100, brighter to the right."""
+class Line(GivenScene):
+    """Cameras along a line; frame f is an image of the value f / 100, brighter to the right.
 
-    def __init__(self, count, held_out=(), step=0.5, name=""):
+    c2w: other poses. more: masks or times of the frames (1, F).
+    """
+
+    def __init__(self, count, held_out=(), step=0.5, name="", c2w=None, **more):
+        c2w = along_x(step * torch.arange(count) + 3) if c2w is None else c2w
+        images = values(range(count)) + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
+        cameras = pinhole(c2w, (8.0, 8, 3, 4), (8, 8))
+        super().__init__(Views(images[None], cameras[None], **more))
         self.name = name or f"line{count}"
         self.held_out = held_out
-        self.count = count
-        self.step = step
-
-    def poses(self):
-        return along_x(self.step * torch.arange(self.count) + 3)
-
-    @property
-    def cameras(self):
-        return pinhole(self.poses(), (8.0, 8, 3, 4), (8, 8))
-
-    def images(self, frames):
-        return values(frames) + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
 
 
 class Lines(SceneSource):

@@ -16,12 +16,10 @@ from qgs.recipe import resolve
 VIEWS = ViewsConfig(inputs=2, targets=2, gap=(2, 4))
 
 
-class Moving(Line):
-    """`cameras` at each time, by time: frame 0 is the first of time 0."""
-
-    def __init__(self, times, cameras, held_out=()):
-        super().__init__(times * cameras, held_out, name=f"moving{times}x{cameras}")
-        self.times = torch.arange(times).double().repeat_interleave(cameras) / 10
+def moving(times, cameras, held_out=()):
+    """A scene of `cameras` at each time, by time: frame 0 is the first of time 0."""
+    taken = torch.arange(times).repeat_interleave(cameras) / 10
+    return Line(times * cameras, held_out, times=taken[None])
 
 
 def dnerf(folder, *times):
@@ -32,10 +30,10 @@ def dnerf(folder, *times):
 
 
 def test_times_of_dnerf(tmp_path):
-    moving = scene(dnerf(tmp_path, 0, 0.25, 0.5, 0.4))
-    assert moving.times.dtype == torch.float64
-    assert moving.times.tolist() == [0, 0.25, 0.5, 0.4]
-    assert moving.held_out == (3,)
+    read = scene(dnerf(tmp_path, 0, 0.25, 0.5, 0.4))
+    assert read.times.dtype == torch.float64
+    assert read.times.tolist() == [0, 0.25, 0.5, 0.4]
+    assert read.held_out == (3,)
     assert scene(dnerf(tmp_path, *[...] * 4)).times is None
     assert scene(dnerf(tmp_path, *[0.5] * 4)).times is None, "nothing moves in one moment"
 
@@ -47,14 +45,14 @@ def test_times_that_cannot_be(tmp_path):
 
 def test_one_camera_a_time_gives_that_frame_as_all_targets():
     for seed in range(40):
-        inputs, (target, same) = drawn(Moving(12, 1), VIEWS, seed)
+        inputs, (target, same) = drawn(moving(12, 1), VIEWS, seed)
         assert inputs[0] < target == same < inputs[-1]
 
 
 def test_several_cameras_a_time_give_targets_of_one_time_and_inputs_of_several_cameras():
     asked = set()
     for seed in range(60):
-        inputs, targets = drawn(Moving(9, 4), VIEWS, seed)
+        inputs, targets = drawn(moving(9, 4), VIEWS, seed)
         assert len({*targets, *inputs}) == 4, "targets are no inputs while there are others"
         first, last = (frame // 4 for frame in inputs)
         assert last - first in (2, 3, 4)
@@ -68,11 +66,11 @@ def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets():
     def made(scene, *frames):
         return make_sample(scene, *frames, VIEWS, False)
 
-    sample = made(Moving(10, 2), (2, 11), (6, 7))
+    sample = made(moving(10, 2), (2, 11), (6, 7))
     assert sample.inputs.times.tolist() == [[0, 1]]
     assert_close(sample.inputs.target_time, torch.tensor([[0.5]]))
     assert sample.inputs.times.dtype == torch.float32
-    several = made(Moving(10, 2), (2, 11), (4, 6)).inputs
+    several = made(moving(10, 2), (2, 11), (4, 6)).inputs
     assert several.target_time is None, "two times cannot be asked for at once"
     still = made(Line(9), (2, 6), (4,))
     assert still.inputs.times is None
@@ -80,7 +78,7 @@ def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets():
 
 
 def test_targets_of_two_times_are_judged_apart():
-    scene = Moving(10, 2, held_out=(6, 7, 9))
+    scene = moving(10, 2, held_out=(6, 7, 9))
     assert [targets for _, targets in held_out_windows(scene, VIEWS)] == [(6, 7, 9)]
     samples = samples_of(Lines(scene), VIEWS, EvaluationConfig(scenes=5))
     assert [sample.target_frames for sample in samples] == [(6, 7), (9,)]

@@ -8,7 +8,7 @@ from line_scenes import Line, Lines, drawn, judged_samples, samples_of
 from qgs_photos.datasets.view_samplers import Bounded, Farthest, Overlapping
 from tables import must_refuse
 from training_runs import batches, stream_of
-from walk import arc
+from walk import along_x, arc
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
@@ -70,8 +70,8 @@ def test_a_training_widens_the_gap_and_resumes_where_it_was():
     recipe = small("view_sampler.warm_up_steps=5", "view_sampler.initial_max_gap=2")
 
     def gaps(start, count):
-        found = [w for batch in in_steps(recipe, start, count) for w in batch.windows]
-        return [inputs[-1] - inputs[0] for inputs, _ in found]
+        found = [inputs for batch in in_steps(recipe, start, count) for inputs, _ in batch.windows]
+        return [frames[-1] - frames[0] for frames in found]
 
     whole = gaps(0, 14)
     assert gaps(9, 5) == whole[18:]
@@ -108,19 +108,14 @@ def test_numbers_of_inputs_and_gaps_as_in_depthsplat():
         assert (min(found), max(found)) == gaps
 
 
-class Bend(Line):
-    """Cameras that wait at the origin and go away at the end."""
-
-    def poses(self):
-        c2w = super().poses()
-        c2w[:, 0, 3] = torch.arange(self.count).clamp_min(self.count - 4)
-        return c2w
+BEND = along_x(torch.arange(21.0).clamp_min(17))
+"""Cameras that wait at one place and go away at the end."""
 
 
 def test_inputs_stand_where_cameras_move():
     sampler = farthest(max_gap=20)
     four = ViewsConfig(inputs=4, targets=8)
-    assert drawn(Bend(21), four, 0, END, sampler)[0][1:] == (18, 19, 20)
+    assert drawn(Line(21, c2w=BEND), four, 0, END, sampler)[0][1:] == (18, 19, 20)
 
 
 def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
@@ -136,14 +131,9 @@ SAMPLER = made(Overlapping)
 SHUFFLED = torch.randperm(40, generator=torch.Generator().manual_seed(0))
 
 
-class Arc(Line):
-    """40 cameras .5 apart around what they look at, DEPTH away; files in an order of chance."""
-
-    def poses(self):
-        return arc((0.5 / DEPTH * (SHUFFLED - 20)).rad2deg(), DEPTH)
-
-
-HELD_OUT = Arc(40, held_out=(0, 8, 16))
+POSES = arc((0.5 / DEPTH * (SHUFFLED - 20)).rad2deg(), DEPTH)
+"""40 cameras .5 apart around what they look at, DEPTH away; files in an order of chance."""
+HELD_OUT = Line(40, held_out=(0, 8, 16), c2w=POSES)
 
 
 def draws(count, views=TWO, **options):
@@ -193,7 +183,7 @@ def test_every_held_out_photo_is_judged_with_inputs_beside_it():
 
 
 def test_without_held_out_photos_four_of_all_are_judged():
-    found = SAMPLER.windows(Arc(40), TWO)
+    found = SAMPLER.windows(Line(40, c2w=POSES), TWO)
     assert [targets for _, targets in found] == [(0,), (13,), (26,), (39,)]
     for inputs, (target,) in found:
         assert target not in inputs
@@ -216,7 +206,7 @@ def test_cameras_without_a_common_point_and_few_photos():
 
 
 def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn():
-    scene = Arc(40, held_out=(3,))
+    scene = Line(40, held_out=(3,), c2w=POSES)
     scene.times = torch.arange(40).double()
     assert SAMPLER.windows(scene, TWO) == []
     must_refuse(r"moves, .* qgs/span", drawn, scene, TWO, 0, 0, SAMPLER)
