@@ -26,17 +26,19 @@ _LARGEST = np.float32(1e9)
 
 
 @kernel
-def _dot(a, b):
+def dot(a, b):
+    """Return the scalar product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @kernel
-def _cross(a, b):
+def cross(a, b):
+    """Return the cross product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @kernel
-def _plus(a, s, b):
+def plus(a, s, b):
     """Return a + s b for vectors a, b and a number s."""
     return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
 
@@ -47,9 +49,9 @@ def _times(s, a):
 
 
 @kernel
-def _combine(a, rows):
+def combine(a, rows):
     """Return the sum of `rows`, weighted by the entries of the vector `a`."""
-    return _plus(_plus(_times(a[0], rows[0]), a[1], rows[1]), a[2], rows[2])
+    return plus(plus(_times(a[0], rows[0]), a[1], rows[1]), a[2], rows[2])
 
 
 @kernel
@@ -60,7 +62,8 @@ def _columns(m):
 
 
 @kernel
-def _vector(array):
+def vector(array):
+    """Return the first three numbers of an array as a vector."""
     return (array[0], array[1], array[2])
 
 
@@ -96,8 +99,9 @@ def _scaled_columns(rows, scale):
 
 
 @kernel
-def _dots(a, rows):
-    return (_dot(rows[0], a), _dot(rows[1], a), _dot(rows[2], a))
+def dots(a, rows):
+    """Return the product of the matrix `rows` and the vector `a`."""
+    return (dot(rows[0], a), dot(rows[1], a), dot(rows[2], a))
 
 
 @kernel
@@ -112,7 +116,7 @@ def _axis(axis, seen, turned, focal, principal, size, margin):
     low = (-margin * size - principal) / focal
     high = (size + margin * size - principal) / focal
     held = min(max(slope, low), high)
-    return slope, held, _times(focal / seen[2], _plus(turned[axis], -held, turned[2]))
+    return slope, held, _times(focal / seen[2], plus(turned[axis], -held, turned[2]))
 
 
 @kernel
@@ -122,12 +126,12 @@ def _view(c2w, lens, mean, factor, margin, height, width):
     The module explains the symbols. lens: fx, fy, cx, cy. mean: m. factor: columns of R S. The two
     axes are results of `_axis`.
     """
-    pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
-    offset = _plus(_vector(mean), -ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
-    seen = _combine(offset, pose)
+    pose = (vector(c2w[0]), vector(c2w[1]), vector(c2w[2]))
+    offset = plus(vector(mean), -ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
+    seen = combine(offset, pose)
     axes = _columns(pose)
     # Rows of C^T F.
-    turned = (_dots(axes[0], factor), _dots(axes[1], factor), _dots(axes[2], factor))
+    turned = (dots(axes[0], factor), dots(axes[1], factor), dots(axes[2], factor))
     fx, fy, cx, cy = _four(lens)
     x_axis = _axis(0, seen, turned, fx, cx, width, margin)
     y_axis = _axis(1, seen, turned, fy, cy, height, margin)
@@ -147,7 +151,7 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
     near, far, dilation, alpha_min, margin, height, width = limits
     for g in range(bounds[0], bounds[1]):
         rows, _, _ = _rotation(quats[g])
-        factor = _scaled_columns(rows, _vector(scales[g]))
+        factor = _scaled_columns(rows, vector(scales[g]))
         opacity = opacities[g]
         fall = max(np.log(opacity / alpha_min), ZERO)
         reach = np.sqrt(TWO * fall)
@@ -165,12 +169,12 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
             if not (opacity >= alpha_min and z >= near and z <= far):
                 out[5] = ONE
                 continue
-            xx = _dot(row_x, row_x)
-            xy = _dot(row_x, row_y)
-            yy = _dot(row_y, row_y)
-            minors = _cross(row_x, row_y)
+            xx = dot(row_x, row_x)
+            xy = dot(row_x, row_y)
+            yy = dot(row_y, row_y)
+            minors = cross(row_x, row_y)
             # Cauchy-Binet: unlike xx * yy - xy^2 this does not cancel for needles.
-            determinant = _dot(minors, minors) + dilation * (xx + yy) + dilation * dilation
+            determinant = dot(minors, minors) + dilation * (xx + yy) + dilation * dilation
             out[0] = cx + fx * x
             out[1] = cy + fy * y
             out[5] = z
@@ -192,17 +196,17 @@ def _covariance_slopes(row_x, row_y, splat, given, dilation):
     splat: the splat's fields; fields 2 to 4 are the conic (inverse 2D covariance). given: gradients
         of the fields.
     """
-    xx = _dot(row_x, row_x)
-    yy = _dot(row_y, row_y)
-    minors = _cross(row_x, row_y)
-    inverse = ONE / (_dot(minors, minors) + dilation * (xx + yy) + dilation * dilation)
+    xx = dot(row_x, row_x)
+    yy = dot(row_y, row_y)
+    minors = cross(row_x, row_y)
+    inverse = ONE / (dot(minors, minors) + dilation * (xx + yy) + dilation * dilation)
     of_determinant = -inverse * (given[2] * splat[2] + given[3] * splat[3] + given[4] * splat[4])
     of_xx = TWO * (given[4] * inverse + dilation * of_determinant)
     of_xy = -given[3] * inverse
     of_yy = TWO * (given[2] * inverse + dilation * of_determinant)
     of_minors = _times(TWO * of_determinant, minors)
-    of_row_x = _plus(_plus(_cross(row_y, of_minors), of_xx, row_x), of_xy, row_y)
-    of_row_y = _plus(_plus(_cross(of_minors, row_x), of_yy, row_y), of_xy, row_x)
+    of_row_x = plus(plus(cross(row_y, of_minors), of_xx, row_x), of_xy, row_y)
+    of_row_y = plus(plus(cross(of_minors, row_x), of_yy, row_y), of_xy, row_x)
     return of_row_x, of_row_y
 
 
@@ -218,8 +222,8 @@ def _axis_slopes(axis, focal, z, of_row, turned_z, of_pixel):
     gain = focal / z
     of_turned = _times(gain, of_row)
     of_turned_z = _times(-held, of_turned)
-    of_held = -_dot(of_turned, turned_z)
-    of_gain = _dot(of_row, row)
+    of_held = -dot(of_turned, turned_z)
+    of_gain = dot(of_row, row)
     of_focal = of_gain / focal + of_pixel * slope
     of_principal = of_pixel
     of_slope = focal * of_pixel
@@ -268,7 +272,7 @@ def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
     """
     for i in range(3):
         for j in range(3):
-            out[3 * i + j] += offset[i] * of_seen[j] + _dot(factor_rows[i], of_turned[j])
+            out[3 * i + j] += offset[i] * of_seen[j] + dot(factor_rows[i], of_turned[j])
         out[9 + i] -= of_mean[i]
     for i in range(4):
         out[12 + i] += of_lens[i]
@@ -289,7 +293,7 @@ def project_backward_unit(
     zeros = (ZERO, ZERO, ZERO)
     for g in range(bounds[0], bounds[1]):
         rows, quat, norm = _rotation(quats[g])
-        scale = _vector(scales[g])
+        scale = vector(scales[g])
         factor = _scaled_columns(rows, scale)
         of_mean = zeros
         of_opacity = ZERO
@@ -312,13 +316,13 @@ def project_backward_unit(
                 y_axis, fy, seen[2], of_row_y, turned[2], slopes[1]
             )
             of_seen = (of_x, of_y, z_x + z_y + slopes[5])
-            of_turned = (of_turned_x, of_turned_y, _plus(turned_z_x, ONE, turned_z_y))
-            of_offset = _dots(of_seen, pose)
-            of_mean = _plus(of_mean, ONE, of_offset)
+            of_turned = (of_turned_x, of_turned_y, plus(turned_z_x, ONE, turned_z_y))
+            of_offset = dots(of_seen, pose)
+            of_mean = plus(of_mean, ONE, of_offset)
             of_factor = (
-                _plus(of_factor[0], ONE, _combine(pose[0], of_turned)),
-                _plus(of_factor[1], ONE, _combine(pose[1], of_turned)),
-                _plus(of_factor[2], ONE, _combine(pose[2], of_turned)),
+                plus(of_factor[0], ONE, combine(pose[0], of_turned)),
+                plus(of_factor[1], ONE, combine(pose[1], of_turned)),
+                plus(of_factor[2], ONE, combine(pose[2], of_turned)),
             )
             if wants_cameras:
                 _add_camera(
@@ -329,5 +333,5 @@ def project_backward_unit(
         of_columns, axes = _columns(of_factor), _columns(rows)
         for i in range(3):
             of_means[g, i] = of_mean[i]
-            of_scales[g, i] = _dot(of_columns[i], axes[i])
+            of_scales[g, i] = dot(of_columns[i], axes[i])
         _quat_slopes(quat, norm, _columns(_scaled_columns(of_factor, scale)), of_quats[g])
