@@ -1,6 +1,7 @@
 """Parts that several systems share: attention, rays of pixels, rotations, weight files."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -82,12 +83,13 @@ def quaternions(rotations: Tensor) -> Tensor:
     return F.normalize(row, dim=-1)
 
 
-def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], remedy: str) -> None:
-    """Read the tensors of a weight file, and call `fill` with them. Nothing is downloaded.
+@contextmanager
+def weight_file(file: str, remedy: str) -> Iterator[Mapping[str, Tensor]]:
+    """Give the tensors of a weight file to a `with` block. Nothing is downloaded.
 
     file: a safetensors file or a torch file. The tensors of a torch file may be in its entry
     `model` or `state_dict`. Raises MissingExtraError, whose message ends with `remedy`, if the file
-    is missing or `fill` fails.
+    is missing or the block fails.
     """
     path = Path(file).expanduser()
     try:
@@ -98,7 +100,7 @@ def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], reme
             tensors = torch.load(path, map_location="cpu", weights_only=True)
             for key in ("model", "state_dict"):
                 tensors = tensors.get(key, tensors)
-        fill(tensors)
+        yield tensors
     except Exception as error:
         # torch and safetensors raise many errors for missing, damaged and other files.
         what = f"cannot read weights of {path.name} ({type(error).__name__}: {error})"

@@ -6,17 +6,16 @@ a list of tensors (B, V, P, 2048), one for each layer, with the P tokens of each
 of the first of these tokens that belongs to a patch.
 """
 
-from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, Literal
 
 from einops import rearrange
 from pydantic import Field
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.contracts import MissingExtraError, ModelDims, PatchEncoder, memory_fields
 from qgs.types import ImageMemory, Views
-from qgs_zoo.parts import load_weights
+from qgs_zoo.parts import weight_file
 
 WIDTH = 2048
 """Width of a token of the last layer (VGGT-1B)."""
@@ -78,14 +77,11 @@ class VggtFeatures(PatchEncoder):
         return ImageMemory(features=self.proj(tokens_BMC), grid=grid)
 
     def load_pretrained(self) -> None:
-        load_weights(
-            self.config.weights,
-            self._fill,
+        remedy = (
             "download VGGT-1B's model.safetensors, which has its own licence, and set the option "
-            "`weights` to the file",
+            "`weights` to the file"
         )
-
-    def _fill(self, weights: Mapping[str, Tensor]) -> None:
-        # The file holds all of VGGT.
-        own = {n.removeprefix(PREFIX): x for n, x in weights.items() if n.startswith(PREFIX)}
-        self.aggregator.load_state_dict(own)
+        with weight_file(self.config.weights, remedy) as weights:
+            # The file holds all of VGGT.
+            own = {n.removeprefix(PREFIX): x for n, x in weights.items() if n.startswith(PREFIX)}
+            self.aggregator.load_state_dict(own)

@@ -6,8 +6,7 @@ and no mask token. It is new code that follows facebookresearch/dinov2 (Apache-2
 tokens of all views.
 """
 
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Collection
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from qgs.contracts import ComponentConfig, ModelDims
 from qgs.contracts.settings import Heads
 from qgs.tokengs import NORM_EPS, LayerScale, Mlp, MultiViewViT
-from qgs_zoo.parts import load_weights, self_attention
+from qgs_zoo.parts import self_attention, weight_file
 
 PATCH = 14
 """Side of a patch, pixels."""
@@ -128,23 +127,20 @@ class DinoV2(nn.Module):
         `pretrained.` in files of Depth Anything V2. All other tensors in the file are ignored.
         Raises MissingExtraError for a file that does not fit.
         """
-        if file is not None:
-            load_weights(
-                file,
-                self._fill,
-                "download weights of DINOv2, such as dinov2_vits14_pretrain.pth, and set `weights` "
-                "to the file and `width`, `depth` and `heads` to its sizes",
-            )
-
-    def _fill(self, weights: Mapping[str, Tensor]) -> None:
-        own = self.state_dict()
-        mark = "patch_embed.proj.weight"
-        prefix = next((n.removesuffix(mark) for n in weights if n.endswith(mark)), None)
-        if prefix is None:
-            raise ValueError(f"no weights of DINOv2: the file has no tensor {mark}")
-        # A mask token and registers in the file are ignored.
-        found: dict[str, Any] = {n: weights[prefix + n] for n in own if prefix + n in weights}
-        self.load_state_dict(found)
+        if file is None:
+            return
+        remedy = (
+            "download weights of DINOv2, such as dinov2_vits14_pretrain.pth, and set `weights` to "
+            "the file and `width`, `depth` and `heads` to its sizes"
+        )
+        with weight_file(file, remedy) as weights:
+            mark = "patch_embed.proj.weight"
+            prefix = next((n.removesuffix(mark) for n in weights if n.endswith(mark)), None)
+            if prefix is None:
+                raise ValueError(f"no weights of DINOv2: the file has no tensor {mark}")
+            # A mask token and registers in the file are ignored.
+            own = self.state_dict()
+            self.load_state_dict({n: weights[prefix + n] for n in own if prefix + n in weights})
 
 
 class Tokens(nn.Module):

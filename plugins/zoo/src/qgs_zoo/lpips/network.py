@@ -5,7 +5,7 @@ the installed package `lpips`. The package is not imported, because it needs tor
 wheels work only with CUDA builds of torch.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from qgs.contracts import (
 from qgs.losses.photometric import too_small
 from qgs.precision import full_precision
 from qgs.types import LayerPrediction, Rendering, Views
-from qgs_zoo.parts import load_weights
+from qgs_zoo.parts import weight_file
 
 # The file of torchvision's VGG-16 in torch's cache.
 _VGG_FILE = "vgg16-397923af.pth"
@@ -93,26 +93,22 @@ class PerceptualDistance(nn.Module):
         linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
         vgg = weights or str(Path(torch.hub.get_dir()) / "checkpoints" / _VGG_FILE)
         remedy = f"download torchvision's {_VGG_FILE} and name it in the option `weights`"
-        load_weights(vgg, self._fill_blocks, remedy)
-        load_weights(str(linear), self._fill_linear, "install lpips 0.1 again")
+        with weight_file(vgg, remedy) as weights_of_vgg:
+            self.blocks = nn.ModuleList()
+            for numbers in _BLOCKS:
+                block = nn.Sequential()
+                for number in numbers:
+                    weight = weights_of_vgg[f"features.{number}.weight"]
+                    bias = weights_of_vgg[f"features.{number}.bias"]
+                    convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
+                    convolution.load_state_dict({"weight": weight, "bias": bias})
+                    block.extend([convolution, nn.ReLU(inplace=True)])
+                self.blocks.append(block)
+        with weight_file(str(linear), "install lpips 0.1 again") as factors:
+            # number 0 in the files is a dropout, which has no weights
+            names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
+            self.linear = nn.ParameterList([factors[name].float() for name in names])
         self.requires_grad_(False)
-
-    def _fill_blocks(self, vgg: Mapping[str, Tensor]) -> None:
-        self.blocks = nn.ModuleList()
-        for numbers in _BLOCKS:
-            block = nn.Sequential()
-            for number in numbers:
-                weight = vgg[f"features.{number}.weight"]
-                bias = vgg[f"features.{number}.bias"]
-                convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
-                convolution.load_state_dict({"weight": weight, "bias": bias})
-                block.extend([convolution, nn.ReLU(inplace=True)])
-            self.blocks.append(block)
-
-    def _fill_linear(self, factors: Mapping[str, Tensor]) -> None:
-        # number 0 in the files is a dropout, which has no weights
-        names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
-        self.linear = nn.ParameterList([factors[name].float() for name in names])
 
 
 class VggOptions(ComponentConfig):
