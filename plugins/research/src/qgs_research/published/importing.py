@@ -6,7 +6,6 @@ is neither used nor listed as unused by its layout is an error.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -43,26 +42,13 @@ NESTING = ("model", "state_dict", "module")
 """Keys under which training scripts store the state dict in a file with other values."""
 
 
-@dataclass(frozen=True)
-class WeightFile:
-    """State dict that was found in a file.
+def read_weight_file(path: Path, notes: list[str]) -> Mapping[str, Tensor]:
+    """Return the state dict in a file. Memory-mapped tensors are read when they are used.
 
-    tensors: tensors by name, memory-mapped if the format allows it. notes: lines that say how the
-    state dict was found in the file.
-    """
-
-    path: Path
-    tensors: Mapping[str, Tensor]
-    notes: tuple[str, ...] = ()
-
-
-def read_weight_file(path: Path) -> WeightFile:
-    """Open the state dict in a file. Memory-mapped tensors are read when they are used.
-
+    notes: list to which lines are appended that say how the state dict was found in the file.
     Raises FileNotFoundError for a missing file, and CheckpointError for a file that does not hold a
     state dict of tensors.
     """
-    notes = list[str]()
     if not path.is_file():
         raise FileNotFoundError(f"there is no file of weights {path}; correct the path")
     if path.suffix.lower() == ".safetensors":
@@ -81,7 +67,7 @@ def read_weight_file(path: Path) -> WeightFile:
         raise CheckpointError(f"{path}: the name of a file of weights must end in one of {known}")
     if not tensors:
         raise CheckpointError(f"{path} holds no tensors; save `model.state_dict()` to this file")
-    return WeightFile(path, tensors, tuple(notes))
+    return tensors
 
 
 def _read_torch(path: Path, notes: list[str]) -> dict[str, Tensor]:
@@ -146,20 +132,21 @@ def import_weights(
     recipe_file = out.with_suffix(".yaml") if recipe is None else None
     if recipe_file:
         refuse_existing(recipe_file)
-    file = _without_prefix(read_weight_file(weights))
-    shapes = shapes_of(file.tensors)
+    report = list[str]()
+    given = _without_prefix(read_weight_file(weights, report), report)
+    shapes = shapes_of(given)
     text = ""
     if recipe is None:
         layout, tree = fitting_recipe(shapes, str(weights))
         recipe = resolve(tree, overrides)
-        head = _head(file, layout, overrides)
+        head = _head(weights, layout, overrides)
         text = "\n".join([*head, dump(dict(recipe.tree if overrides else tree))])
     names = names_of(recipe)
-    tensors, converted = _as_float32(file, names)
+    tensors = _as_float32(given, names, weights, report)
     # Weights do not show activations, so report where the recipe differs from the published one.
     settings = differing_predictions(recipe.tree, resolve(names.layout.read(shapes)).tree)
     name = names.layout.name
-    imported = f"{name} weights {file.path.name}"
+    imported = f"{name} weights {weights.name}"
     write_checkpoint(out, tensors, recipe.tree, recipe.releases, {"imported": imported})
     if recipe_file:
         try:
@@ -168,9 +155,8 @@ def import_weights(
             # A checkpoint without a known recipe would be useless.
             out.unlink()
             raise
-    used = f"{name} ({names.layout.source}): {len(tensors)} tensors used"
-    report = [*file.notes, *converted, used]
-    dropped = [tensor for tensor in names.unused if tensor in file.tensors]
+    report.append(f"{name} ({names.layout.source}): {len(tensors)} tensors used")
+    dropped = [tensor for tensor in names.unused if tensor in given]
     if dropped:
         report.append(f"dropped {len(dropped)} tensors that the code of {name} never reads:")
         report += [f"  {tensor}" for tensor in dropped]
@@ -183,38 +169,42 @@ def import_weights(
     return report
 
 
-def _head(file: WeightFile, layout: WeightLayout, overrides: Sequence[str]) -> Sequence[str]:
+def _head(weights: Path, layout: WeightLayout, overrides: Sequence[str]) -> Sequence[str]:
     """Return lines of YAML that say what a derived recipe rests on."""
     return [
-        f"# Derived from {file.path.name}, weights of {layout.name} ({layout.source}).",
+        f"# Derived from {weights.name}, weights of {layout.name} ({layout.source}).",
         "# Shapes do not determine these options; the published values are used:",
         *(f"#   {choice}" for choice in layout.undecided),
         *(f"# Overridden: {override}" for override in overrides),
     ]
 
 
-def _without_prefix(file: WeightFile) -> WeightFile:
+def _without_prefix(given: Mapping[str, Tensor], notes: list[str]) -> Mapping[str, Tensor]:
     """Remove the prefix of all names of tensors if a known layout has the names without it.
 
     Training frameworks prepend the attribute that holds the model, such as `model.` or `module.`.
+    notes: list to which a line about a removed prefix is appended.
     """
     # A common prefix is a prefix of any name, so the first name is enough.
-    modules = next(iter(file.tensors)).split(".")[:-1]
+    modules = next(iter(given)).split(".")[:-1]
     for prefix in accumulate(f"{module}." for module in modules):
-        tensors = inside(prefix, file.tensors)
-        if len(tensors) == len(file.tensors) and recognise(shapes_of(tensors)):
-            note = f"removed the prefix {prefix!r} from all {len(tensors)} names"
-            return WeightFile(file.path, tensors, (*file.notes, note))
-    return file
+        tensors = inside(prefix, given)
+        if len(tensors) == len(given) and recognise(shapes_of(tensors)):
+            notes.append(f"removed the prefix {prefix!r} from all {len(tensors)} names")
+            return tensors
+    return given
 
 
-def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list[str]]:
-    """Return contiguous float32 tensors by their names in qgs, and notes about conversions.
+def _as_float32(
+    weights: Mapping[str, Tensor], names: Names, path: Path, notes: list[str]
+) -> dict[str, Tensor]:
+    """Return contiguous float32 tensors by their names in qgs.
 
-    Raises PublishedError for weights that are not floating-point numbers, and the error of
-    `refuse_nonfinite` for NaN and infinity.
+    path: file of the weights, for messages. notes: list to which a line about conversions is
+    appended. Raises PublishedError for weights that are not floating-point numbers, and the error
+    of `refuse_nonfinite` for NaN and infinity.
     """
-    given = names.from_published(file.tensors, file.path)
+    given = names.from_published(weights, path)
     others = {name: t.dtype for name, t in given.items() if t.dtype != torch.float32}
     kinds = Counter(str(dtype).removeprefix("torch.") for dtype in others.values())
     report = ", ".join(f"{count} of {len(given)} are {kind}" for kind, count in kinds.items())
@@ -222,13 +212,15 @@ def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list
     strange = [names.published[n] for n, dtype in others.items() if not dtype.is_floating_point]
     if strange:
         raise PublishedError(
-            f"{file.path} holds weights that are not floating-point numbers: {listed(strange)} "
+            f"{path} holds weights that are not floating-point numbers: {listed(strange)} "
             f"({report}); save the weights as float32"
         )
     # Names may share a tensor in a torch file; a checkpoint stores each on its own.
     tensors = copied({name: tensor.to(torch.float32) for name, tensor in given.items()})
-    refuse_nonfinite({names.published[name]: t for name, t in tensors.items()}, file.path)
-    return tensors, [f"converted to float32: {report}"] if others else []
+    refuse_nonfinite({names.published[name]: t for name, t in tensors.items()}, path)
+    if others:
+        notes.append(f"converted to float32: {report}")
+    return tensors
 
 
 def export_checkpoint(name: AnyPath, out: Path, half: bool) -> None:
