@@ -7,19 +7,25 @@ import torch
 import torch.nn.functional as F
 import yaml
 from qgs_anchors.landmark.observed import ObservedQueries
-from qgs_anchors.landmark.places import cells, colors_at, patch_centres, sampled, spread
+from qgs_anchors.landmark.places import cells, colors_at, sampled, spread
 from qgs_anchors.landmark.sweep import mismatch
 from qgs_locus.fields import CENTER
 from small_parts import made
 from torch.testing import assert_close
 from walk import arc, pinhole
 
-from qgs.geometry.rays import camera_rays
+from qgs.geometry.rays import camera_rays, pixel_directions
 from qgs.types import ImageMemory, Views
 
 GRID = (3, 4, 6)
 """Views, rows, columns."""
 CPU = torch.device("cpu")
+
+
+def patch_centres(rows, columns):
+    """Return places (rows * columns, 2) of the centres of a photo's patches, row by row."""
+    lens = torch.tensor([columns, rows, 0.0, 0.0])
+    return pixel_directions(lens, (rows, columns))[..., :2].flatten(0, 1)
 
 
 def test_bilinear_features_are_those_of_torch():
@@ -34,7 +40,7 @@ def test_bilinear_features_are_those_of_torch():
 
 def test_points_are_spread_evenly_over_all_photos():
     size = torch.tensor([64.0, 48.0])
-    pixels = patch_centres(48, 64, CPU) * size
+    pixels = patch_centres(48, 64) * size
     for views, count in product((1, 2, 5), (1, 256, 300)):
         view_N, place, _ = spread(count, views, (48, 64), 1.0, CPU)
         numbers = view_N.bincount(minlength=views)
@@ -74,7 +80,7 @@ def test_points_are_in_tiles_where_these_divide_the_photos():
         if grid:
             assert [height / high, width / wide] == pytest.approx(grid, rel=1e-5)
             for of in range(views):
-                assert_close(place[view == of], patch_centres(*grid, CPU))
+                assert_close(place[view == of], patch_centres(*grid))
         else:
             assert wide == pytest.approx(high, rel=1e-5)
 
