@@ -42,6 +42,8 @@ class RayBiasedCrossAttention(ContentCrossAttention):
 
     name = "ray_biased"
     raw_radius = RAW_RADIUS
+    # Another anchor has other fields, which the bandwidth depends on unless it is fixed.
+    fields_of_radius = staticmethod(radius_field)
     reads: ClassVar[Fields] = {**memory_fields("keys", "values", "patch_rays"), **CENTER_FIELD}
 
     class Config(RadiusOptions, ContentCrossAttention.Config):
@@ -72,12 +74,8 @@ class RayBiasedCrossAttention(ContentCrossAttention):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        return {**cls.reads, **cls.bandwidth_fields(config)}
-
-    @classmethod
-    def bandwidth_fields(cls, config: Config) -> Fields:
-        """Return the state fields that the bandwidth depends on; no field if it is fixed."""
-        return radius_field(config) if config.bandwidth == "radius" else {}
+        radius = cls.fields_of_radius(config) if config.bandwidth == "radius" else {}
+        return {**cls.reads, **radius}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:

@@ -23,6 +23,8 @@ class AnchorRefinement(Refinement):
 
     name = "refine"
     parts = ("`center`", "`radius`")
+    # Another anchor may have more radii.
+    field_of_radius = staticmethod(radius_field)
 
     class Config(RadiusOptions):
         center: bool = True
@@ -50,8 +52,8 @@ class AnchorRefinement(Refinement):
         if config.center:
             self.center_mlp = self._head(3)
         if config.radius:
-            # A subclass may refine another field, such as three radii: its spec has the channels.
-            ((self.raw_radius, spec),) = self.radius_field(config).items()
+            # The spec has the channels.
+            ((self.raw_radius, spec),) = self.field_of_radius(config).items()
             self.radius_mlp = self._head(int(spec.shape[0]))
 
     def _head(self, channels: int) -> Mlp:
@@ -63,14 +65,9 @@ class AnchorRefinement(Refinement):
         return mlp
 
     @classmethod
-    def radius_field(cls, config: Config) -> Fields:
-        """Return the state field of raw radii. A subclass may return a field with more channels."""
-        return radius_field(config)
-
-    @classmethod
     def fields_read(cls, config: Config) -> Fields:
         center = CENTER_FIELD if config.center else {}
-        return {**center, **(cls.radius_field(config) if config.radius else {})}
+        return {**center, **(cls.field_of_radius(config) if config.radius else {})}
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:

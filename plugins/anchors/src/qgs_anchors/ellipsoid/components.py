@@ -160,10 +160,7 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
 
     name = "ray_biased"
     raw_radius = RAW_RADII
-
-    @classmethod
-    def bandwidth_fields(cls, config: RayBiasedCrossAttention.Config) -> Fields:
-        return shape_fields(config) if config.bandwidth == "radius" else {}
+    fields_of_radius = staticmethod(shape_fields)
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """Return the bias of attention logits, from anchors in `state` and rays in `memory`."""
@@ -189,6 +186,7 @@ class EllipsoidRefinement(AnchorRefinement):
 
     name = "refine"
     parts = ("`center`", "`rotation`", "`radius`")
+    field_of_radius = staticmethod(radii_field)
 
     class Config(AnchorRefinement.Config):
         rotation: bool = True
@@ -200,11 +198,6 @@ class EllipsoidRefinement(AnchorRefinement):
         super().__init__(config, dims)
         if config.rotation:
             self.rotation_mlp = self._head(3)
-
-    @classmethod
-    def radius_field(cls, config: Config) -> Fields:
-        """Return the state field of the three raw radii (B, N, 3)."""
-        return radii_field(config)
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
