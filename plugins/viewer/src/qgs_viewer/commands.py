@@ -31,7 +31,7 @@ from qgs.wording import listed
 
 
 class FigureName(StrEnum):
-    """Names of the figures that `qgs figures` draws, in the order of their texts in figures.md."""
+    """Figures that `qgs figures` draws, in this order, by their functions in `sections`."""
 
     NOVEL_VIEWS = auto()
     QUERIES = auto()

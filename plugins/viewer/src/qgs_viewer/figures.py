@@ -1,6 +1,6 @@
 """Draw sections of the report with Matplotlib as figures for papers, in PDF and PNG."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +24,6 @@ DPI = 220
 # Pixels on the longer side of pictures that models render.
 SIDE = 512
 LISTING = "figures.md"
-FIGURES: Mapping[str, Callable[[Shown, Detail], Section]] = {
-    "novel_views": sections.novel_views,
-    "queries": sections.queries,
-    "anchors": sections.anchors,
-    "cross_attention": sections.attention,
-    "curves": sections.training_curves,
-}
 
 
 @torch.no_grad()
@@ -52,8 +45,8 @@ def write_figures(
         f"Figures of one scene show {first.scene}, with input frames {listed(first.input_frames)}."
     )
     texts = [f"# {' and '.join(model.name for model in models)}", *notes, scene]
-    for name in names or FIGURES:
-        section = FIGURES[name](models, detail)
+    for name in names or FigureName:
+        section: Section = getattr(sections, name)(models, detail)
         if not section.rows:
             yield f"left out {name}: {section.words['empty']}"
             texts.append(f"{name} is left out: {section.words['empty']}.")

@@ -112,7 +112,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     ranked = [view for scene in scenes for view in scene["views"]]
     # the best first, by the first model
     ranked.sort(key=lambda view: -view[0])
-    drawn = (sections.queries, sections.anchors, sections.attention, sections.training_curves)
+    drawn = (sections.queries, sections.anchors, sections.cross_attention, sections.curves)
     height, width = first.recipe.tree["data"]["image_size"]
     data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
     unseen = not any(score.given for score in first.evaluation.scores)

@@ -1,4 +1,4 @@
-"""Build the sections of report.html; `qgs figures` draws most of them as figures."""
+"""Build the sections of report.html; `qgs figures` draws those that a FigureName names."""
 
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -149,7 +149,7 @@ def anchors(models: Shown, detail: Detail) -> Section:
     return Section("anchors", rows, width=180)
 
 
-def attention(models: Shown, detail: Detail) -> Section:
+def cross_attention(models: Shown, detail: Detail) -> Section:
     """Return a section with the attention of one query of each model to photo patches.
 
     The columns show logits from content, bias from geometry, and the attention that results from
@@ -168,12 +168,12 @@ def attention(models: Shown, detail: Detail) -> Section:
     return Section("attention", rows, width=240)
 
 
-def training_curves(models: Shown, detail: Detail) -> Section:
+def curves(models: Shown, detail: Detail) -> Section:
     """Return a section with loss and PSNR over the training, for models with a history."""
-    curves = {model.name: model.curves for model in models if model.curves}
-    if not curves:
+    records = {model.name: model.curves for model in models if model.curves}
+    if not records:
         return Section("training", {})
-    figure = curves_figure(curves)
+    figure = curves_figure(records)
     tile = Tile(figure_picture(figure, dpi=168))
     return Section("training", {"": [tile]}, figure, width=600)
 
