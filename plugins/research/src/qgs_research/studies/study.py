@@ -50,10 +50,7 @@ def _folder_name(name: str) -> str:
 
 def _variant_name(name: str, info: ValidationInfo) -> str:
     # If the variants were refused, no name is known.
-    variants = info.data.get("variants", {name: None})
-    if name not in variants:
-        fix = did_you_mean(name, variants, "variants")
-        raise OptionError(f"there is no variant `{name}`", fix)
+    _check_known("variant", name, info.data.get("variants", {name: None}))
     return name
 
 
@@ -196,9 +193,9 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
         if not whole or any(not match[1] for match in matches[1:]):
             raise OptionError(f"`{side}` in `{text}` is not a sum of variants", _FORM)
         for sign, variant, evaluation in (match.groups() for match in matches):
-            _check_known("variant", variant, variants, text)
+            _check_known("variant", variant, variants, f"`{text}`: ")
             if evaluation:
-                _check_known("evaluation", evaluation, evaluations, text)
+                _check_known("evaluation", evaluation, evaluations, f"`{text}`: ")
             sums[variant, evaluation or MAIN] += -factor if sign == "-" else factor
     # A sum that does not cancel would depend on the data set, not on the variants.
     if sums.total():
@@ -212,10 +209,10 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     return Contrast(terms, -1 if comparison == "<" else 1)
 
 
-def _check_known(noun: str, name: str, known: Collection[str], text: str) -> None:
+def _check_known(noun: str, name: str, known: Collection[str], where: str = "") -> None:
     if name not in known:
         fix = did_you_mean(name, known, f"{noun}s")
-        raise OptionError(f"`{text}` names the unknown {noun} `{name}`", fix)
+        raise OptionError(f"{where}there is no {noun} `{name}`", fix)
 
 
 @dataclass(frozen=True)
