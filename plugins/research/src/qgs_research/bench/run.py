@@ -4,6 +4,7 @@ A workload sets the size of the inputs of a measured call; a task executes an op
 """
 
 import platform
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -194,8 +195,7 @@ def resident_bytes(field: str) -> int:
     """
     status = Path("/proc/self/status")
     if status.exists():
-        lines = status.read_text().splitlines()
-        (kibibytes,) = (line.split()[1] for line in lines if line.startswith(f"{field}:"))
+        (kibibytes,) = re.findall(rf"^{field}:\s*(\d+)", status.read_text(), re.MULTILINE)
         return int(kibibytes) * 1024
     # Imported here: Windows has none, and on Linux it would count the parent of the process.
     import resource
@@ -332,6 +332,6 @@ def in_turn(tasks: Sequence[Task], rounds: int, warmup: int) -> list[list[float]
 
 def _processor() -> str:
     information = Path("/proc/cpuinfo")
-    lines = information.read_text().splitlines() if information.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return (names or [platform.processor() or platform.machine()])[0]
+    text = information.read_text() if information.exists() else ""
+    found = re.search(r"^model name\s*:\s*(.*\S)", text, re.MULTILINE)
+    return found[1] if found else platform.processor() or platform.machine()
