@@ -73,16 +73,21 @@ def parts_of(features_BND: Tensor) -> tuple[Tensor, ...]:
     return features_BND.tensor_split([first, last], -1)
 
 
-def width_problems(context: RecipeContext) -> Iterable[Problem]:
-    """Report a model whose width is less than the number of channels that a pixel needs."""
-    least = min(WIDTHS)
-    if context.dims.width < least:
-        reason = f"the model is {context.dims.width} wide, but a pixel has at least {least} numbers"
-        fix = f"set model.width to one of {[*WIDTHS]}, for harmonics of degree 1, 2, 3, 4"
-        yield Problem("", reason, fix)
+class OfPixels:
+    """Part of components whose features hold the numbers of a pixel."""
+
+    @classmethod
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        """Report a model whose width is less than the number of channels that a pixel needs."""
+        width = context.dims.width
+        least = min(WIDTHS)
+        if width < least:
+            reason = f"the model is {width} wide, but a pixel has at least {least} numbers"
+            fix = f"set model.width to one of {[*WIDTHS]}, for harmonics of degree 1, 2, 3, 4"
+            yield Problem("", reason, fix)
 
 
-class PixelQueries(Queries):
+class PixelQueries(OfPixels, Queries):
     """One query for each pixel, with the rays through the pixel and the rotation of its camera.
 
     The features of a query are the encoder's features of the pixel. Their spherical harmonics are
@@ -92,10 +97,6 @@ class PixelQueries(Queries):
     name = "pixels"
     reads = memory_fields("features", "grid")
     writes = PIXEL_FIELDS
-
-    @classmethod
-    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        return width_problems(context)
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         assert memory.grid is not None
@@ -170,7 +171,7 @@ SCALE_SHIFT = 4.0
 """Number subtracted from DepthSplat's raw scales, which then start at softplus(-4) = 0.018."""
 
 
-class PixelHead(Head):
+class PixelHead(OfPixels, Head):
     """Base of heads without parameters that turn each query of `mvsplat/pixels` into a Gaussian."""
 
     writes: ClassVar[Fields] = {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]}
@@ -186,10 +187,6 @@ class PixelHead(Head):
     @property
     def gaussians_per_query(self) -> int:
         return 1
-
-    @classmethod
-    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        return width_problems(context)
 
     @full_precision
     def forward(self, state: QueryState) -> GaussianAttributes:

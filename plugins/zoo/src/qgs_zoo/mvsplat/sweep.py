@@ -20,7 +20,7 @@ from qgs.contracts.settings import Far
 from qgs.geometry.constants import constant
 from qgs.precision import at_least_float32, full_precision
 from qgs.types import Cameras, ImageMemory, Views
-from qgs_zoo.mvsplat.pixels import width_problems
+from qgs_zoo.mvsplat.pixels import OfPixels
 
 MIN_DEPTH = 1e-3
 """Least z by which a projection divides, world units. Points behind the camera then project far
@@ -229,7 +229,7 @@ class DepthRange(ComponentConfig):
     on DL3DV."""
 
 
-class SweepEncoder(Encoder):
+class SweepEncoder(OfPixels, Encoder):
     """Base of encoders that predict depths by a plane sweep.
 
     They make a token for each pixel, or for each square of pixels.
@@ -259,7 +259,7 @@ class SweepEncoder(Encoder):
 
     @classmethod
     def problems(cls, config: DepthRange, context: RecipeContext) -> Iterable[Problem]:
-        yield from width_problems(context)
+        yield from super().problems(config, context)
         size = context.image_size
         multiple = cls.multiple(config)
         if size and any(side % multiple for side in size):
