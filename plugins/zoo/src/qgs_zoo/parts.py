@@ -120,14 +120,10 @@ def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
             "rename these losses"
         )
     parts = [(outcome.total, outcome.terms, outcome.signs) for outcome in outcomes]
-    total, judged, signs = concatenated(parts, 0, _mean)
+    total, judged, signs = concatenated(parts, 0, lambda each, dim: torch.stack(each).mean(dim))
     # The maximum, because a mean would hide a single collapsed pass.
     spread = torch.stack([o.signs["deviation"] for o in outcomes]).amax()
     # Detached for the log: a graph would keep the memory of the step.
     detached = {n: term.detach() for n, term in terms.items()}
     total = total + torch.stack([*terms.values()]).sum()
     return Outcome(total, {**judged, **detached}, {**signs, "deviation": spread})
-
-
-def _mean(tensors: list[Tensor], dim: int) -> Tensor:
-    return torch.stack(tensors).mean(dim)
