@@ -13,8 +13,15 @@ plugin = Plugin(
     name="mvsplat",
     contract_version=1,
     components=(
-        *(MVSplatEncoder, PixelQueries, RayHead, OnRays),
-        *(DepthSplatEncoder, WorldHead, Exchange, DecayedSupervision, DepthError),
+        MVSplatEncoder,
+        PixelQueries,
+        RayHead,
+        OnRays,
+        DepthSplatEncoder,
+        WorldHead,
+        Exchange,
+        DecayedSupervision,
+        DepthError,
     ),
     examples=(
         MVSplatEncoder.Config(

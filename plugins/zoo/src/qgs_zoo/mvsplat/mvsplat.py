@@ -31,21 +31,6 @@ FACTOR = 4
 """Side of an image divided by the side of its feature map."""
 
 
-class Backbone(nn.Module):
-    """CNN and multi-view transformer that compute features at 1/4 of the image size."""
-
-    def __init__(self, width: int, stages: tuple[int, int, int]) -> None:
-        super().__init__()
-        self.backbone = CNN(width, (2, 1), stages)
-        self.transformer = WindowTransformer(width)
-
-    def forward(self, images_BV3HW: Tensor, neighbours_BVJ: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features of the CNN, and features of the transformer, each (B, V, D, H/4, W/4)."""
-        normalized = imagenet_normalised(images_BV3HW).flatten(0, 1)
-        cnn = self.backbone(normalized).features.unflatten(0, images_BV3HW.shape[:2])
-        return cnn, self.transformer(with_positions(cnn), neighbours_BVJ)
-
-
 class MVSplatEncoder(SweepEncoder):
     """Encoder that predicts depth and raw Gaussian of each pixel with a plane sweep.
 
@@ -91,15 +76,22 @@ class MVSplatEncoder(SweepEncoder):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.backbone = Backbone(config.features, config.cnn_widths)
+        # Both compute features at 1/4 of the image size; the names are published.
+        cnn = CNN(config.features, (2, 1), config.cnn_widths)
+        transformer = WindowTransformer(config.features)
+        self.backbone = nn.ModuleDict({"backbone": cnn, "transformer": transformer})
         self.depth_predictor = DepthPredictor(config, dims.width)
 
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
         neighbours = cyclic_neighbours(*views.cameras.shape, device=near_BV.device)
+        normalized_N3HW = imagenet_normalised(views.images).flatten(0, 1)
+        cnn_NDhw = self.backbone["backbone"](normalized_N3HW).features
+        cnn_BVDhw = cnn_NDhw.unflatten(0, views.cameras.shape)
         # The transformer reads other views in ascending order, the sweep in cyclic order.
-        cnn, features = self.backbone(views.images, neighbours.sort(-1).values)
+        ascending_BVJ = neighbours.sort(-1).values
+        features_BVDhw = self.backbone["transformer"](with_positions(cnn_BVDhw), ascending_BVJ)
         sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
-        return self.depth_predictor(views.images, cnn, features, sweep)
+        return self.depth_predictor(views.images, cnn_NDhw, features_BVDhw, sweep)
 
 
 class DepthPredictor(nn.Module):
@@ -114,8 +106,11 @@ class DepthPredictor(nn.Module):
         gaussian = numbers - 2
         matched = count + width
         self.corr_refine_net = OverViews(
-            *(conv3(matched, cost), group_norm(cost), nn.GELU()),
-            *(UNet(cost, config.cost_levels, pre_norm=False), conv3(cost, count)),
+            conv3(matched, cost),
+            group_norm(cost),
+            nn.GELU(),
+            UNet(cost, config.cost_levels, pre_norm=False),
+            conv3(cost, count),
         )
         self.compares = config.cost_volume
         self.regressor_residual = nn.Conv2d(matched, count, 1)
@@ -127,14 +122,16 @@ class DepthPredictor(nn.Module):
         self.upsampler = nn.Sequential(conv3(2 * width, width), upscale, nn.GELU())
         self.proj_feature = conv3(width, fine)
         self.refine_unet = OverViews(
-            *(conv3(3 + fine + 2, fine), nn.GroupNorm(4, fine), nn.GELU()),
+            conv3(3 + fine + 2, fine),
+            nn.GroupNorm(4, fine),
+            nn.GELU(),
             UNet(fine, config.depth_levels, pre_norm=False),
         )
         self.to_gaussians = two_convolutions(fine + 3 + width, 2 * gaussian, gaussian)
         self.to_disparity = two_convolutions(fine, 2 * fine, 2)
 
     def forward(
-        self, images_BV3HW: Tensor, cnn_BVDhw: Tensor, features_BVDhw: Tensor, sweep: Sweep
+        self, images_BV3HW: Tensor, cnn_NDhw: Tensor, features_BVDhw: Tensor, sweep: Sweep
     ) -> Tensor:
         """Return C numbers per pixel (B, V, C, H, W).
 
@@ -144,7 +141,6 @@ class DepthPredictor(nn.Module):
         views = images_BV3HW.shape[1]
         # These networks see images in [0, 1]; only the CNN sees normalised ones.
         images_N3HW = images_BV3HW.flatten(0, 1)
-        cnn_NDhw = cnn_BVDhw.flatten(0, 1)
         features_NDhw = features_BVDhw.flatten(0, 1)
         disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)
         # With fewer Gaussians than pixels, colours are means over squares.
