@@ -20,7 +20,7 @@ from qgs.types import Views
 from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
 from qgs_zoo.mvsplat.adapter import coefficients
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS, Stages
-from qgs_zoo.mvsplat.dpt import LEVELS, DptHead
+from qgs_zoo.mvsplat.dpt import LEVELS, DptHead, Joined
 from qgs_zoo.mvsplat.mvsplat import expected_disparity
 from qgs_zoo.mvsplat.pixels import WIDTHS as TOKEN_WIDTHS
 from qgs_zoo.mvsplat.pixels import degree_of
@@ -114,7 +114,7 @@ class Depths(NamedTuple):
     depths: list[Tensor]
     confidence: Tensor
     maps: list[Tensor]
-    joined: list[tuple[list[Tensor], list[Tensor]]]
+    joined: Joined
 
 
 class Pyramid(nn.Module):
@@ -241,16 +241,11 @@ class DepthPredictor(nn.Module):
             found.append(inverse)
         return found, confidence
 
-    def beside(
-        self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None
-    ) -> list[tuple[list[Tensor], list[Tensor]]]:
-        """Return maps that a DPT head concatenates with the ViT's maps, at 1/2, 1/4 and 1/8 size.
-
-        Each size has two lists: maps to put before the ViT's channels, and maps to put after them.
-        """
+    def beside(self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None) -> Joined:
+        """Return maps that a DPT head concatenates with the ViT's maps."""
         # The order of the release: CNN, ViT, transformer, depth. If its CNN ends at 1/4, nothing
         # joins at 1/8.
-        found: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in range(LEVELS)]
+        found: Joined = [([], []) for _ in range(LEVELS)]
         maps = [*cnn, *multi, depth]
         for place, (x, level) in enumerate(zip(maps, self.sizes.levels, strict=True)):
             if x is not None:

@@ -12,6 +12,9 @@ from torch import Tensor, nn
 
 from qgs_zoo.mvsplat.unet import conv3, resized, two_convolutions, zeroed
 
+Joined = list[tuple[list[Tensor], list[Tensor]]]
+"""Maps of other networks, two lists for each of the sizes 1/2, 1/4 and 1/8: maps to put before the
+ViT's channels, and maps to put after them."""
 LEVELS = 3
 """Number of resolutions (1/2, 1/4, 1/8) at which other networks' maps are appended to ViT maps."""
 
@@ -121,12 +124,11 @@ class DptHead(nn.Module):
     def forward(
         self,
         maps: Sequence[Tensor],  # four of (X, C, H/8, W/8)
-        joined: Sequence[tuple[Sequence[Tensor], Sequence[Tensor]]],
+        joined: Joined,
     ) -> Tensor:
         """Return a full-size map (X, F, H, W), or (X, 1, H, W) if the head ends in depth.
 
-        X: number of images. F: channels. joined: maps of other networks, two lists for each of the
-        sizes 1/2, 1/4 and 1/8: maps to put before the ViT's channels, and maps to put after them.
+        X: number of images. F: channels.
         """
         own = [
             resize(project(x))
