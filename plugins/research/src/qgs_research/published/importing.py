@@ -17,6 +17,7 @@ from qgs.checkpoint.model_file import CheckpointFile, refuse_nonfinite, write_ch
 from qgs.checkpoint.tensors import (
     CheckpointError,
     TensorFile,
+    Weights,
     copied,
     inside,
     nonfinite,
@@ -42,7 +43,7 @@ NESTING = ("model", "state_dict", "module")
 """Keys under which training scripts store the state dict in a file with other values."""
 
 
-def read_weight_file(path: Path, notes: list[str]) -> Mapping[str, Tensor]:
+def read_weight_file(path: Path, notes: list[str]) -> Weights:
     """Return the state dict in a file. Memory-mapped tensors are read when they are used.
 
     notes: list to which lines are appended that say how the state dict was found in the file.
@@ -179,7 +180,7 @@ def _head(weights: Path, layout: WeightLayout, overrides: Sequence[str]) -> Sequ
     ]
 
 
-def _without_prefix(given: Mapping[str, Tensor], notes: list[str]) -> Mapping[str, Tensor]:
+def _without_prefix(given: Weights, notes: list[str]) -> Weights:
     """Remove the prefix of all names of tensors if a known layout has the names without it.
 
     Training frameworks prepend the attribute that holds the model, such as `model.` or `module.`.
@@ -195,9 +196,7 @@ def _without_prefix(given: Mapping[str, Tensor], notes: list[str]) -> Mapping[st
     return given
 
 
-def _as_float32(
-    weights: Mapping[str, Tensor], names: Names, path: Path, notes: list[str]
-) -> dict[str, Tensor]:
+def _as_float32(weights: Weights, names: Names, path: Path, notes: list[str]) -> dict[str, Tensor]:
     """Return contiguous float32 tensors by their names in qgs.
 
     path: file of the weights, for messages. notes: list to which a line about conversions is

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
@@ -12,7 +11,7 @@ from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.wording import listed
 from qgs_research.published.mvsplat import DEPTHSPLAT, MVSPLAT
 from qgs_research.published.tokengs import LOCUSGS, TOKENGS, TOKENGS_2026_6
-from qgs_research.published.weight_layout import LayoutError, WeightLayout, renamed
+from qgs_research.published.weight_layout import LayoutError, Tree, WeightLayout, renamed
 
 # TokenGS comes first, because it is the most general.
 LAYOUTS = (TOKENGS, LOCUSGS, MVSPLAT, DEPTHSPLAT, TOKENGS_2026_6)
@@ -112,7 +111,7 @@ def recognise(shapes: Shapes) -> WeightLayout | None:
     return max(found, key=lambda layout: len(layout.marks), default=None)
 
 
-def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str, Any]]:
+def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, Tree]:
     """Return the layout of a state dict, and a recipe that fits it, as a plain mapping.
 
     origin: name of the file for messages. Raises PublishedError if no layout has these names, or if

@@ -1,10 +1,9 @@
 """Published weights of MVSplat and DepthSplat: parameter names, and recipes that fit."""
 
-from typing import Any
-
 from qgs.checkpoint.tensors import Shapes
 from qgs_research.published.weight_layout import (
     LayoutError,
+    Tree,
     layer_count,
     layout,
     size_at,
@@ -24,7 +23,7 @@ _HARMONICS = (4, 9, 16, 25)
 _EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement"))
 
 
-def _recipe(model: dict[str, Any]) -> dict[str, Any]:
+def _recipe(model: Tree) -> Tree:
     common = {
         "heads": 1,
         "queries": {"type": "mvsplat/pixels"},
@@ -57,7 +56,7 @@ def _unet_levels(shapes: Shapes, name: str) -> int:
     return blocks // 2
 
 
-def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
+def _read_mvsplat(shapes: Shapes) -> Tree:
     backbone = "encoder.backbone.backbone."
     raw = size_at(shapes, _PREDICTOR + "to_gaussians.2.weight")
     encoder = {
@@ -83,7 +82,7 @@ def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
     )
 
 
-def depthsplat_encoder(shapes: Shapes) -> dict[str, Any]:
+def depthsplat_encoder(shapes: Shapes) -> Tree:
     """Return the options of DepthSplat's encoder that fit the shapes of published weights.
 
     Raises LayoutError for a number of scales or blocks that no published model has.
@@ -119,7 +118,7 @@ def depthsplat_encoder(shapes: Shapes) -> dict[str, Any]:
     }
 
 
-def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
+def _read_depthsplat(shapes: Shapes) -> Tree:
     encoder = depthsplat_encoder(shapes)
     raw = size_at(shapes, _HEAD)
     two = encoder["scales"] == 2

@@ -1,11 +1,10 @@
 """Published weights of TokenGS, LocusGS and TokenGS 2026.6: names, and recipes that fit."""
 
-from typing import Any
-
 from qgs.checkpoint.tensors import Shapes
 from qgs.tokengs.head import CHANNELS
 from qgs_research.published.weight_layout import (
     LayoutError,
+    Tree,
     layer_count,
     layout,
     real_ratio,
@@ -21,7 +20,7 @@ LATENTS = "enc_dec_backbone.latents"
 LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
 
 
-def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
+def backbone(shapes: Shapes, queries: str) -> Tree:
     """Return the options of `model` that TokenGS shares with models built on it.
 
     queries: component type of `model.queries`. Raises LayoutError for shapes that do not fit.
@@ -54,7 +53,7 @@ def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
     }
 
 
-def read_tokengs(shapes: Shapes) -> dict[str, Any]:
+def read_tokengs(shapes: Shapes) -> Tree:
     """Return the recipe that fits the weights of a TokenGS. Raises LayoutError if none fits."""
     model = backbone(shapes, "qgs/latent")
     model["decoder"] |= {
@@ -72,7 +71,7 @@ def read_tokengs(shapes: Shapes) -> dict[str, Any]:
 TOKENGS = layout("tokengs", read_tokengs)
 
 
-def _read_locus(shapes: Shapes) -> dict[str, Any]:
+def _read_locus(shapes: Shapes) -> Tree:
     # The ablations of the paper omit parts, so the names that exist determine the variant.
     radius = "gs_anchor_radius_raw" in shapes
     ray_biased = DECODER + "0.gs_cross_attn.geo_scale" in shapes
@@ -101,7 +100,7 @@ def _read_locus(shapes: Shapes) -> dict[str, Any]:
 LOCUSGS = layout("locus", _read_locus, TOKENGS)
 
 
-def _read_2026(shapes: Shapes) -> dict[str, Any]:
+def _read_2026(shapes: Shapes) -> Tree:
     tree = read_tokengs(shapes)
     model = tree["model"]
     model["encoder"] |= _encoder(shapes, model["encoder"]["depth"])
@@ -130,7 +129,7 @@ def _channels(shapes: Shapes, module: str) -> int:
     return size_at(shapes, name, 1) if name in shapes else 0
 
 
-def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
+def _encoder(shapes: Shapes, depth: int) -> Tree:
     """Return the encoder options that TokenGS 2026.6 adds to TokenGS. depth: number of blocks."""
     scales = layer_count(shapes, READOUT)
     if scales > depth:
@@ -140,7 +139,7 @@ def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
         )
     # files do not say which blocks are read: the release reads every second one
     step = 2 if 2 * scales <= depth + 1 else 1
-    found: dict[str, Any] = {"blocks": list(range(depth - step * (scales - 1), depth + 1, step))}
+    found: Tree = {"blocks": list(range(depth - step * (scales - 1), depth + 1, step))}
     if LATENTS not in shapes:
         return {"type": "tokengs2026/multiscale_vit", **found}
     blocks = layer_count(shapes, LATENT_BLOCK)

@@ -10,6 +10,9 @@ from typing import Any
 
 from qgs.checkpoint.tensors import Shapes
 
+Tree = dict[str, Any]
+"""Recipe, or a part of it, as a plain mapping."""
+
 
 class LayoutError(ValueError):
     """Error for published weights that fit no recipe."""
@@ -54,7 +57,7 @@ class WeightLayout:
     components: Mapping[str, Sequence[str]]
     renames: Mapping[str, str]
     marks: Sequence[str]
-    read: Callable[[Shapes], dict[str, Any]]
+    read: Callable[[Shapes], Tree]
     undecided: Sequence[str]
     unused: Sequence[tuple[str, str]] = ()
 
@@ -65,7 +68,7 @@ class WeightLayout:
 
 
 def layout(
-    name: str, read: Callable[[Shapes], dict[str, Any]], base: WeightLayout | None = None
+    name: str, read: Callable[[Shapes], Tree], base: WeightLayout | None = None
 ) -> WeightLayout:
     """Load the layout in `name`.toml.
 
