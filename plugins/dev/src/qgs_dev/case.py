@@ -15,6 +15,7 @@ from qgs.contracts import Component, ComponentConfig, Fields, Metric, ModelDims
 from qgs.recipe.build import load_pretrained
 from qgs.recipe.yaml_text import dump
 from qgs.tokengs import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
+from qgs.types import Size
 
 # The smallest model with two heads and two layers, so that the checks of a plugin take seconds.
 SMALL = ModelDims(width=32, heads=2, depth=2)
@@ -66,7 +67,7 @@ class Case:
 
     config: ComponentConfig
     dims: ModelDims = SMALL
-    image_size: tuple[int, int] | None = None
+    image_size: Size | None = None
     state_dict: Mapping[str, tuple[int, ...]] | None = None
 
     def __post_init__(self) -> None:
@@ -112,7 +113,7 @@ class Case:
         return f"{self.slot}/{self.component.name}{options}"
 
     @property
-    def size(self) -> tuple[int, int]:
+    def size(self) -> Size:
         """Size (H, W) of the views in pixels."""
         if self.image_size is not None:
             return self.image_size
@@ -131,7 +132,7 @@ class Case:
             return "cuda"
         raise CannotCheck(f"runs only on {' or '.join(devices)}, which this machine does not have")
 
-    def problems(self, size: tuple[int, int] | None = None) -> list[contracts.Problem]:
+    def problems(self, size: Size | None = None) -> list[contracts.Problem]:
         """Return the problems that the component reports for its options and images of `size`.
 
         size: (H, W), by default `self.size`.

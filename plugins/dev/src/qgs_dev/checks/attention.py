@@ -11,7 +11,7 @@ from torch import Tensor
 from qgs.containers import map_tensors
 from qgs.contracts import Encoder, Queries
 from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.types import ImageMemory, Photos, QueryState, Views
+from qgs.types import ImageMemory, Photos, QueryState, Size, Views
 from qgs_dev.case import CannotCheck, Case
 from qgs_dev.inputs import Inputs, Sizes, inputs_of
 from qgs_dev.vocabulary import Trial, cast, difference, expect, expect_same, floating, masked, scene
@@ -229,7 +229,7 @@ def check_project_makes_the_memory_again(case: Case) -> None:
     expect(difference(memory, other), "`project` of other features gives the same memory")
 
 
-def _wide_and_tall(case: Case, size: tuple[int, int]) -> Iterator[tuple[str, Views]]:
+def _wide_and_tall(case: Case, size: Size) -> Iterator[tuple[str, Views]]:
     """Yield views of `size` (H, W), and of (W, H) if the component takes it, with descriptions."""
     for image in dict.fromkeys([size, (size[1], size[0])]):
         if image == size or not case.problems(image):

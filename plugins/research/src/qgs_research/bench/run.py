@@ -29,7 +29,7 @@ from qgs.precision import Precision, autocast
 from qgs.recipe import Recipe, resolve
 from qgs.train.state import make_optimizer
 from qgs.train.training_pass import TrainingPass
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Cameras, Gaussians, Size, Views
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class Workload:
 
     views: int
     targets: int
-    size: tuple[int, int]
+    size: Size
     batch: int = 1
     device: str = "cpu"
     precision: Precision = "float32"
 
 
 def workload_of(
-    recipe: Recipe, views: int | None = None, size: tuple[int, int] | None = None, **more: Any
+    recipe: Recipe, views: int | None = None, size: Size | None = None, **more: Any
 ) -> Workload:
     """Return the workload for `recipe`.
 
@@ -67,7 +67,7 @@ def workload_of(
     return Workload(views or recipe.views.inputs, recipe.views.targets, size, **more)
 
 
-def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
+def posed_photos(batch: int, count: int, size: Size, seed: int) -> Views:
     """Return `count` random photos (noise) for each of `batch` scenes, with cameras and times.
 
     Cameras are on an arc and look at its centre (0, 0, 1). The pose of the first camera is the
