@@ -1,10 +1,8 @@
 """What commands print, those of plugins too, holds no control characters of names and texts."""
 
-import io
 import json
 import re
 import sys
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -55,7 +53,7 @@ COMMANDS = (
 
 
 @pytest.fixture
-def printed(install, here, monkeypatch):
+def printed(install, here, monkeypatch, capsys):
     """What a command prints where all is called NAME."""
     monkeypatch.setenv("COLUMNS", "400")
     Path(f"{NAME}.yaml").write_text(RECIPE)
@@ -67,16 +65,15 @@ def printed(install, here, monkeypatch):
     install("box", "box", MODELS)
 
     def printed(command):
-        with monkeypatch.context() as patch, redirect_stdout(io.StringIO()) as out:
+        with monkeypatch.context() as patch:
             # rich is left as it is
             patch.setattr(rich.text, "strip_control_codes", rich.text.strip_control_codes)
             patch.setattr(sys, "argv", ["qgs", *command.split(" ")])
-            with redirect_stderr(out):
-                try:
-                    main()
-                except (Exception, SystemExit):
-                    sys.excepthook(*sys.exc_info())
-        return out.getvalue()
+            try:
+                main()
+            except (Exception, SystemExit):
+                sys.excepthook(*sys.exc_info())
+        return "".join(capsys.readouterr())
 
     return printed
 
