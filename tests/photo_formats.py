@@ -90,13 +90,16 @@ def row_of_frames(count, step=1.0, **top):
     return {**top, "frames": frames}
 
 
-def write_row(folder, images, step=1.0, cameras=(), **top):
-    """Images and their `row_of_frames`. cameras: what the first frames have of their own."""
+def write_row(folder, images, step=1.0, cameras=(), kind="PNG", **top):
+    """Images and their `row_of_frames`. cameras: what the first frames have of their own.
+
+    kind: of the files, whatever their names say.
+    """
     content = row_of_frames(len(images), step, **top)
     for frame, own in zip(content["frames"], cameras, strict=False):
         frame.update(own)
     for number, image in enumerate(images):
-        put(folder / f"images/{number}.png", encoded(image))
+        put(folder / f"images/{number}.png", encoded(image, kind))
     write_json(folder / "transforms.json", content)
     return folder
 

@@ -8,11 +8,11 @@ import photo_formats
 import pytest
 import torch
 from commands import done
-from photo_formats import listed_lens, put, row_of_frames
+from photo_formats import listed_lens, put, write_row
 from PIL import Image
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools import packing
-from tables import assert_near, must_refuse, names_in, write_json
+from tables import assert_near, must_refuse, names_in
 from torch.testing import assert_close
 from upath import UPath
 
@@ -20,21 +20,22 @@ from qgs.recipe import resolve
 
 SIZE = (24, 32)
 GIVEN = listed_lens(60.0, 61.0, 31.0, 25.0, 48, 64)
+MASKED = [{}, {"mask_path": "mask.png"}]
 KEPT = {
     "png": {},
-    "jpg": {"suffix": "jpg"},
-    "mpo": {"suffix": "mpo"},
-    "masks": {"mask": True},
-    "times": {"times": [0.1, 0.2, 0.2, 0.7]},
-    "late": {"times": [1.7e9, 1.7e9, 1.7e9 + 0.01, 0]},
+    "jpg": {"kind": "JPEG"},
+    "mpo": {"kind": "MPO"},
+    "masks": {"cameras": MASKED},
+    "times": {"cameras": [{"time": time} for time in (0.1, 0.2, 0.2, 0.7)]},
+    "late": {"cameras": [{"time": time} for time in (1.7e9, 1.7e9, 1.7e9 + 0.01, 0)]},
 }
 LENS = {"k1": -0.2, "camera_model": "OPENCV"}
 CHANGED = {
-    "webp": {"suffix": "webp"},
+    "webp": {"kind": "WEBP"},
     "grey": {"convert": "L"},
     "transparent": {"convert": "RGBA"},
     "distorted": {"p1": 0.01, **LENS},
-    "distorted masks": {"mask": True, **LENS},
+    "distorted masks": {"cameras": MASKED, **LENS},
 }
 """Scenes whose photos keep their bytes, and others."""
 
@@ -44,20 +45,10 @@ def noise(seed, kind):
     return Image.fromarray(pixels).convert(kind)
 
 
-def photos(path, frames=4, suffix="png", convert="RGB", mask=False, times=None, **top):
-    """A scene of noise in nerfstudio's format."""
-    listing = row_of_frames(frames, 0.3, **GIVEN | top)
-    (path / "images").mkdir(parents=True)
-    for i, entry in enumerate(listing["frames"]):
-        entry["file_path"] = f"images/{i}.{suffix}"
-        noise(i, convert).save(path / entry["file_path"])
-        entry["transform_matrix"][2][3] = -1000.7
-        if mask and i % 2:
-            entry["mask_path"] = f"mask{i}.png"
-            noise(100 + i, "L").save(path / entry["mask_path"])
-        if times:
-            entry["time"] = times[i]
-    write_json(path / "transforms.json", listing)
+def photos(path, frames=4, convert="RGB", **options):
+    """A scene of noise in nerfstudio's format, by cameras that stand far apart."""
+    write_row(path, [noise(i, convert) for i in range(frames)], 300.7, **GIVEN | options)
+    noise(100, "L").save(path / "mask.png")
 
 
 source = partial(photo_formats.opened, size=SIZE, holdout=3)
@@ -110,8 +101,8 @@ def test_chunks_read_as_their_source_does(kinds, tmp_path):
 
     entries = torch.load(tmp_path / "train/000000.torch", weights_only=True)
     entries = {entry["key"]: entry for entry in entries}
-    for kind, options in KEPT.items():
-        file = kinds / f"{kind}/images/2.{options.get('suffix', 'png')}"
+    for kind in KEPT:
+        file = kinds / f"{kind}/images/2.png"
         assert bytes(entries[kind]["images"][2].numpy()) == file.read_bytes()
     assert {"url", "timestamps"} <= entries["png"].keys()
     cameras = entries["png"]["cameras"]
