@@ -8,15 +8,11 @@ import photo_formats
 import pytest
 import torch
 from PIL import Image
-from planted import save
+from planted import as_tensor, entry, save
 from qgs_photos.datasets.chunk_files import load_chunk
 from qgs_photos.datasets.chunks import ChunksSource
 from tables import assert_equal, assert_near, must_not_find, must_refuse, write_json
 from upath import UPath
-
-
-def as_tensor(data):
-    return torch.tensor(list(data), dtype=torch.uint8)
 
 
 def encoded(color, size=(64, 36)):
@@ -24,22 +20,16 @@ def encoded(color, size=(64, 36)):
     return as_tensor(photo_formats.encoded(Image.new(mode, size, color)))
 
 
-def camera(x):
-    """A camera at (x, 2, 3) that is turned a quarter about z."""
-    w2c = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]], float)
-    w2c[:, 3] = -w2c[:, :3] @ [x, 2, 3]
-    return [0.5, 0.9, 0.45, 0.55, 0, 0, *w2c.flatten()]
+def pose(x):
+    """A camera at (x, 2, 3); its x axis is the world's z."""
+    c2w = np.eye(4)[[1, 2, 0, 3]]
+    c2w[:3, 3] = x, 2, 3
+    return c2w
 
 
 def record(key, frames=4, **extra):
-    return {
-        "key": key,
-        "url": "",
-        "timestamps": torch.arange(frames) * 1000,
-        "cameras": torch.tensor([camera(i) for i in range(frames)]),
-        "images": [encoded((10 * i, 50, 200)) for i in range(frames)],
-        **extra,
-    }
+    images = [encoded((10 * i, 50, 200)) for i in range(frames)]
+    return entry(key, (0.5, 0.9, 0.45, 0.55), map(pose, range(frames)), images) | extra
 
 
 def write(folder, index=True, **chunks):
@@ -47,7 +37,7 @@ def write(folder, index=True, **chunks):
     keys = {}
     for name, records in chunks.items():
         save(folder / f"{name}.torch", records)
-        keys |= {entry["key"]: f"{name}.torch" for entry in records if index}
+        keys |= {record["key"]: f"{name}.torch" for record in records if index}
     if index:
         write_json(folder / "index.json", keys)
 
@@ -71,7 +61,7 @@ def test_frames_and_cameras(tmp_path):
     c2w = scene.cameras.c2w[5]
     assert c2w.dtype == torch.float64
     assert_near(c2w[:3, 3], [5, 2, 3])
-    assert c2w[:3, 0].tolist() == [0, 1, 0]  # the camera's x axis
+    assert c2w[:3, 0].tolist() == [0, 0, 1]  # the camera's x axis
     # 64 x 36 cropped to 36 x 36, 14 pixels off the left, then scaled by 16 / 36
     wanted = np.array([0.5 * 64, 0.9 * 36, 0.45 * 64 - 14, 0.55 * 36]) * 16 / 36
     assert_near(scene.cameras.intrinsics[0], wanted)

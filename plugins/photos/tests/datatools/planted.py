@@ -73,14 +73,26 @@ def assert_told(path, patterns, index=(), geometry=1):
     assert alike(found, patterns), found
 
 
+def as_tensor(data):
+    return torch.frombuffer(bytearray(data), dtype=torch.uint8)
+
+
+def entry(key, lens, poses, images):
+    """A scene of a chunk. lens: in parts of the sides. images: files as tensors."""
+    cameras = [[*lens, 0, 0, *np.linalg.inv(c2w)[:3].flatten()] for c2w in poses]
+    return {
+        "key": key,
+        "url": "",
+        "timestamps": torch.arange(len(images)) * 1000,
+        "cameras": torch.tensor(cameras, dtype=torch.float32),
+        "images": images,
+    }
+
+
 def record(key, shots):
-    """A scene of a chunk."""
     lens = np.array(INTRINSICS) / (SIZE[::-1] * 2)
-    cameras = [[*lens, 0, 0, *np.linalg.inv(shot.c2w)[:3].flatten()] for shot in shots]
-    images = [torch.frombuffer(bytearray(s.encoded()), dtype=torch.uint8) for s in shots]
-    stamps = torch.arange(len(shots))
-    cameras = torch.tensor(cameras, dtype=torch.float32)
-    return {"key": key, "url": "", "timestamps": stamps, "cameras": cameras, "images": images}
+    images = [as_tensor(shot.encoded()) for shot in shots]
+    return entry(key, lens, [shot.c2w for shot in shots], images)
 
 
 def save(chunk, content):

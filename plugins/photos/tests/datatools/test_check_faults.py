@@ -166,12 +166,12 @@ def test_faults_of_a_scene_in_a_chunk(shots, tmp_path):
     pixels["cameras"][:, :4] *= torch.tensor([180, 120] * 2)
     save(tmp_path / "test/0.torch", records)
     expected = (
-        "error: a, frame 2 (2): the pose has NaN*",
-        "error: b, frames 0-5 (0 to 5): *on one point*",
-        "error: c, frame 4 (4): the image cannot be decoded*",
-        "error: d, frames 0-5 (0 to 5): the poses do not fit the photos: *",
-        "error: e, frames 0-5 (0 to 5): *are implausible*",
-        "error: f, frames 0-5 (0 to 5): *look like pixels*",
+        "error: a, frame 2 (2000): the pose has NaN*",
+        "error: b, frames 0-5 (0 to 5000): *on one point*",
+        "error: c, frame 4 (4000): the image cannot be decoded*",
+        "error: d, frames 0-5 (0 to 5000): the poses do not fit the photos: *",
+        "error: e, frames 0-5 (0 to 5000): *are implausible*",
+        "error: f, frames 0-5 (0 to 5000): *look like pixels*",
     )
     assert_told(tmp_path, expected, geometry=6)
 
