@@ -12,7 +12,7 @@ from photo_formats import listed_lens, put, write_row
 from PIL import Image
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools import packing
-from tables import assert_near, must_refuse, names_in
+from tables import assert_equal, assert_near, must_refuse, names_in
 from torch.testing import assert_close
 from upath import UPath
 
@@ -67,8 +67,7 @@ def same(before, after, tolerance=0.0, split="train"):
         assert [*map(one.frame_name, frames)] == [*map(other.frame_name, frames)]
         assert [*one.held_out] == [*other.held_out]
         assert (one.images(frames) - other.images(frames)).abs().max() <= tolerance, one.name
-        for expected, given in ((one.times, other.times), (one.masks(frames), other.masks(frames))):
-            assert given is None if expected is None else torch.equal(expected, given)
+        assert_equal((one.times, one.masks(frames)), (other.times, other.masks(frames)))
         close(one.cameras.intrinsics, other.cameras.intrinsics)
         close(one.cameras.c2w, other.cameras.c2w)
 
