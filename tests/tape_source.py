@@ -55,9 +55,9 @@ INSTALLED = ("qgs-tapes", "tapes", "from tape_source import plugin")
 """For the fixture `install`."""
 
 
-def write_tape(file):
+def write_tape(file, step=0.1):
     """Noise, seen by cameras a step apart."""
     file.parent.mkdir(parents=True, exist_ok=True)
     images = np.random.default_rng(0).integers(0, 256, (6, 16, 16, 3), np.uint8)
     with file.open("wb") as opened:
-        np.savez(opened, images=images, c2w=along_x(0.1 * np.arange(6)))
+        np.savez(opened, images=images, c2w=along_x(step * np.arange(6)))
