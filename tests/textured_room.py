@@ -26,10 +26,13 @@ class Shot:
         return photo_formats.encoded(self.image, "JPEG", quality=92)
 
 
-def walk(count):
-    """Photos along a rising arc that turns and rolls, so that no convention is ambiguous."""
+def walk(count, scale=1):
+    """Photos along a rising arc that turns and rolls, so that no convention is ambiguous.
+
+    scale: of their size, over SIZE.
+    """
     noise = np.random.default_rng(0).random((40, 40, 40))
-    return [_shot(noise, pose) for pose in _poses(count)]
+    return [_shot(noise, pose, scale) for pose in _poses(count)]
 
 
 def photos_of(shots):
@@ -50,13 +53,13 @@ def _poses(count):
     return poses
 
 
-def _shot(noise, pose):
+def _shot(noise, pose, scale):
     """Every pixel's ray meets the box's walls, at 1.2, 1 and 1.5 from the origin, from inside.
 
     They are cut out of a block of noise.
     """
-    fx, fy, cx, cy = INTRINSICS
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    fx, fy, cx, cy = scale * np.array(INTRINSICS)
+    y, x = np.mgrid[: scale * SIZE[0], : scale * SIZE[1]] + 0.5
     rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], -1) @ pose[:3, :3].T
     half = np.array([1.2, 1.0, 1.5])
     reach = ((np.sign(rays) * half - pose[:3, 3]) / rays).min(-1)

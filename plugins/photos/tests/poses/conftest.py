@@ -10,11 +10,7 @@ from walked import PHOTOS, QUIET, SCALE, cut
 
 @pytest.fixture(scope="session")
 def shots():
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("SIZE", "INTRINSICS"):
-            larger = tuple(SCALE * number for number in getattr(textured_room, name))
-            patch.setattr(textured_room, name, larger)
-        return textured_room.walk(PHOTOS)
+    return textured_room.walk(PHOTOS, SCALE)
 
 
 @pytest.fixture(scope="session")
