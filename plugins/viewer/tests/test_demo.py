@@ -164,9 +164,7 @@ def page(tmp_path_factory):
     steps = [{"step": n, "seconds": n / 2, "loss": 1 / n, "psnr": 10.0 + n} for n in range(1, 9)]
     (folder / RUN / "history.jsonl").write_text("\n".join(map(json.dumps, steps)))
     more = stand_in(folder / "more.safetensors", queries=12)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        done("demo", "--model", RUN, "--model", more)
+    done("demo", "--model", folder / RUN, "--model", more, "--out", folder / "demo")
     return (folder / "demo/report.html").read_text()
 
 
