@@ -53,7 +53,7 @@ class Planted:
         """All rooms at once."""
         for number, room in enumerate(self.rooms):
             room.write(self.root / f"room {number:02}")
-        report = check(UPath(self.root), Options(geometry))
+        report = checked(self.root, geometry=geometry)
         assert not report.general
         wrong = []
         for scene, lines in zip(report.scenes, self.rooms.values(), strict=True):
@@ -68,8 +68,12 @@ def alike(lines, patterns):
     return len(lines) == len(patterns) and all(map(fnmatchcase, lines, patterns))
 
 
+def checked(path, index=(), **options):
+    return check(UPath(path), Options(**options), index)
+
+
 def assert_told(path, patterns, index=(), geometry=1):
-    found = [*map(str, check(UPath(path), Options(geometry), index).findings)]
+    found = [*map(str, checked(path, index, geometry=geometry).findings)]
     assert alike(found, patterns), found
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from photo_formats import encoded
 from PIL import Image
-from planted import ALL, HASH, INTRINSICS, SIZE, assert_told, record, save
-from qgs_photos.datatools.check import Options, check
+from planted import ALL, HASH, INTRINSICS, SIZE, assert_told, checked, record, save
 from tables import must_not_find
 from upath import UPath
 
@@ -19,7 +18,7 @@ OPENGL = [1, -1, -1, 1]
 
 def test_untouched_sets_pass(good):
     for name in ("room", "chunks", "archives"):
-        report = check(UPath(good / name), Options())
+        report = checked(good / name)
         assert not report.findings
         for scene in report.scenes:
             assert float(scene.epipolar) < 0.6
@@ -219,17 +218,16 @@ def test_other_data_sets_beside_scenes_are_named(room, chunks):
 
 
 def test_single_files_are_data_sets_too(good):
-    options = Options(headers_only=True)
     for file, held in (
         (f"archives/{HASH}.zip", [HASH]),
         ("chunks/test/0.torch", ["a", "b"]),
         ("room/transforms.json", ["room"]),
     ):
-        assert [scene.name for scene in check(UPath(good / file), options).scenes] == held
+        assert [scene.name for scene in checked(good / file, headers_only=True).scenes] == held
 
 
 def test_nothing_passes_in_silence(good):
     room = UPath(good / "room")
     absent = "holds no data of the format chunks: leave --format out"
-    must_not_find(absent, check, room, Options(format="chunks"))
-    must_not_find("no evaluation index at", check, room, Options(geometry=0), [room / "none.json"])
+    must_not_find(absent, checked, room, format="chunks")
+    must_not_find("no evaluation index at", checked, room, [room / "none.json"], geometry=0)

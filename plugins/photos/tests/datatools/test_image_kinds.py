@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from photo_formats import encoded, scene, turned, write_row
 from PIL import Image
-from qgs_photos.datatools.check import Options, check
+from planted import checked
 from tables import must_refuse
-from upath import UPath
 
 SIZE = (4, 6)
 GREY = np.uint8([[0, 1, 127, 128, 254, 255]] * 4)
@@ -31,7 +30,7 @@ def photos(folder, files, key="file_path"):
         if not isinstance(data, bytes):
             data = encoded(data, "TIFF" if name.endswith("tif") else "PNG")
         (folder / name).write_bytes(data)
-    return scene(folder, SIZE), check(UPath(folder), Options(geometry=0)).findings
+    return scene(folder, SIZE), checked(folder, geometry=0).findings
 
 
 def wide(values, factor):

@@ -8,8 +8,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from photo_formats import encoded, scene, turned
 from PIL import Image
-from planted import Room
-from qgs_photos.datatools.check import Options, check
+from planted import Room, checked
 from qgs_photos.datatools.entries import Encoding, encoded_frames
 from qgs_photos.datatools.geometry import Geometry, geometry_findings
 from qgs_photos.datatools.photos import Decoded, DecodedScene
@@ -65,7 +64,7 @@ def test_cameras_and_pixels_are_the_upright_ones(written, shots):
         assert_allclose(read.images([1])[0].permute(1, 2, 0) * 255, shots[1].image, 1e-6)
         assert_allclose(read.masks([1])[0, 0], shots[1].image[..., 0] > 128)
         assert read.stored_size(0) == SIZE
-        report = check(UPath(folder), Options(threads=1))
+        report = checked(folder)
         assert not report.findings
         assert float(report.scenes[0].epipolar) < 1
 
