@@ -167,11 +167,9 @@ def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path
     assert "images/1.png" in result.left_out["s3"]
     must_refuse(
         "no scene to pack: s3: ",
-        packing.pack,
-        six,
-        {"train": {"s3": ("train", 3)}, "test": {}},
-        UPath(tmp_path / "none"),
-        {},
+        pack,
+        source(tmp_path / "scenes/s3"),
+        tmp_path / "none",
         leave_out_broken=True,
     )
 
