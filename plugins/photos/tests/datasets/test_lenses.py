@@ -3,9 +3,7 @@
 import math
 
 import numpy as np
-import pytest
 from photo_formats import numbered_photos, scene
-from PIL import Image
 from qgs_photos.datasets.lenses import bending
 
 from qgs.data.photos.nerfstudio import read_transforms
@@ -37,22 +35,3 @@ def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path):
         assert image[24, 32 : 32 + reach].all()
         path = numbered_photos(tmp_path, 3, camera_model=model, k1=-0.6, **wide)
         assert (scene(path, size=(48, 64)).images([2])[0, 2] > 0).all()
-
-
-def test_black_edges_of_undistorted_photos_are_cut_off(tmp_path):
-    distorted = numbered_photos(tmp_path, 3, k1=0.9, cx=36.0, cy=24.0)
-    pixels = np.full((48, 64, 3), 255, np.uint8)
-    pixels[:, :, 0] = np.arange(64) * 3 + 9
-    Image.fromarray(pixels).save(tmp_path / "images/0.png")
-    for size in ((48, 64), (24, 24)):
-        opened = scene(distorted, size=size)
-        image = opened.images([0])[0] * 255
-        assert (image[1] > 240).all()  # resampling overshoots a little
-        # a pixel still shows what its camera says
-        row = size[0] // 2
-        column = size[1] - 4
-        fx, fy, cx, cy = opened.cameras.intrinsics[0].tolist()
-        x = (column + 0.5 - cx) / fx
-        y = (row + 0.5 - cy) / fy
-        expected = 36 + 100 * x * (1 + 0.9 * (x * x + y * y)) - 0.5
-        assert image[0, row, column].item() == pytest.approx(3 * expected + 9, abs=3)
