@@ -22,11 +22,11 @@ FX, FY, CX, CY = INTRINSICS
 HEIGHT, WIDTH = SIZE
 SIDES = {"fl_x": FY, "fl_y": FX, "w": HEIGHT, "h": WIDTH}
 STORED = {
-    6: (np.pi / 2, Image.Transpose.ROTATE_90, {**SIDES, "cx": CY, "cy": WIDTH - CX}),
-    8: (-np.pi / 2, Image.Transpose.ROTATE_270, {**SIDES, "cx": HEIGHT - CY, "cy": CX}),
-    3: (np.pi, Image.Transpose.ROTATE_180, {"cx": WIDTH - CX, "cy": HEIGHT - CY}),
+    6: (1, Image.Transpose.ROTATE_90, {**SIDES, "cx": CY, "cy": WIDTH - CX}),
+    8: (3, Image.Transpose.ROTATE_270, {**SIDES, "cx": HEIGHT - CY, "cy": CX}),
+    3: (2, Image.Transpose.ROTATE_180, {"cx": WIDTH - CX, "cy": HEIGHT - CY}),
 }
-"""By EXIF's orientation: the angle by which it turns a picture clockwise, how an upright one is
+"""By EXIF's orientation: the quarter turns of a picture clockwise, how an upright one is
 stored, and the camera of the stored pixels."""
 
 
@@ -36,11 +36,10 @@ def written(shots, tmp_path):
 
     def written(orientation, listed, **lens):
         room = Room(shots[:4])
-        angle, transpose, camera = STORED[orientation]
+        turns, transpose, camera = STORED[orientation]
         if listed == "stored":
             room.camera |= camera
-            stored_axes = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-            room.poses[:, :, :2] @= stored_axes
+            room.poses[:, :, :2] @= np.linalg.matrix_power([[0, -1], [1, 0]], turns)
         room.camera |= lens
         masks = []
         for name, shot in zip(list(room.files), shots, strict=False):
