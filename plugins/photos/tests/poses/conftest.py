@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import textured_room
+from photo_formats import turned
 from PIL import Image
 from qgs_photos.poses.making import Options, make_poses
 from walked import PHOTOS, QUIET, SCALE, cut
@@ -25,9 +26,8 @@ def walk(images, tmp_path_factory):
     folder.mkdir()
     photos = [*map(Image.fromarray, images)]
     photos[0].save(folder / "0 Fo’to #{} %20 'ä'.JPG", quality=95)
-    exif = Image.Exif()
-    exif[0x0112] = 6  # a quarter turn clockwise makes it upright
-    photos[1].transpose(Image.Transpose.ROTATE_90).save(folder / "1.jpg", quality=95, exif=exif)
+    stored = photos[1].transpose(Image.Transpose.ROTATE_90)
+    stored.save(folder / "1.jpg", quality=95, exif=turned(6))  # upright by a quarter turn
     Image.fromarray(257 * np.array(photos[2].convert("L"), np.uint16)).save(folder / "2.png")
     photos[3].convert("CMYK").save(folder / "3.tif")
     photos[4].save(folder / "4.avif", quality=95)

@@ -38,8 +38,8 @@ def frames(path):
 def write_turned(path, images, degrees):
     """An mp4 whose track says that it is shown `degrees` clockwise: the matrix in `tkhd`."""
     data = write_video(path, images).read_bytes()
-    cosine, sine = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[degrees]
-    matrix = 65536 * np.array([cosine, sine, 0, -sine, cosine, 0, 0, 0])
+    turn = 1j ** (degrees // 90)
+    matrix = 65536 * np.array([turn.real, turn.imag, 0, -turn.imag, turn.real, 0, 0, 0])
     start = data.index(b"tkhd") + 4 + 40  # version 0: 40 bytes before the matrix
     path.write_bytes(data[:start] + matrix.astype(">i4").tobytes() + data[start + 32 :])
     return path
