@@ -4,9 +4,10 @@ import shutil
 
 import pytest
 from commands import done, record_of, saved
+from photo_formats import noisy_photos
 from plyfile import PlyData
 from reconstructing import HOLDOUTS, kinds
-from tables import must_refuse, read_json, write_json
+from tables import must_refuse, write_json
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
 
@@ -65,10 +66,7 @@ def test_an_earlier_result_stays_and_a_single_file_is_written(reconstruction, ph
 
 
 def test_what_makes_no_sense_is_refused_in_a_sentence(reconstruction, photos, tmp_path):
-    moved = shutil.copytree(photos, tmp_path / "moved")
-    listing = read_json(moved / "transforms.json")
-    listing["frames"][2]["transform_matrix"][0][3] += 0.05
-    write_json(moved / "transforms.json", listing)
+    moved = noisy_photos(tmp_path / "moved", step=0.15)
     by_hand = shutil.copytree(reconstruction, tmp_path / "by hand")
     damaged = shutil.copytree(reconstruction, tmp_path / "damaged")
     write_json(by_hand / "cameras.json", {**record_of(by_hand), "model": ""})
