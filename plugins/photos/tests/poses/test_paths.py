@@ -6,7 +6,6 @@ import av
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from commands import done, run_qgs, typed
 from photo_formats import noisy_photos, row_of_frames
 from PIL import Image, ImageSequence
@@ -22,8 +21,7 @@ from qgs.cli.options import scale_settings
 from qgs.geometry.transforms import moved
 from qgs.reconstruction.reconstruct import reconstruct
 from qgs.reconstruction.scene_formats import save_ply
-from qgs.renderers import AutoRenderer, TorchRenderer
-from qgs.types import Cameras
+from qgs.renderers import AutoRenderer
 
 SIZE = (36, 54)
 
@@ -71,7 +69,7 @@ def test_camera_paths_in_files_are_read(tmp_path):
         file.write_text(content)
         c2w, found = read_path(file, (100, 150))
         assert c2w.tolist() == [expected.tolist()] * 2
-        np.testing.assert_allclose(found, [[focal, focal]] * 2)
+        assert_near(found, [[focal, focal]] * 2)
 
 
 def test_a_file_that_is_no_path_is_refused(tmp_path):
@@ -119,14 +117,12 @@ def test_a_film_shows_the_pictures(tmp_path):
 
 def test_a_scene_of_photos_is_filmed_from_their_cameras(made, tmp_path):
     """What is rendered in the film's world is what the photos' world shows."""
-    views = qgs.read_photos(made[0], size=SIZE)
+    views = qgs.read_photos(made[0])
     gaussians = moved(wall(1.5), views.cameras.c2w[0, 0], 1.0)
     save_ply(gaussians, tmp_path / "scene.ply")
     opened = open_film_scene(tmp_path / "scene.ply", str(made[0]), None)
-    third = opened.cameras[:, 2:3]
-    lens = third.intrinsics * SIZE[0] / third.size[0]
-    renderer = TorchRenderer(TorchRenderer.Config())
-    found = renderer(opened.gaussians, Cameras(third.c2w, lens, SIZE)).rgb
+    renderer = AutoRenderer(AutoRenderer.Config())
+    found = renderer(opened.gaussians, opened.cameras[:, 2:3]).rgb
     expected = renderer(gaussians, views.cameras.to(torch.float32)[:, 2:3]).rgb
     assert torch.allclose(found, expected, 0, 0.02)
 
@@ -175,8 +171,8 @@ def test_a_film_shows_what_the_reconstruction_renders_of_the_photos_world(tmp_pa
 
     scene = reconstruct(qgs.load(checkpoint), photos, inputs=2, overrides=scale_settings(2.0))
     c2w, focal = read_path(path, (480, 480))
-    lens = F.pad(focal, (0, 2), value=240.0)
-    rendered = scene.render(Cameras(c2w[None], lens[None], (480, 480))).rgb[0]
+    filmed = pinhole(c2w, (*focal[0], 240, 240), (480, 480))
+    rendered = scene.render(filmed[None]).rgb[0]
     expected = 255 * rendered.clamp(0, 1).permute(0, 2, 3, 1).numpy()
     assert np.abs(expected[0] - expected[1]).mean() > 0.05 * 255
     assert np.shape(frames(film)) == expected.shape
