@@ -9,7 +9,7 @@ import pytest
 from photo_formats import encoded, scene, turned, write_row
 from PIL import Image
 from planted import checked
-from tables import must_refuse
+from tables import assert_near, must_refuse
 
 SIZE = (4, 6)
 GREY = np.uint8([[0, 1, 127, 128, 254, 255]] * 4)
@@ -153,7 +153,7 @@ def test_what_is_refused_is_told_alike(method, tmp_path):
 def test_a_photo_mirrored_by_exif_keeps_its_stored_pixels_and_a_warning_names_it(tmp_path, caplog):
     data = encoded(RGB, exif=turned(2))
     read, (finding,) = photos(tmp_path, {"a.png": data, "b.png": data})
-    np.testing.assert_allclose(read.images([0])[0].movedim(0, -1) * 255, RGB, 1e-6)
+    assert_near(read.images([0])[0].movedim(0, -1) * 255, RGB)
     assert "EXIF orientation, which is ignored" in caplog.text
     assert finding.severity == "warning"
     assert "EXIF" in str(finding)
