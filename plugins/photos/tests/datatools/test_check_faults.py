@@ -201,14 +201,12 @@ def test_an_index_is_checked_where_it_is_given_and_where_it_lies_with_the_chunks
             '{"nowhere": {"context": [0], "target": [1]}, "a": null, '
             '"b": {"context": [0, 2], "target": [3]}}'
         )
-    expected = [
-        line
-        for name in ("given", "evaluation")
-        for line in (
-            f"error: nowhere: the index {name}.json *does not exist*",
-            f"error: b: the index {name}.json has frames 3, but the scene has 0 to 2*",
-        )
-    ]
+    expected = (
+        "error: nowhere: the index given.json *does not exist*",
+        "error: b: the index given.json has frames 3, but the scene has 0 to 2*",
+        "error: nowhere: the index evaluation.json *does not exist*",
+        "error: b: the index evaluation.json has frames 3, but the scene has 0 to 2*",
+    )
     assert_told(chunks, expected, [given], geometry=0)
 
 
