@@ -32,19 +32,18 @@ def record(key, frames=4, **extra):
     return entry(key, (0.5, 0.9, 0.45, 0.55), map(pose, range(frames)), images) | extra
 
 
-def write(folder, index=True, **chunks):
+def write(folder, **chunks):
     """Chunks, by their names without the suffix."""
-    keys = {}
     for name, records in chunks.items():
         save(folder / f"{name}.torch", records)
-        keys |= {record["key"]: f"{name}.torch" for record in records if index}
-    if index:
-        write_json(folder / "index.json", keys)
 
 
 def data_set(path):
+    """With an index of the scenes for training."""
     write(path / "train", a=[record("s0"), record("s1", 7)], b=[record("s2")])
     write(path / "test", a=[record("t0")])
+    index = {"s0": "a.torch", "s1": "a.torch", "s2": "b.torch"}
+    write_json(path / "train/index.json", index)
 
 
 opened = partial(photo_formats.opened, size=(16, 16), source=ChunksSource)
@@ -89,11 +88,11 @@ def test_held_out_frames_serve_where_there_are_no_test_chunks(tmp_path):
 
 
 def test_without_an_index_and_split_folders_the_chunks_are_read(tmp_path, caplog):
-    write(tmp_path, a=[record("s0")], b=[record("s1")], index=False)
+    write(tmp_path, a=[record("s0")], b=[record("s1")])
     assert opened(tmp_path).names("train") == ["s0", "s1"]
     assert opened(tmp_path, max_scenes=1).names("train") == ["s0"]
     assert "has no index.json" in caplog.text
-    write(tmp_path, c=[record("s1")], index=False)
+    write(tmp_path, c=[record("s1")])
     must_refuse(r"'s1' is in b\.torch and in c\.torch", opened, tmp_path)
 
 
@@ -181,7 +180,7 @@ def test_broken_chunks_are_told(tmp_path):
     ]
     cases += [([record("s0", **extra)], f"scene 's0'{told}") for extra, told in BROKEN]
     for records, message in cases:
-        write(tmp_path, a=records, index=False)
+        write(tmp_path, a=records)
         must_refuse(rf"a\.torch.*{message}", all_images, tmp_path)
 
 
