@@ -16,25 +16,10 @@ from qgs_photos.poses.photos import PosesError
 from qgs_photos.poses.worker import likely
 from tables import must_not_find, must_refuse, names_in, read_json
 from upath import UPath
-from walked import PHOTOS, QUIET, SCALE, write_photos, write_video
+from walked import PHOTOS, QUIET, SCALE, assert_close, write_photos, write_video
 
 import qgs
 from qgs.data.photos import formats_of, read_listing
-
-
-def relative(c2w):
-    """Poses in the first one's frame, positions in parts of the farthest one's distance."""
-    found = np.linalg.inv(c2w[0]) @ c2w
-    found[:, :3, 3] /= np.linalg.norm(found[:, :3, 3], axis=1).max()
-    return found
-
-
-def assert_close(folder, shots):
-    """Within a degree, .0175, and two hundredths of the extent."""
-    frames = read_listing(UPath(folder)).frames
-    assert len(frames) == PHOTOS
-    found, true = (relative(np.stack([one.c2w for one in each])) for each in (frames, shots))
-    assert np.median(np.abs(found - true).max((1, 2))) < 0.0175
 
 
 def test_photos_get_the_poses_they_were_taken_with(made, shots):

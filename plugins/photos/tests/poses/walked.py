@@ -6,6 +6,9 @@ import av
 import numpy as np
 from photo_formats import write_photos as write_photos
 from rich.console import Console
+from upath import UPath
+
+from qgs.data.photos import read_listing
 
 QUIET = Console(quiet=True)
 SCALE = 2
@@ -43,6 +46,21 @@ def write_turned(path, images, degrees):
     start = data.index(b"tkhd") + 4 + 40  # version 0: 40 bytes before the matrix
     path.write_bytes(data[:start] + matrix.astype(">i4").tobytes() + data[start + 32 :])
     return path
+
+
+def relative(c2w):
+    """Poses in the first one's frame, positions in parts of the farthest one's distance."""
+    found = np.linalg.inv(c2w[0]) @ c2w
+    found[:, :3, 3] /= np.linalg.norm(found[:, :3, 3], axis=1).max()
+    return found
+
+
+def assert_close(folder, shots):
+    """Within a degree, .0175, and two hundredths of the extent; of two photos, within two."""
+    frames = read_listing(UPath(folder)).frames
+    assert len(frames) == len(shots)
+    found, true = (relative(np.stack([one.c2w for one in each])) for each in (frames, shots))
+    assert np.median(np.linalg.norm(found - true, axis=(1, 2))) < 0.0175
 
 
 def cut(path, part):
