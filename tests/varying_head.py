@@ -1,6 +1,5 @@
 """A head whose Gaussians have colours that depend on the direction, and features."""
 
-import torch
 import torch.nn.functional as F
 from torch import nn
 
@@ -16,9 +15,7 @@ class VaryingHead(nn.Module):
         self.head = head
         self.config = head.config
         channels = head.gaussians_per_query * (3 * HARMONICS + FEATURES)
-        generator = torch.Generator().manual_seed(4)
         self.linear = nn.Linear(head.linear.in_features, channels, bias=False)
-        nn.init.normal_(self.linear.weight, std=0.1, generator=generator)
 
     def forward(self, state):
         normed = F.layer_norm(state.features, state.features.shape[-1:])
