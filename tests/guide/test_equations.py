@@ -9,7 +9,6 @@ import yaml
 from guide_pages import DOCS, all_pages
 from tables import rows
 
-from qgs.contracts import Component
 from qgs.recipe.errors import Problems
 from qgs.recipe.sections import RecipeSettings
 from qgs.recipe.slots import SLOTS
@@ -85,12 +84,8 @@ def owners(option, where):
         places = {t.removeprefix("model."): c for t, c in guide.SECTIONS.items()}
         places |= {s: configs(s)[slot.default] for s, slot in SLOTS.items() if slot.default}
         found = [places[section]]
-    elif name in RecipeSettings.model_fields:
-        return [RecipeSettings]
     else:
-        things = linked(where)
-        classes = [x for x in things if isinstance(x, type) and issubclass(x, Component)]
-        found = [kind.Config for kind in classes]
+        found = [RecipeSettings, *(kind.Config for kind in linked(where) if hasattr(kind, "Config"))]
     return [config for config in found if name in config.model_fields]
 
 
