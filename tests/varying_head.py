@@ -1,6 +1,5 @@
 """A head whose Gaussians have colours that depend on the direction, and features."""
 
-import torch.nn.functional as F
 from torch import nn
 
 HARMONICS = 8
@@ -18,7 +17,6 @@ class VaryingHead(nn.Module):
         self.linear = nn.Linear(head.linear.in_features, channels, bias=False)
 
     def forward(self, state):
-        normed = F.layer_norm(state.features, state.features.shape[-1:])
-        raw = self.linear(normed).unflatten(-1, (self.head.gaussians_per_query, -1))
+        raw = self.linear(state.features).unflatten(-1, (self.head.gaussians_per_query, -1))
         sh, features = raw.split([3 * HARMONICS, FEATURES], -1)
         return self.head(state).replace(sh=sh.unflatten(-1, (HARMONICS, 3)), features=features)
