@@ -3,7 +3,6 @@
 import re
 
 from guide import ROOT, filled
-from qgs_dev import checks_for, run_check
 
 DOCS = ROOT / "docs"
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
@@ -23,9 +22,3 @@ def blocks(page, kind):
     """Title, or position, to text of the blocks of one kind."""
     found = BLOCK.findall(text_of(page))
     return {t or str(i): text for i, (k, t, text) in enumerate(found) if k == kind}
-
-
-def contract_failures(*cases):
-    """What components of the guide do not keep of their contracts."""
-    outcomes = [run_check(check, case) for case in cases for check in checks_for(case, ["core"])]
-    return [outcome.message for outcome in outcomes if outcome.verdict == "failed"]

@@ -8,8 +8,8 @@ import guide
 import pytest
 import torch
 import yaml
-from guide_pages import blocks, contract_failures
-from qgs_dev import Case
+from guide_pages import blocks
+from qgs_dev import Case, CaseRun
 
 from qgs.contracts import ModelDims
 from qgs.recipe import RecipeError, resolve
@@ -39,7 +39,7 @@ def test_the_code_of_the_five_ideas_computes_its_formula_and_keeps_its_contract(
     centers = near(near.Config(distance=2.0), ModelDims(16, 2, 1))
     means = centers(torch.zeros(1, 8, 4, 3), QueryState(torch.zeros(1, 8, 16)))
     assert means.tolist() == [[[[0.0, 0.0, 2.0]] * 4] * 8]
-    assert not contract_failures(Case(near.Config()))
+    CaseRun(Case(near.Config())).check(["core"])
 
 
 def test_recipes_of_the_five_ideas():
