@@ -11,7 +11,7 @@ from varying_head import VaryingHead
 
 import qgs
 from qgs.containers import map_tensors
-from qgs.geometry.poses import look_at
+from qgs.geometry.poses import look_at, scaled
 from qgs.renderers import AutoRenderer
 from qgs.types import Views
 
@@ -37,11 +37,8 @@ def photos(tmp_path_factory):
 
 @pytest.fixture
 def far(views):
-    """The views by cameras far from the origin, in units of which 100 lie between them."""
-    c2w = views.cameras.c2w.clone()
-    c2w[0, 1, 0, 3] = 1
-    c2w = POSE @ c2w
-    c2w[..., :3, 3] *= 100
+    """The views by cameras far from the origin, in units of which 30 lie between them."""
+    c2w = scaled(POSE @ views.cameras.c2w, 100)
     return views.replace(cameras=views.cameras.replace(c2w=c2w))
 
 
