@@ -19,8 +19,7 @@ from qgs.reconstruction.scenes import chosen_scene
 class Grey(Walk):
     """Grey photos of 16 pixels."""
 
-    def __init__(self):
-        self.cameras = pinhole(arc(range(-30, 31, 12), 3), size=(16, 16))
+    cameras = pinhole(arc(range(-30, 31, 12), 3), size=(16, 16))
 
     def images(self, frames):
         return torch.full((len(frames), 3, *self.cameras.size), 0.5)
