@@ -15,7 +15,7 @@ def pair(*shape):
     return (truth + 0.2 * torch.randn(shape)).requires_grad_(), truth
 
 
-def slow(x, y, padding):
+def slow(x, y):
     """Equation 13 of Wang et al. 2004, every window of 11 x 11 pixels at once, in float64."""
     offset = torch.arange(-5.0, 6.0, dtype=torch.float64)
     weights = torch.exp(-(offset[:, None] ** 2 + offset**2) / (2 * 1.5**2))
@@ -24,7 +24,7 @@ def slow(x, y, padding):
     y = y.double()
 
     def mean(image):
-        return F.conv2d(image.reshape(-1, 1, *image.shape[-2:]), window, padding=padding)
+        return F.conv2d(image.reshape(-1, 1, *image.shape[-2:]), window, padding="same")
 
     a = mean(x)
     b = mean(y)
@@ -37,9 +37,7 @@ def slow(x, y, padding):
 def test_values_and_gradients():
     """Of either image, which goes another way, of any leading dimensions and strides."""
     sizes = [(1, 1), (3, 7), (11, 11), (16, 40), (33, 12)]
-    for size, padding, dtype in product(sizes, ["same", "valid"], [torch.float32, torch.float64]):
-        if padding == "valid" and min(size) < 11:
-            continue
+    for size, dtype in product(sizes, [torch.float32, torch.float64]):
         images, truth = pair(2, 3, *size)
         one = truth[:1, :1].mT.expand(2, 3, -1, -1)
         for x, y in (
@@ -48,12 +46,12 @@ def test_values_and_gradients():
             (images.mT, one),
             (images[0, 0], truth[0, 0]),
         ):
-            found = mean_ssim(x.to(dtype), y.to(dtype), padding)
-            expected = slow(x, y, padding)
+            found = mean_ssim(x.to(dtype), y.to(dtype), "same")
+            expected = slow(x, y)
             slope, reference = (torch.autograd.grad(3 * v, images)[0] for v in (found, expected))
             off = (slope - reference).abs().max() / reference.abs().max()
             assert (found - expected).abs() <= (2e-7 if dtype == torch.float32 else 1e-12)
-            assert off <= 3e-6, (size, padding, dtype)
+            assert off <= 3e-6, (size, dtype)
 
 
 def test_the_same_bits_whatever_the_threads():

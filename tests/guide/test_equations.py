@@ -85,7 +85,8 @@ def owners(option, where):
         places |= {s: configs(s)[slot.default] for s, slot in SLOTS.items() if slot.default}
         found = [places[section]]
     else:
-        found = [RecipeSettings, *(kind.Config for kind in linked(where) if hasattr(kind, "Config"))]
+        own = (kind.Config for kind in linked(where) if hasattr(kind, "Config"))
+        found = [RecipeSettings, *own]
     return [config for config in found if name in config.model_fields]
 
 

@@ -29,8 +29,6 @@ def test_valid_ssim_is_the_metric_of_large_enough_images():
     rgb = PREDICTED.clamp(0, 1)
     found = photometric(rgb, ssim_weight=0.3, padding="valid")["ssim"]
     assert_close(found, 0.3 * (1 - ssim(rgb, TRUTH).mean()) / 2)
-    low = (image[..., :10, :] for image in (rgb, TRUTH))
-    must_refuse("at least 11 pixels a side, got 10 x 24", photometric, *low, padding="valid")
 
 
 def test_terms_have_weights_and_those_of_weight_zero_are_left_out():
