@@ -26,10 +26,15 @@ def _seeded_on_one_thread():
 
 
 @pytest.fixture(autouse=True, scope="session")
-def few_samples_measured():
-    """Measure the ranges of a training's views in .02 s, not in a second."""
+def few_samples_measured_and_short_orbits():
+    """Measure the ranges of a training's views in .02 s, not in a second.
+
+    Orbits have two frames of 16 pixels.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("qgs.data.stream.MEASURED", 8)
+        patch.setattr("qgs.reconstruction.saving.ORBIT_FRAMES", 2)
+        patch.setattr("qgs.reconstruction.saving.ORBIT_SIDE", 16)
         yield
 
 
@@ -40,17 +45,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture(scope="session")
-def short_orbit():
-    """Make orbits of two frames of 16 pixels."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qgs.reconstruction.saving.ORBIT_FRAMES", 2)
-        patch.setattr("qgs.reconstruction.saving.ORBIT_SIDE", 16)
-        yield
-
-
 @pytest.fixture
-def small_pictures(monkeypatch, short_orbit):
-    """Overview and orbit are most of the work of saving; one test looks at a real one."""
+def small_pictures(monkeypatch):
+    """Overview and orbit are most of the work of saving; one test looks at a real overview."""
     picture = np.zeros((4, 4, 3), np.uint8)
     monkeypatch.setattr("qgs.reconstruction.saving.overview", lambda result: picture)

@@ -21,9 +21,7 @@ def written(*words, out):
     return record_of(out)
 
 
-def test_everything_is_written_and_what_a_user_made_is_kept(
-    checkpoint, photos, tmp_path, short_orbit
-):
+def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, tmp_path):
     notes = tmp_path / "notes.ply"
     old = tmp_path / "views/00099_novel.png"
     notes.write_text("mine")

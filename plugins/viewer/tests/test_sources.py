@@ -19,7 +19,7 @@ from qgs.reconstruction.scene_formats import load_ply, save_ply
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, short_orbit):
+def finished(tmp_path_factory):
     """What `qgs reconstruct` leaves, by a model whose checkpoint lies beside it."""
     folder = tmp_path_factory.mktemp("finished")
     qgs.save(model_of("locus"), folder / "model.safetensors")
