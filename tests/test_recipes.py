@@ -27,7 +27,9 @@ EVERY = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*
 STUDIES = [file for file in EVERY if file.startswith("studies/")]
 FILES = [file for file in EVERY if file not in STUDIES]
 OVERLAYS = (
-    *(f"finetune/dl3dv_{views}views.yaml" for views in (2, 4, 6)),
+    "finetune/dl3dv_2views.yaml",
+    "finetune/dl3dv_4views.yaml",
+    "finetune/dl3dv_6views.yaml",
     "rooms/budget_64.yaml",
 )
 """Laid over recipes with data; they say nothing of its type."""

@@ -2,6 +2,7 @@
 
 import torch
 from tables import must_refuse
+from torch import zeros
 
 from qgs.containers import concatenated
 from qgs.types import (
@@ -16,10 +17,6 @@ from qgs.types import (
 )
 
 CAMERA = Cameras(torch.eye(4)[None, None], torch.ones(1, 1, 4), (8, 8))
-
-
-def zeros(*shape):
-    return torch.zeros(shape)
 
 
 THREE = zeros(1, 2, 5, 3)
