@@ -8,19 +8,18 @@ from walk import along_x, pinhole
 import qgs
 from qgs.types import Views
 
-OPTIONS = [
-    "queries.count=12",
-    "decoder={depth: 3, layer_scale: 0.1}",
-    "head={init_std: 0.3, scale_cap: 0.2}",
-    "supervision.layers=[3]",
-    "renderer.type=qgs/torch",
+OVERRIDES = [
+    "model.queries.count=12",
+    "model.decoder={depth: 3, layer_scale: 0.1}",
+    "model.head={init_std: 0.3, scale_cap: 0.2}",
+    "model.supervision.layers=[3]",
+    "model.renderer.type=qgs/torch",
 ]
 
 
 @pytest.fixture
 def model():
-    overrides = [f"model.{option}" for option in OPTIONS]
-    return qgs.compose(ONE_LAYER, overrides).eval()
+    return qgs.compose(ONE_LAYER, OVERRIDES).eval()
 
 
 @pytest.fixture

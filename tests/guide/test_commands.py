@@ -5,12 +5,11 @@ import shlex
 import tomllib
 
 from commands import run_qgs
-from guide_pages import DOCS, text_of
+from guide_pages import DOCS, all_pages, text_of
 from qgs_dev.new_command import rendered
 
 TEMPLATE = {path.name: text for path, text in rendered("sightline")}
-TEXTS = {path.name: text_of(path.name) for path in sorted(DOCS.glob("*.md"))}
-TEXTS |= {"README": TEMPLATE["README.md"] + text_of("../README.md")}
+TEXTS = all_pages() | {"README": TEMPLATE["README.md"] + text_of("../README.md")}
 PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text())["project"]
 PLUGIN = tomllib.loads(TEMPLATE["pyproject.toml"])["project"]
 
