@@ -1,6 +1,6 @@
 """Photos of the inside of a textured box, with exact cameras, for matching features."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import photo_formats
@@ -15,8 +15,7 @@ SIZE = (120, 180)
 INTRINSICS = (145.0, 147.0, 89.0, 61.0)
 
 
-@dataclass(frozen=True)
-class Shot:
+class Shot(NamedTuple):
     """image: (H, W, 3) uint8. c2w: (4, 4) OpenCV camera-to-world."""
 
     image: np.ndarray
@@ -37,7 +36,7 @@ def walk(count, scale=1):
 
 def photos_of(shots):
     """Photos (1, V) and their cameras, in float32."""
-    images, c2w = (np.stack([getattr(s, name) for s in shots]) for name in ("image", "c2w"))
+    images, c2w = map(np.stack, zip(*shots, strict=True))
     cameras = pinhole(torch.tensor(c2w).float(), INTRINSICS, SIZE)
     return Views((torch.tensor(images).movedim(-1, 1) / 255)[None], cameras[None])
 
