@@ -38,16 +38,12 @@ class TapeSource(SceneSource):
         path: str
         """The folder."""
 
-    def __init__(self, config):
-        super().__init__(config)
-        self._tapes = [Tape(file) for file in sorted(Path(config.path).glob("*.tape"))]
-
     @classmethod
     def recognises(cls, path):
         return path.is_dir() and any(item.suffix == ".tape" for item in path.iterdir())
 
     def scenes(self, split):
-        return self._tapes
+        return [Tape(file) for file in sorted(Path(self.config.path).glob("*.tape"))]
 
 
 plugin = Plugin("tapes", 1, (TapeSource,))
