@@ -12,7 +12,6 @@ class VaryingHead(nn.Module):
     def __init__(self, head):
         super().__init__()
         self.head = head
-        self.config = head.config
         channels = head.gaussians_per_query * (3 * HARMONICS + FEATURES)
         self.linear = nn.Linear(head.linear.in_features, channels, bias=False)
 
