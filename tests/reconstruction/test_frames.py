@@ -46,11 +46,10 @@ def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
 def test_a_photo_between_two_inputs_is_an_input_unless_two_are_asked_for():
     walk = Walk()
     wide = Domain({"baseline": [1.8, 1.9], "depth": [3.0, 3.0], "turn": [30.0, 40.0]}, 4)
-    for inputs, held_out, compare, expected in (
+    for inputs, walk.held_out, compare, expected in (
         (None, (2,), None, (0, 1, 3)),
         (2, (2,), None, (0, 3)),
         (None, (), (0,), (1, 2, 4)),
     ):
-        walk.held_out = held_out
         found, _ = choose_frames(walk, ViewsConfig(inputs=2), inputs, None, compare, wide)
         assert found == expected

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from varying_head import VaryingHead
 
 import qgs
-from qgs.containers import map_tensors
+from qgs.containers import concatenated
 from qgs.geometry.poses import look_at, scaled
 from qgs.renderers import AutoRenderer
 from qgs.types import Views
@@ -69,7 +69,7 @@ def test_gaussians_with_harmonics_lie_in_the_world_of_the_photos(model, far, tmp
 
 
 def test_what_cannot_be_reconstructed_is_refused(model, views, photos):
-    two = map_tensors(lambda tensor: torch.cat([tensor, tensor]), views)
+    two = concatenated([views, views], 0)
     by_hand = qgs.compose(RECIPE)
     by_hand.recipe = None
     for chosen, given, options, word in (
