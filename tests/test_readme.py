@@ -15,7 +15,7 @@ from size import ROOT
 from qgs.cli import COMMANDS, GROUP
 from qgs.recipe.slots import SECTIONS, SLOTS
 
-README = (ROOT / "README.md").read_text()
+README = text_of("../README.md")
 
 
 def test_the_readme_shows_the_overlay_and_paths_that_exist():
