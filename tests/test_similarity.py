@@ -10,7 +10,6 @@ from qgs.similarity import mean_ssim
 
 
 def pair(*shape):
-    torch.manual_seed(0)
     truth = torch.rand(shape)
     return (truth + 0.2 * torch.randn(shape)).requires_grad_(), truth
 
