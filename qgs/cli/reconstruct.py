@@ -34,7 +34,7 @@ def reconstruct(
         str, typer.Argument(help="Folder of photos or of a data set, URL of a folder, or video.")
     ],
     out: Annotated[
-        Path, typer.Option(help="Folder for results; or .ply or .splat file for Gaussians alone.")
+        Path, typer.Option(help="Folder for results; or file for Gaussians alone: .ply, .glb, ...")
     ],
     inputs: Inputs = None,
     frames: Frames = None,
@@ -97,10 +97,10 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
     if not overwrite:
         refuse_filled(out, "add --overwrite")
 
-    from qgs.reconstruction.scene_formats import scene_writers
+    from qgs.reconstruction.scene_formats import writer_of
 
     # The import of a plug-in's writer may fail.
-    if find := scene_writers().get(out.suffix.lower()):
+    if find := writer_of(out):
         find()
 
 

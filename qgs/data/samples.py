@@ -178,6 +178,13 @@ def in_world(world: World, cameras: Cameras) -> Cameras:
     return cameras.replace(c2w=c2w).to(torch.float32)
 
 
+def in_photos_world(world: World, cameras: Cameras) -> Cameras:
+    """Return cameras (B, V), float64, in the frame of the photos: the inverse of `in_world`."""
+    reference, scale = world
+    c2w = reference.double() @ scaled(cameras.c2w.to(reference.device, torch.float64), 1 / scale)
+    return cameras.replace(c2w=c2w)
+
+
 def from_0_to_1(times: Tensor) -> Tensor:
     """Return times (F,) scaled to [0, 1] (TokenGS 2026.6), or zeros if all times are equal."""
     first, last = times.aminmax()

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from qgs.containers import concatenated
-from qgs.data.samples import Sample, in_world
+from qgs.data.samples import Sample, in_photos_world, in_world
 from qgs.domain import REMEDY
 from qgs.files import AnyPath
 from qgs.geometry.transforms import moved
@@ -74,6 +74,13 @@ class Reconstruction:
         """Gaussians (1, G) in the frame and unit of the photos' cameras."""
         reference, scale = self.sample.world
         return moved(self.gaussians, reference, 1 / float(scale))
+
+    @property
+    def input_cameras(self) -> dict[str, Cameras]:
+        """Cameras (1, 1) of the input photos, in the photos' world, by their labels."""
+        placed = in_photos_world(self.sample.world, self.sample.inputs.cameras)
+        labels = map(self.sample.short_label, self.sample.input_frames)
+        return {label: placed[:, [view]] for view, label in enumerate(labels)}
 
     def render(self, cameras: Cameras) -> Rendering:
         """Render from cameras (1, V) in the photos' world; depths are in the unit of that world."""

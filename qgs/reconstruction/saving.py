@@ -15,7 +15,7 @@ from qgs.files import replacing_entries, write_text
 from qgs.geometry.poses import look_at, mean_camera
 from qgs.metrics.images import Psnr
 from qgs.reconstruction.result import Reconstruction, sample_cameras
-from qgs.reconstruction.scene_formats import save_gaussians, save_ply, scene_writers
+from qgs.reconstruction.scene_formats import save_gaussians, save_ply, writer_of
 from qgs.types import Cameras
 
 ORBIT_FRAMES = 24
@@ -57,8 +57,8 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
     the Gaussians in the photos' world.
     """
     # A file holds Gaussians alone, so they are in the world of the photos.
-    if out.suffix.lower() in scene_writers():
-        save_gaussians(result.in_photos_world, out)
+    if writer_of(out):
+        save_gaussians(result.in_photos_world, out, result.input_cameras)
         return [out]
     middle = sum(depth_range(result.rendering.depth)) / 2
     path = images.finer(orbit(result.sample.inputs.cameras, middle, ORBIT_FRAMES), ORBIT_SIDE)

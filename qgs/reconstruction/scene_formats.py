@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -22,13 +23,21 @@ from qgs.containers import map_tensors, named_tensors
 from qgs.extensions import imported, installed
 from qgs.files import replacing
 from qgs.geometry.harmonics import SH_C0
-from qgs.geometry.transforms import moved, narrowed
-from qgs.types import SH_COUNTS, Gaussians
+from qgs.geometry.transforms import narrowed
+from qgs.types import SH_COUNTS, Cameras, Gaussians
 from qgs.wording import listed, one_line, warn_once
 
 WRITER_GROUP = "qgs.scene_writers"
-"""Group of entry points of writers, which are functions (gaussians, path). An entry point has the
-suffix of its files as its name, without the dot."""
+"""Group of entry points of writers (see `SceneWriter`). An entry point has the suffix of its files
+as its name, without the first dot."""
+READER_GROUP = "qgs.scene_readers"
+"""Group of entry points of readers, which are functions: path -> Gaussians (G,). Their numbers need
+not be finite, and quaternions not be unit. Entry points are named as those of writers."""
+SceneWriter: TypeAlias = Callable[[Gaussians, str | Path, Mapping[str, Cameras]], None]
+"""Function (gaussians, path, cameras) that writes one scene. Cameras (1, 1), in the world of the
+Gaussians, have names; formats that hold no cameras leave them out."""
+
+T = TypeVar("T")
 
 OPACITY_EPS = 1e-6
 """Least distance of a stored opacity from 0 and 1, where the logit is infinite."""
@@ -49,32 +58,49 @@ PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, *_OTHERS)
 _HEADER = 2**16
 
 
-def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
+def save_gaussians(
+    gaussians: Gaussians, path: str | Path, cameras: Mapping[str, Cameras] | None = None
+) -> None:
     """Write one scene, (G, ...) or (1, G, ...), in the format that the suffix of `path` names.
 
-    Raises ValueError for a suffix without a writer (see `scene_writers`), for several scenes, and
-    for numbers that are not finite.
+    cameras: see `SceneWriter`. Raises ValueError for a suffix without a writer, for several scenes,
+    and for numbers that are not finite.
     """
-    writers = scene_writers()
-    suffix = Path(path).suffix.lower()
-    if suffix not in writers:
+    writer = writer_of(path)
+    if writer is None:
         raise ValueError(
-            f"{path} must end in {listed(writers, between=' or ')}; for .spz, .sog and others give "
-            "a PLY to PlayCanvas' converter: `npx @playcanvas/splat-transform IN.ply OUT.sog`"
+            f"{path} must end in {listed(_writers(), between=' or ')}; for others give a PLY to "
+            "PlayCanvas' converter: `npx @playcanvas/splat-transform IN.ply OUT`"
         )
-    writers[suffix]()(gaussians, path)
+    writer()(gaussians, path, cameras or {})
 
 
-def scene_writers() -> Mapping[str, Callable[[], Callable[[Gaussians, str | Path], None]]]:
-    """Map each suffix of a file to a function that returns the writer of such files.
+def writer_of(path: str | Path) -> Callable[[], SceneWriter] | None:
+    """Return a function that returns the writer of files such as `path`; None if there is none.
 
     For a writer of another package (entry points WRITER_GROUP), the function raises ExtensionError
     if the package cannot be imported.
     """
-    added = {
-        f".{entry.name.lower()}": partial(imported, entry) for entry in installed(WRITER_GROUP)
+    return _of_suffix(path, _writers())
+
+
+def _writers() -> dict[str, Callable[[], SceneWriter]]:
+    return {
+        ".ply": lambda: lambda gaussians, path, _: save_ply(gaussians, path),
+        ".splat": lambda: lambda gaussians, path, _: save_splat(gaussians, path),
+        **_added(WRITER_GROUP),
     }
-    return {**added, ".ply": lambda: save_ply, ".splat": lambda: save_splat}
+
+
+def _added(group: str) -> dict[str, Callable]:
+    """Return functions that import the entry points of `group`, by suffix."""
+    return {f".{entry.name.lower()}": partial(imported, entry) for entry in installed(group)}
+
+
+def _of_suffix(path: str | Path, known: Mapping[str, T]) -> T | None:
+    """Return the value of the longest suffix in `known` with which the name of `path` ends."""
+    name = Path(path).name.lower()
+    return known.get(max(filter(name.endswith, known), key=len, default=""))
 
 
 def save_ply(gaussians: Gaussians, path: str | Path) -> None:
@@ -126,25 +152,27 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Return the Gaussians (1, G) of a file: a PLY of the 3DGS release or SuperSplat, .spz, .splat.
+    """Return the Gaussians (1, G) of a file: a PLY of the 3DGS release or SuperSplat, .splat.
 
-    They are in the world of the file. Gaussians that are not finite are left out, with a warning.
-    The 3D filter of Mip-Splatting is applied. `sh` has all degrees up to the last that is not all
-    zeros, and is None if all are zeros. Means are float64 if float32 would lose digits. Raises
-    FileNotFoundError, and ValueError for another kind of file.
+    Other packages add formats (entry points READER_GROUP). The Gaussians are in the world of the
+    file. Those that are not finite are left out, with a warning. The 3D filter of Mip-Splatting is
+    applied. `sh` has all degrees up to the last that is not all zeros, and is None if all are
+    zeros. Means are float64 if float32 would lose digits. Raises FileNotFoundError, and ValueError
+    for another kind of file.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no file at {path}")
     try:
-        read = {".splat": _of_splat, ".spz": _of_packed}.get(path.suffix.lower(), _of_ply)
-        scene = read(path)
+        readers = {".splat": lambda: _of_splat, **_added(READER_GROUP)}
+        read = _of_suffix(path, readers) or (lambda: read_ply)
+        scene = read()(path)
     # Readers raise anything of a damaged file.
     except Exception as error:
         raise ValueError(
-            f"{path} cannot be read as Gaussians ({one_line(error)}): copy it again if it is PLY, "
-            ".spz or .splat; .sog and others become PLY by `npx @playcanvas/splat-transform IN "
-            "OUT.ply`"
+            f"{path} cannot be read as Gaussians ({one_line(error)}): copy it again if it is "
+            f"{listed(('PLY', *readers), between=' or ')}; others become PLY by `npx "
+            "@playcanvas/splat-transform IN OUT.ply`"
         ) from error
     # In float64 norms are finite; a quaternion of 0 becomes NaN, which is left out.
     quats = scene.quats.double()
@@ -174,19 +202,17 @@ def _of_splat(path: Path) -> Gaussians:
 
 
 def _of_packed(path: Path) -> Gaussians:
-    """Read an .spz, or a compressed PLY of SuperSplat."""
-    from gsply import plyread, read_spz
+    """Read a compressed PLY of SuperSplat."""
+    from gsply import plyread
 
-    is_spz = path.suffix.lower() == ".spz"
     with TemporaryDirectory() as folder:
         plain = Path(folder, "plain.ply")
-        (read_spz if is_spz else plyread)(path).save(plain)
-        scene = _of_ply(plain)
-    # The axes of .spz are right, up, back.
-    return moved(scene, torch.tensor([1.0, -1, -1, 1]).diag(), 1.0) if is_spz else scene
+        plyread(path).save(plain)
+        return read_ply(plain)
 
 
-def _of_ply(path: Path) -> Gaussians:
+def read_ply(path: Path) -> Gaussians:
+    """Return the Gaussians (G,) of a PLY file as they are stored, see `load_ply`."""
     with path.open("rb") as file:
         header, end, _ = file.read(_HEADER).partition(b"end_header")
     counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))

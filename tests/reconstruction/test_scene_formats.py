@@ -210,7 +210,7 @@ def test_convert_keeps_the_most_opaque(tmp_path):
 def test_other_suffixes_and_files_that_exist_are_refused(tmp_path):
     before = saved(tmp_path / "a.ply", cloud(2)).read_bytes()
     for name, error, word in (
-        ("a.spz", ValueError, r"\.splat"),
+        ("a.abc", ValueError, r"\.splat"),
         ("a.ply", FileExistsError, r"a\.ply"),
     ):
         must_refuse(word, done, "convert", tmp_path / "a.ply", tmp_path / name, kind=error)
@@ -218,14 +218,19 @@ def test_other_suffixes_and_files_that_exist_are_refused(tmp_path):
 
 
 def test_an_installed_distribution_adds_a_format(install, tmp_path):
+    """The longest suffix decides."""
     source = """
-        def plugin(gaussians, path):
-            path.write_text(str(gaussians.count))
+        def plugin(gaussians, path, cameras):
+            path.write_text(f"{gaussians.count} {[*cameras]}")
         """
-    install("qgs-xyz", "xyz", source, group="qgs.scene_writers")
-    save_gaussians(cloud(5), tmp_path / "a.XYZ")
-    assert (tmp_path / "a.XYZ").read_text() == "5"
+    install("qgs-xyz", "xyz.ply", source, group="qgs.scene_writers")
+    file = tmp_path / "a.XYZ.ply"
+    save_gaussians(cloud(5), file, {"photo": None})
+    assert file.read_text() == "5 ['photo']"
     must_refuse(r"\.xyz", save_gaussians, cloud(5), tmp_path / "a.abc")
+    reader = "from walk import cloud\nplugin = lambda path: cloud(int(path.read_text()[0]))[0]"
+    install("qgs-abc", "xyz.ply", reader, group="qgs.scene_readers")
+    assert load_ply(file).count == 5
 
 
 def test_a_format_that_cannot_be_imported_is_refused_before_the_work(install, tmp_path):

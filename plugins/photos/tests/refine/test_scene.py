@@ -1,5 +1,7 @@
 """`qgs scene` on a tiny folder: its files, what it chooses, and the points that it starts from."""
 
+import json
+import math
 import re
 import shutil
 import struct
@@ -18,7 +20,7 @@ from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.initial import from_points, photos_start, photos_world, sparse_points
 from qgs_photos.refine.options import NONE, Options
-from qgs_photos.refine.result import page_writer
+from qgs_photos.refine.result import has_viewer
 from qgs_photos.refine.scene import faults_of_given_poses
 from qgs_photos.refine.scene_photos import ScenePhotos, judged_frames, sized
 from tables import must_not_find, must_refuse, names_in, read_json, rows, text_console
@@ -129,6 +131,23 @@ def test_a_model_makes_the_start(photos, tmp_path):
     assert "--frames images/0.png,images/2.png --scale 0.5 " in record["command"]
 
 
+def test_a_file_has_the_cameras_too(photos, tmp_path):
+    """In the world of the photos, turned upright."""
+    few = "--holdout none --seconds 0.1 --size 32x48 --gaussians 300"
+    file = tmp_path / "scene.glb"
+    output = done(*f"scene {photos} {few} --out {file}".split()).output
+    assert names_in(tmp_path) == {"scene.glb"}
+    assert f"wrote {file}" in output
+    assert qgs.load_ply(file).count > 300
+    (length,) = struct.unpack_from("<I", file.read_bytes(), 12)
+    content = json.loads(file.read_bytes()[20 : 20 + length])
+    nodes = {node["name"]: node for node in content["nodes"][1:]}
+    assert [*nodes] == [*(f"images/{number}.png" for number in range(9)), "flight"]
+    first, last = (nodes[f"images/{number}.png"]["translation"] for number in (0, 8))
+    given = qgs.read_photos(photos).cameras.c2w[0, [0, 8], :3, 3]
+    assert math.dist(first, last) == pytest.approx(math.dist(*given.tolist()), rel=1e-4)
+
+
 def test_an_interrupt_before_the_optimisation_says_what_is_kept(photos, tmp_path, monkeypatch):
     monkeypatch.setattr(scene, "chosen_start", MagicMock(side_effect=KeyboardInterrupt))
     result = run_qgs("scene", photos, "--out", tmp_path / "out")
@@ -139,7 +158,7 @@ def test_an_interrupt_before_the_optimisation_says_what_is_kept(photos, tmp_path
 def test_without_the_viewer_there_is_no_page(monkeypatch):
     monkeypatch.setitem(sys.modules, "qgs_viewer.page", None)
     console = text_console()
-    assert page_writer(console) is None
+    assert not has_viewer(console)
     assert "pip install" in console.file.getvalue()
 
 

@@ -4,10 +4,12 @@ import base64
 import http
 import io
 import ipaddress
+import json
 import logging
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -21,11 +23,13 @@ import viser
 import websockets.asyncio.server as sockets
 from rich.console import Console
 
+from qgs.drawing.images import rgb_picture
 from qgs.files import refuse_existing, write_text
 from qgs.geometry.harmonics import rotated
 from qgs.geometry.poses import look_at_depth
-from qgs.types import Gaussians, Views
+from qgs.types import Cameras, Gaussians, Views
 from qgs_viewer.drawing import FRUSTUM, Choice, Drawing, distance_to
+from qgs_viewer.look import data_uri
 from qgs_viewer.query_scene import NEUTRAL, Background, QueryScene
 
 # Vertical angle of the viewer's window, radians.
@@ -157,17 +161,73 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
     return place.numpy(), target.numpy()
 
 
-def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
+@dataclass(frozen=True)
+class Tour:
+    """Views that a page of a scene offers, and the camera path that it plays.
+
+    title, note: heading, and the line below it. stops: views (1, V) that have a button each; the
+    page opens at the first. names: texts of the buttons. photos: number of stops, from the first,
+    that can be compared with their photo. path: cameras (1, P).
+    """
+
+    title: str
+    note: str
+    stops: Views
+    names: Sequence[str]
+    photos: int
+    path: Cameras
+
+    def script(self, distance: float) -> str:
+        """Return the tour as a script.
+
+        distance: distance from the cameras to the points about which the reader turns the scene.
+        """
+        stops = _stations(self.stops.cameras, distance)
+        for index, (stop, name) in enumerate(zip(stops, self.names, strict=True)):
+            stop["name"] = name
+            if index < self.photos:
+                stop["photo"] = data_uri(rgb_picture(self.stops.images[0, index]), photo=True)
+        path = _stations(self.path, distance)
+        content = {"title": self.title, "note": self.note, "stops": stops, "path": path}
+        # names of files must not end the script
+        text = json.dumps(content).replace("<", r"\u003c")
+        return f"<script>window.tour = {text};</script>{template('tour.html')}"
+
+
+def _stations(cameras: Cameras, distance: float) -> list[dict[str, Any]]:
+    """Return positions, targets, up directions and lenses of cameras (1, V), for the script."""
+    height, width = cameras.size
+    stations = list[dict[str, Any]]()
+    for c2w, lens in zip(cameras.c2w[0].cpu().double(), cameras.intrinsics[0], strict=True):
+        _, down, forward, eye = c2w[:3].unbind(-1)
+        fx, fy, _, _ = lens.tolist()
+        stations.append(
+            {
+                "eye": eye.tolist(),
+                "target": (eye + distance * forward).tolist(),
+                "up": (-down).tolist(),
+                "tangent": height / (2 * fy),
+                "ratio": width / fx * fy / height,
+            }
+        )
+    return stations
+
+
+def scene_html(scene: QueryScene, choice: Choice | None = None, tour: Tour | None = None) -> str:
     """Return an HTML page that shows `scene` in 3D; a reader can turn the scene and record a video.
 
     The page takes 0.8 MB plus 40 bytes for each Gaussian, with harmonics 56 to 104. choice: what is
     shown; by default all Gaussians in their own colours, and the anchors after the last layer.
+    tour: views for buttons, in place of photos in the scene.
     """
+    shown = scene if tour is None else replace(scene, views=None)
     with quiet_server() as server:
         stand(server, scene)
-        Drawing(server.scene).put(scene, choice or Choice(layer=scene.depth))
+        Drawing(server.scene).put(shown, choice or Choice(layer=scene.depth))
         page = server.get_scene_serializer().as_html()
     head = template("head.html")
+    if tour:
+        head += tour.script(distance_to(scene))
     # a picked query has colours of its own
     if choice is None or choice.query is None:
         head += harmonics_script(scene)
@@ -222,9 +282,10 @@ def write_page(scene: QueryScene, query: int | None, file: Path, console: Consol
         console.print("--query picks a query for the page; leave out --html to pick by mouse.")
 
 
-def gaussians_html(gaussians: Gaussians, views: Views, background: Background = NEUTRAL) -> str:
-    """Return an HTML page that shows G Gaussians and, at their cameras, V photos of one scene.
+def gaussians_html(gaussians: Gaussians, tour: Tour, background: Background = NEUTRAL) -> str:
+    """Return an HTML page that shows Gaussians (1, G) from the views of `tour`.
 
-    gaussians: (1, G). views: (1, V). background: RGB in [0, 1].
+    background: RGB in [0, 1].
     """
-    return scene_html(QueryScene(gaussians, views, background=background))
+    scene = QueryScene(gaussians, tour.stops, background=background)
+    return scene_html(scene, tour=tour)

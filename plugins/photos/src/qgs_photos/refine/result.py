@@ -1,7 +1,7 @@
 """Score an optimised scene on held-out photos, and write its files."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from qgs.containers import concatenated
+from qgs.data.samples import in_photos_world
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import rgb_picture
@@ -19,7 +21,13 @@ from qgs.geometry.harmonics import seen_colors
 from qgs.geometry.transforms import depths_in_view, moved
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
-from qgs.reconstruction.scene_formats import load_ply, save_ply, save_splat
+from qgs.reconstruction.scene_formats import (
+    load_ply,
+    save_gaussians,
+    save_ply,
+    save_splat,
+    writer_of,
+)
 from qgs.terminal import print_lines
 from qgs.types import Cameras, Gaussians, Rendering, Views, World
 from qgs_photos.refine.refining import RefinedScene
@@ -28,11 +36,10 @@ from qgs_photos.viewing import VIEWER, in_own_world
 
 # Held-out photos in the picture.
 _SHOWN = 6
-# Photos on the page.
+# Views on the page: of photos for the optimisation, and of held-out ones.
 _ON_PAGE = 12
+_JUDGED_ON_PAGE = 4
 _SCORES = ("psnr", "ssim", "alpha", "nearest_input")
-
-PageWriter = Callable[[Gaussians, Views, tuple[float, float, float]], str]
 
 
 @dataclass(frozen=True)
@@ -58,6 +65,12 @@ class Result:
         reference, scale = self.world
         return moved(gaussians, reference, 1 / float(scale))
 
+    def cameras(self) -> dict[str, Cameras]:
+        """Return cameras (1, 1) of the V photos in their world, by their names."""
+        placed = in_photos_world(self.world, self.refined.cameras)
+        names = map(self.photos.small.frame_name, self.photos.frames)
+        return {name: placed[:, [view]] for view, name in enumerate(names)}
+
     def read_back(self, file: Path) -> "Result":
         """Return a copy of this result with the Gaussians in `file`, so as to score the file."""
         gaussians = in_own_world(self.world, load_ply(file).to(self.world[0].device))
@@ -70,34 +83,24 @@ class Result:
 
 
 @torch.no_grad()
-def write_scene(
-    result: Result, out: Path, page: PageWriter | None, began: float, console: Console
-) -> None:
-    """Write scene.ply, scene.splat, metrics.json, held_out.png and index.html into `out`.
+def write_scene(result: Result, out: Path, page: bool, began: float, console: Console) -> None:
+    """Write the scene, and print its scores.
 
-    page: function that makes index.html; None writes no page. began: time of `perf_counter` at the
-    start of the command, for the total time in metrics.json.
+    If `out` has the suffix of a scene format, the file `out` gets the Gaussians, in the photos'
+    world; .glb also gets the photos' cameras. Otherwise, scene.ply, scene.splat, metrics.json and
+    held_out.png are written into the folder `out`, and with `page` index.html. began: time of
+    `perf_counter` at the start of the command, for the total time in metrics.json.
     """
     refined = result.refined
-    # all files or none: a scene without its scores is none
-    with replacing_entries(out, "scene.ply") as fresh:
-        save_ply(result.in_photos_world(refined.gaussians), fresh / "scene.ply")
-        # .splat files have no harmonics
-        shown = plain(refined.gaussians, refined.cameras)
-        save_splat(result.in_photos_world(shown), fresh / "scene.splat")
-        result = result.read_back(fresh / "scene.ply")
+    if writer_of(out):
+        save_gaussians(result.in_photos_world(refined.gaussians), out, result.cameras())
         record = scores(result)
-        if result.photos.held_out:
-            picture = held_out_picture(result, record["held_out"])
-            images.write_png(picture, fresh / "held_out.png")
-        if page:
-            views = replace(result.views, cameras=refined.cameras)
-            every = max(len(result.photos.frames) // _ON_PAGE, 1)
-            few = views.select(slice(None, None, every))
-            write_text(fresh / "index.html", page(refined.gaussians, few, (0, 0, 0)))
-        record["total_seconds"] = round(perf_counter() - began, 1)
-        write_text(fresh / "metrics.json", json.dumps(record, indent=1))
-        names = sorted(entry.name for entry in fresh.iterdir())
+        written = [out]
+    else:
+        # all files or none: a scene without its scores is none
+        with replacing_entries(out, "scene.ply") as fresh:
+            record = _write_files(result, fresh, page, began)
+            written = [out / name for name in sorted(entry.name for entry in fresh.iterdir())]
     ended = f", ended by {refined.stopped_by}" if refined.stopped_by else ""
     lines = [
         f"{refined.gaussians.count:,} Gaussians after {refined.steps:,} steps in "
@@ -114,7 +117,49 @@ def write_scene(
                 "the scene is worse than the nearest photo: the poses are wrong, or the time is "
                 "too short; run `qgs data check` on the photos"
             )
-    print_lines(console, [*lines, *(f"wrote {out / name}" for name in names)])
+    print_lines(console, [*lines, *(f"wrote {file}" for file in written)])
+
+
+def _write_files(result: Result, folder: Path, page: bool, began: float) -> dict[str, Any]:
+    """Write the files of `write_scene` into `folder`; return what metrics.json holds."""
+    refined = result.refined
+    save_ply(result.in_photos_world(refined.gaussians), folder / "scene.ply")
+    # .splat files have no harmonics
+    shown = plain(refined.gaussians, refined.cameras)
+    save_splat(result.in_photos_world(shown), folder / "scene.splat")
+    result = result.read_back(folder / "scene.ply")
+    record = scores(result)
+    if result.photos.held_out:
+        picture = held_out_picture(result, record["held_out"])
+        images.write_png(picture, folder / "held_out.png")
+    if page:
+        write_text(folder / "index.html", page_of(result, record))
+    record["total_seconds"] = round(perf_counter() - began, 1)
+    write_text(folder / "metrics.json", json.dumps(record, indent=1))
+    return record
+
+
+def page_of(result: Result, record: Mapping[str, Any]) -> str:
+    """Return an HTML page of the scene, which opens at the held-out photo with the best score.
+
+    record: what metrics.json holds.
+    """
+    from qgs_viewer.page import Tour, gaussians_html
+
+    refined = result.refined
+    views = replace(result.views, cameras=refined.cameras)
+    rows = record["held_out"]
+    best = sorted(range(len(rows)), key=lambda row: -rows[row]["psnr"])[:_JUDGED_ON_PAGE]
+    every = max(len(record["refined_on"]) // _ON_PAGE, 1)
+    stops = concatenated([result.judged.select(best), views.select(slice(None, None, every))], 1)
+    names = [f"{Path(rows[row]['photo']).name}, held out" for row in best]
+    names += [Path(name).name for name in record["refined_on"][::every]]
+    note = f"{refined.gaussians.count:,} Gaussians"
+    if mean := record["mean"]:
+        note += f"; held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}"
+    title = Path(result.photos.path).name
+    tour = Tour(title, note, stops, names, len(best), refined.cameras)
+    return gaussians_html(refined.gaussians, tour, (0, 0, 0))
 
 
 def scores(result: Result) -> dict[str, Any]:
@@ -168,18 +213,18 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
     return figure_picture(grid_figure(pictures, titles), 120)
 
 
-def page_writer(console: Console) -> PageWriter | None:
-    """Return the viewer's function that makes an HTML page; None if the viewer is not installed.
+def has_viewer(console: Console) -> bool:
+    """Return True if the viewer is installed, which makes pages.
 
     Without the viewer, a line on the console says how to install it.
     """
     try:
-        from qgs_viewer.page import gaussians_html
+        import qgs_viewer.page  # noqa: F401
     except ImportError:
         lacking = f"index.html is not written, it needs query-gaussians-viewer: {INSTALL_ALL}"
         print_lines(console, [lacking])
-        return None
-    return gaussians_html
+        return False
+    return True
 
 
 @torch.no_grad()

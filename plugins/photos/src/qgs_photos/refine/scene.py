@@ -12,6 +12,7 @@ from qgs.data.photos.finding import is_inside
 from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import views_in
 from qgs.paths import opened_path
+from qgs.reconstruction.scene_formats import writer_of
 from qgs.reconstruction.scenes import Size
 from qgs.renderers import AutoRenderer
 from qgs.terminal import print_lines
@@ -23,7 +24,7 @@ from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.initial import Initialisation, photos_start
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import refine, seconds_of_step
-from qgs_photos.refine.result import Result, page_writer, write_scene
+from qgs_photos.refine.result import Result, has_viewer, write_scene
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
@@ -50,7 +51,7 @@ def make_scene(
     began: time of `perf_counter` at the start. seconds: time from `began` to the last file.
     """
     # its remark comes first, before minutes of bars
-    page = page_writer(console)
+    page = writer_of(out) is None and has_viewer(console)
     end = END + PART_OF_END * seconds
 
     def left() -> float:

@@ -1,0 +1,79 @@
+"""Compressed files of Gaussians, by gsply: .spz, compressed PLY, and .sog, which is only read."""
+
+import math
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import gsply
+import torch
+
+from qgs.files import replacing
+from qgs.geometry.transforms import moved
+from qgs.reconstruction.scene_formats import read_ply, save_ply
+from qgs.types import SH_COUNTS, Gaussians
+
+# Right, down, forward to right, up, back, the axes of .spz.
+_TURN = torch.tensor([1.0, -1, -1, 1]).diag()
+# Bits of a coordinate in .spz, without its sign.
+_BITS = 23
+
+
+def save_compressed(gaussians: Gaussians, path: str | Path, _: Any = None) -> None:
+    """Write one scene, (G, ...) or (1, G, ...), as compressed PLY of SuperSplat.
+
+    Warns and raises errors as `save_ply` does.
+    """
+    content = gsply.compress_to_bytes(_stored(gaussians))
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def save_spz(gaussians: Gaussians, path: str | Path, _: Any = None) -> None:
+    """Write one scene, (G, ...) or (1, G, ...), as .spz of version 3.
+
+    Positions get as many bits after the point as the farthest allows. Warns and raises errors as
+    `save_ply` does.
+    """
+    content = _stored(moved(gaussians, _TURN, 1.0))
+    _, whole = math.frexp(abs(content.means).max())
+    with replacing(path) as temporary:
+        gsply.write_spz(temporary, content, fractional_bits=min(_BITS - whole, _BITS))
+
+
+def _stored(gaussians: Gaussians) -> gsply.GSData:
+    """Return what a PLY file stores of one scene, without harmonics that the scene lacks."""
+    with TemporaryDirectory() as folder:
+        plain = Path(folder, "plain.ply")
+        save_ply(gaussians, plain)
+        whole = gsply.plyread(plain)
+    count = 0 if gaussians.sh is None else gaussians.sh.shape[-2]
+    degree = (0, *SH_COUNTS).index(count)
+    return gsply.GSData(
+        whole.means,
+        whole.scales,
+        whole.quats,
+        whole.opacities,
+        whole.sh0,
+        whole.shN[:, :count],
+        gsply.create_ply_format(degree),
+    )
+
+
+def load_spz(path: Path) -> Gaussians:
+    """Return the Gaussians (G,) of an .spz file. Errors of gsply pass through."""
+    return moved(_loaded(gsply.read_spz(path)), _TURN, 1.0)
+
+
+def load_sog(path: Path) -> Gaussians:
+    """Return the Gaussians (G,) of a .sog file. Errors of gsply pass through."""
+    from gsply.sog_reader import sogread
+
+    return _loaded(sogread(path))
+
+
+def _loaded(content: gsply.GSData) -> Gaussians:
+    with TemporaryDirectory() as folder:
+        plain = Path(folder, "plain.ply")
+        content.save(plain)
+        return read_ply(plain)

@@ -1,0 +1,135 @@
+""".glb files: what they store of Gaussians and cameras, and what others may write."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+from qgs_photos.formats.gltf import load_glb, save_glb
+from tables import must_refuse
+from torch.testing import assert_close
+from walk import arc, cloud, pinhole
+
+import qgs
+from qgs.geometry.transforms import moved, quat_to_matrix, to_camera, to_pixels
+from qgs.reconstruction.scene_formats import save_gaussians
+
+
+def opened(path):
+    """The JSON and the numbers of a .glb file."""
+    data = path.read_bytes()
+    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    assert (kind, length % 4) == (b"JSON", 0)
+    size, kind = struct.unpack_from("<I4s", data, 20 + length)
+    numbers = data[28 + length :]
+    assert (kind, size) == (b"BIN\0", len(numbers))
+    return json.loads(data[20 : 20 + length]), numbers
+
+
+def write(path, content, numbers):
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(numbers), b"BIN\0") + numbers
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def assert_same(found, expected):
+    for part in ("means", "scales", "opacities", "colors", "sh"):
+        assert_close(getattr(found, part), getattr(expected, part))
+    turns = quat_to_matrix(found.quats), quat_to_matrix(expected.quats)
+    assert_close(*turns, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("count", [0, 3, 8, 15])
+def test_the_round_trip(tmp_path, count):
+    given = cloud(50).replace(sh=torch.randn(1, 50, count, 3) if count else None)
+    save_gaussians(given, tmp_path / "a.glb")
+    assert_same(qgs.load_ply(tmp_path / "a.glb"), given)
+
+
+def test_cameras_see_what_ours_see(tmp_path):
+    """In glTF, -Z is forward and +Y is up; the mean up direction of the cameras is +Y."""
+    lens = (60.0, 50.0, 32.0, 24.0)
+    cameras = pinhole(arc([-20, 0, 20], 3, 0.2), lens, (48, 64))[None].to(torch.float32)
+    given = cloud(20)
+    named = {f"photo {view}": cameras[:, [view]] for view in range(3)}
+    save_glb(given, tmp_path / "a.glb", named)
+    content, numbers = opened(tmp_path / "a.glb")
+    nodes = content["nodes"]
+    assert [node["name"] for node in nodes] == ["scene", *named, "flight"]
+    stored = load_glb(tmp_path / "a.glb").means * torch.tensor([1.0, -1, -1])
+    up = torch.zeros(3)
+    for view, node in enumerate(nodes[1:4]):
+        x, y, z, w = node["rotation"]
+        turn = quat_to_matrix(torch.tensor([w, x, y, z]))
+        up += turn[:, 1]
+        local = (stored - torch.tensor(node["translation"])) @ turn
+        lens = content["cameras"][node["camera"]]["perspective"]
+        half = np.tan(lens["yfov"] / 2)
+        seen = local[:, :2] / -local[:, 2:] / torch.tensor([half * lens["aspectRatio"], half])
+        pixels = (seen * torch.tensor([1, -1]) + 1) / 2 * torch.tensor([64, 48])
+        camera = cameras[:, [view]]
+        expected = to_pixels(to_camera(given.means, camera), camera.intrinsics)[0, 0]
+        assert_close(pixels.float(), expected, atol=1e-3, rtol=1e-4)
+    assert_close(up / up.norm(), torch.tensor([0.0, 1, 0]), atol=1e-5, rtol=0)
+
+    (flight,) = content["animations"]
+    for sampler, part, width in zip(
+        flight["samplers"], ("translation", "rotation"), (3, 4), strict=True
+    ):
+        view = content["bufferViews"][content["accessors"][sampler["output"]]["bufferView"]]
+        values = np.frombuffer(numbers, "<f4", 3 * width, view["byteOffset"]).reshape(3, width)
+        expected = [node[part] for node in nodes[1:4]]
+        np.testing.assert_allclose(values, expected, atol=1e-6)
+    assert {channel["target"]["node"] for channel in flight["channels"]} == {4}
+
+
+def test_files_of_others_are_read(tmp_path):
+    """Nodes in nodes, integers as fractions, arrays woven into one, another primitive."""
+    given = cloud(6)
+    save_glb(given, tmp_path / "a.glb")
+    content, numbers = opened(tmp_path / "a.glb")
+    splats = content["meshes"][0]["primitives"][0]
+    content["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}})
+    content["nodes"] = [
+        {"children": [1], "rotation": [0, 0, 2**-0.5, 2**-0.5], "scale": [2, 2, 2]},
+        {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]},
+    ]
+    content["scenes"] = [{"nodes": [0]}]
+    woven = np.full((6, 4), 77, np.uint16)
+    woven[:, 0] = (given.opacities[0] * 65535).round().numpy()
+    content["bufferViews"].append(
+        {"buffer": 0, "byteOffset": len(numbers), "byteLength": 48, "byteStride": 8}
+    )
+    opacities = content["accessors"][splats["attributes"]["KHR_gaussian_splatting:OPACITY"]]
+    opacities |= {"bufferView": len(content["bufferViews"]) - 1, "componentType": 5123}
+    write(tmp_path / "b.glb", content, numbers + woven.tobytes())
+
+    turn = torch.tensor([1.0, -1, -1, 1]).diag()
+    outer = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    inner = torch.eye(4)
+    inner[0, 3] = 5
+    expected = moved(moved(given, inner @ turn, 1.0), turn @ outer, 2.0)
+    found = qgs.load_ply(tmp_path / "b.glb")
+    assert_close(found.opacities, given.opacities, atol=1e-5, rtol=0)
+    assert_same(found.replace(opacities=given.opacities), expected)
+
+
+def test_what_cannot_be_read_is_refused(tmp_path):
+    save_glb(cloud(3), tmp_path / "a.glb")
+    content, numbers = opened(tmp_path / "a.glb")
+    mesh = content["meshes"][0]["primitives"][0]
+    wrong = tmp_path / "wrong.glb"
+    for part, key, value, words in (
+        (content["accessors"][0], "count", 10**9, "strides"),
+        (mesh["extensions"]["KHR_gaussian_splatting"], "colorSpace", "linear", "linear"),
+        (mesh, "extensions", {}, "no primitives"),
+    ):
+        part[key] = value
+        write(wrong, content, numbers)
+        must_refuse(f"wrong.glb cannot be read.*{words}", qgs.load_ply, wrong)
+    wrong.write_bytes(b"solid cube of another program")
+    must_refuse("no binary glTF", qgs.load_ply, wrong)
