@@ -9,16 +9,18 @@ import torch
 from browser import CHROMIUM, chromium
 from qgs_viewer.comparison import open_models
 from qgs_viewer.opening import open_source
-from qgs_viewer.page import quiet_server, scene_html
+from qgs_viewer.page import Tour, gaussians_html, quiet_server, scene_html
 from qgs_viewer.panel import Panel
 from qgs_viewer.query_scene import QueryScene
 from qgs_viewer.report import Comparison, report_html
 from qgs_viewer.scenes import model_scenes
 from small import PAIR, stand_in
 from torch.nn.functional import normalize
-from walk import cloud
+from walk import arc, cloud, pinhole
 
 from qgs.geometry.harmonics import harmonics
+from qgs.renderers import AutoRenderer
+from qgs.types import Views
 
 pytestmark = [
     pytest.mark.slow,
@@ -132,6 +134,52 @@ def test_a_page_has_the_colors_of_several_directions(page, tmp_path, monkeypatch
         values = harmonics(normalize(-torch.tensor(eye), dim=0), count)
         expected = 255 * (given.colors + values @ sh)[0, 0]
         assert shown == pytest.approx(expected.numpy(), abs=3)
+
+
+def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
+    """Photos are what our renderer shows, and as wide as the window."""
+    lens = (300.0, 300.0, 160.0, 100.0)
+    cameras = pinhole(arc([-40.0, 0, 40], 3, 0.3), lens, (200, 320))[None].to(torch.float32)
+    given = cloud(200)
+    photos = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0)))(given, cameras).rgb
+    names = ["</script><b>left</b>", "middle", "right"]
+    tour = Tour("walk", "3 photos", Views(photos, cameras), names, 2, cameras)
+    file = tmp_path / "scene.html"
+    file.write_text(gaussians_html(given, tour, (0, 0, 0)))
+    page.open(file.as_uri())
+    page.until("the scene", "window.tour && !document.querySelector('#veil')")
+    buttons = "[...document.querySelectorAll('#tour nav button')]"
+    assert page.evaluate(f"{buttons}.map(b => b.innerText)") == ["play", *names]
+
+    def away():
+        """Of the window from each photo, as a mean of differences."""
+        shown = drawn(page)[:, 2:-2]
+        small = shown.reshape(120, 4, 149, 4, 3).mean((1, 3))
+        parts = 255 * photos[0, :, :, 40:160, 83:232].permute(0, 2, 3, 1).numpy()
+        return [abs(small - part).mean() for part in parts]
+
+    left, middle, _ = away()
+    assert left < 4 < middle / 2
+    page.evaluate(f"{buttons}[3].click()")
+    *_, middle, right = away()
+    assert right < 4 < middle / 2
+    photo = "document.querySelector('#tour img')"
+    assert page.evaluate(f"{photo}.hidden")
+    page.evaluate(f"{buttons}[2].click()")
+    assert not page.evaluate(f"{photo}.hidden")
+    rendered = away()[1]
+    slider = "document.querySelector('#tour input')"
+    page.evaluate(f"{slider}.value = 100; {slider}.oninput()")
+    assert away()[1] < 0.5 < rendered
+    page.evaluate(f"{buttons}[0].click()")
+    page.until("a flight", lambda: away()[1] > 8)
+    page.evaluate(f"{buttons}[0].click()")
+    phone = {"width": 420, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    page.call("Emulation.setDeviceMetricsOverride", **phone)
+    assert page.evaluate("document.documentElement.scrollWidth") == 420
+    page.call("Emulation.clearDeviceMetricsOverride")
+    assert not page.errors
+    assert_alone(page, file)
 
 
 def assert_alone(page, file):

@@ -1,6 +1,7 @@
 """The panel, its scene and its server without a browser; pages, notebooks, `qgs view`."""
 
 import http.client
+import json
 import re
 import time
 from contextlib import suppress
@@ -17,17 +18,18 @@ from commands import done
 from PIL import Image
 from qgs_viewer.drawing import Choice, Drawing
 from qgs_viewer.notebook import prediction_png, show_pictures
-from qgs_viewer.page import quiet_server, scene_html
+from qgs_viewer.page import Tour, gaussians_html, quiet_server, scene_html
 from qgs_viewer.panel import Panel, plain
 from qgs_viewer.query_scene import QueryScene
 from small import QUERIES, model_of, model_scenes_of, sample_of, source_of
 from tables import must_refuse
 from viser.transforms import SO3
-from walk import cloud
+from walk import arc, cloud, pinhole
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import qgs
+from qgs.types import Views
 
 
 @pytest.fixture(scope="module")
@@ -158,6 +160,22 @@ def test_a_page_is_small_and_asks_for_nothing():
     assert len(without_data) < len(page) < 2_000_000
     outside = r"""(?:src|href)\s*=\s*["']?(https?:)?//|<link rel="stylesheet"""
     assert not re.search(outside, without_data)
+
+
+def test_a_tour_lists_cameras_and_names():
+    lens = (60.0, 50.0, 32.0, 24.0)
+    cameras = pinhole(arc([-20.0, 20], 3), lens, (48, 64))[None].to(torch.float32)
+    views = Views(torch.rand(1, 2, 3, 48, 64), cameras)
+    page = gaussians_html(cloud(64), Tour("a", "b", views, ["</script>", "c"], 1, cameras))
+    tour = json.loads(re.search("window.tour = (.*);</script>", page)[1])
+    first, last = tour["stops"]
+    assert (first["name"], "photo" in first, "photo" in last) == ("</script>", True, False)
+    assert first["tangent"] == 48 / 2 / 50
+    assert first["ratio"] == pytest.approx(64 / 60 / (48 / 50))
+    eye, target = np.array(tour["path"][1]["eye"]), np.array(last["target"])
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    np.testing.assert_allclose(forward, cameras.c2w[0, 1, :3, 2], rtol=1e-5)
+    np.testing.assert_allclose(last["up"], -cameras.c2w[0, 1, :3, 1])
 
 
 show_pictures()
