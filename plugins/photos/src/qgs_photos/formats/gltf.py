@@ -29,6 +29,8 @@ from qgs.types import Cameras, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 COLORS = "srgb_rec709_display"
+UPRIGHT = "upright"
+"""Extra of the asset: the rotation (4, 4) from the world of the Gaussians to that of the file."""
 SECONDS = 1.0
 """Time of the flight from one camera to the next."""
 NEAREST = 0.01
@@ -72,7 +74,7 @@ def save_glb(
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": COLORS}},
     }
     content = {
-        "asset": {"version": "2.0", "generator": "qgs"},
+        "asset": {"version": "2.0", "generator": "qgs", "extras": {UPRIGHT: upright.tolist()}},
         "extensionsUsed": [EXTENSION],
         "meshes": [{"primitives": [splats]}],
         "nodes": [{"name": "scene", "mesh": 0}],
@@ -193,8 +195,9 @@ def _filmed(
 def load_glb(path: Path) -> Gaussians:
     """Return the Gaussians (G,) of all primitives with KHR_gaussian_splatting in a .glb file.
 
-    Raises ValueError for another kind of file, for none of these primitives, and for other colours
-    than sRGB; IndexError, KeyError or struct.error for a damaged file.
+    The world of a file by `save_glb` is turned back; of others, +Y becomes -y. Raises ValueError
+    for another kind of file, for none of these primitives, and for other colours than sRGB;
+    IndexError, KeyError or struct.error for a damaged file.
     """
     data = path.read_bytes()
     magic, _, _, length, _ = struct.unpack_from("<4sIIII", data)
@@ -203,9 +206,10 @@ def load_glb(path: Path) -> Gaussians:
     content = json.loads(data[20 : 20 + length])
     numbers = data[28 + length :]
     parts = list[Gaussians]()
+    turned = content["asset"].get("extras", {}).get(UPRIGHT, _TURN.tolist())
     for pose, mesh in _meshes(content):
         factor = float(pose[:3, 0].norm())
-        rigid = _TURN @ pose
+        rigid = torch.tensor(turned).double().T @ pose
         rigid[:3, :3] /= factor
         for primitive in mesh["primitives"]:
             if EXTENSION in primitive.get("extensions", ()):
