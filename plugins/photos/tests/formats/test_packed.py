@@ -1,12 +1,19 @@
 """Compressed files: gsply writes and reads them, others read ours."""
 
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
+from qgs_photos.formats.gltf import save_glb
 from torch.testing import assert_close
-from walk import cloud
+from walk import arc, cloud, pinhole
 
 import qgs
-from qgs.geometry.transforms import quat_to_matrix
+from qgs.geometry.transforms import moved, quat_to_matrix
 from qgs.reconstruction.scene_formats import save_gaussians
 
 
@@ -15,12 +22,12 @@ def covariances(gaussians):
     return axes @ axes.mT
 
 
-def assert_close_enough(found, given):
+def assert_close_enough(found, given, sh=0.04):
     found = found[0][torch.cdist(given.means[0], found.means[0]).argmin(1)]
     for part in ("means", "opacities", "colors"):
         assert_close(getattr(found, part), getattr(given, part)[0], atol=0.01, rtol=0)
     assert_close(covariances(found), covariances(given)[0], atol=4e-3, rtol=0)
-    assert_close(found.sh, given.sh[0], atol=0.04, rtol=0)
+    assert_close(found.sh, given.sh[0], atol=sh, rtol=0)
 
 
 @pytest.mark.parametrize("suffix", ["spz", "compressed.ply"])
@@ -44,3 +51,40 @@ def test_positions_in_spz_are_as_fine_as_the_farthest_allows(tmp_path):
         found = qgs.load_ply(tmp_path / "a.spz")
         step = factor * float(given.means.abs().max()) / 2**22
         assert_close(found.means, far.means, atol=max(step, 2**-24), rtol=0)
+
+
+def node(*words, folder):
+    return subprocess.run(words, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("npm") is None, reason="there is no npm: apt install npm")
+def test_splat_transform_and_three_read_our_files(tmp_path):
+    node("npm", "install", "three@0.187", "@playcanvas/splat-transform@2.7", folder=tmp_path)
+    given = cloud(300).replace(sh=torch.rand(1, 300, 8, 3) - 0.5)
+    for name in ("a.spz", "a.compressed.ply"):
+        save_gaussians(given, tmp_path / name)
+        node("npx", "splat-transform", "-w", name, "back.ply", folder=tmp_path)
+        assert_close_enough(qgs.load_ply(tmp_path / "back.ply"), given)
+    qgs.save_ply(given, tmp_path / "a.ply")
+    for name in ("back.spz", "back.compressed.ply", "back.glb"):
+        node("npx", "splat-transform", "-w", "a.ply", name, folder=tmp_path)
+        found = qgs.load_ply(tmp_path / name)
+        if name == "back.glb":
+            # it turns about another axis
+            found = moved(found, torch.tensor([-1.0, 1, -1, 1]).diag(), 1.0)
+        # it gives harmonics of degree 2 four bits
+        assert_close_enough(found, given, 0.07)
+
+    cameras = pinhole(arc([-20.0, 0, 20], 3)).to(torch.float32)[None]
+    save_glb(given, tmp_path / "a.glb", {name: cameras[:, [i]] for i, name in enumerate("abc")})
+    read = Path(__file__).with_name("read_glb.mjs").read_text()
+    (tmp_path / "read.mjs").write_text(read)
+    seen = json.loads(node("node", "read.mjs", "a.glb", folder=tmp_path))
+    assert seen["counts"] == [300]
+    assert [camera["name"] for camera in seen["cameras"]] == [*"abc", "flight"]
+    turn = np.diag([1, -1, -1, 1])
+    for camera, c2w in zip(seen["cameras"], cameras.c2w[0].numpy(), strict=False):
+        world = np.reshape(camera["world"], (4, 4)).T
+        np.testing.assert_allclose(world, turn @ c2w @ turn, atol=1e-5)
+    assert seen["clips"] == [["flight", 2, ["flight.position", "flight.quaternion"]]]

@@ -7,7 +7,7 @@ Source: glTF 2.0 and its extension KHR_gaussian_splatting. In glTF, +Y is up and
 import json
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ EXTENSION = "KHR_gaussian_splatting"
 COLORS = "srgb_rec709_display"
 UPRIGHT = "upright"
 """Extra of the asset: the rotation (4, 4) from the world of the Gaussians to that of the file."""
+FLIGHT = "flight"
+"""Name of the camera that moves, and of its animation."""
 SECONDS = 1.0
 """Time of the flight from one camera to the next."""
 NEAREST = 0.01
@@ -80,10 +82,8 @@ def save_glb(
         "nodes": [{"name": "scene", "mesh": 0}],
     }
     if given:
-        c2w = upright @ c2w @ _TURN
-        distance = float((c2w[:, :3, 3] - scene.means.median(0).values).norm(dim=-1).median())
-        lenses = [_lens(camera, NEAREST * distance) for camera in given.values()]
-        content |= _filmed([*given], c2w, lenses, arrays)
+        filmed = {**given, FLIGHT: next(iter(given.values()))}
+        content |= _filmed(filmed, upright, scene.means.median(0).values, arrays)
     content |= {
         "scene": 0,
         "scenes": [{"nodes": [*range(len(content["nodes"]))]}],
@@ -162,34 +162,34 @@ def _lens(camera: Cameras, near: float) -> dict[str, Any]:
 
 
 def _filmed(
-    names: Sequence[str], poses: Tensor, lenses: Sequence[Mapping[str, Any]], arrays: _Arrays
+    cameras: Mapping[str, Cameras], upright: Tensor, middle: Tensor, arrays: _Arrays
 ) -> dict[str, Any]:
     """Return cameras with their nodes, after the scene's, and the animation of the last of them.
 
-    poses: (V, 4, 4). lenses: glTF cameras of the V photos; the flight has the first.
+    upright: rotation (4, 4) from their world to the file's. middle: middle of the scene, (3,).
     """
-    places = poses[:, :3, 3]
-    quats = rotation_matrix_to_quaternion(poses[:, :3, :3].contiguous()).roll(-1, -1)
+    c2w = torch.cat([camera.c2w[0].double().cpu() for camera in cameras.values()])
+    c2w = upright @ c2w @ _TURN
+    places = c2w[:, :3, 3]
+    quats = rotation_matrix_to_quaternion(c2w[:, :3, :3].contiguous()).roll(-1, -1)
+    near = NEAREST * float((places - middle).norm(dim=-1).median())
     nodes = [{"name": "scene", "mesh": 0}]
-    for index, name in enumerate([*names, "flight"]):
-        photo = index % len(names)
-        nodes.append(
-            {
-                "name": name,
-                "camera": photo,
-                "translation": places[photo].tolist(),
-                "rotation": quats[photo].tolist(),
-            }
-        )
-    times = arrays.add(SECONDS * torch.arange(len(names))[:, None])
-    moves = {"translation": arrays.add(places), "rotation": arrays.add(quats)}
+    for index, name in enumerate(cameras):
+        place = {"translation": places[index].tolist(), "rotation": quats[index].tolist()}
+        nodes.append({"name": name, "camera": index, **place})
+    # from each of the others to the next
+    times = arrays.add(SECONDS * torch.arange(len(cameras) - 1)[:, None])
+    outputs = {"translation": arrays.add(places[:-1]), "rotation": arrays.add(quats[:-1])}
     channels = [
-        {"sampler": index, "target": {"node": len(names) + 1, "path": path}}
-        for index, path in enumerate(moves)
+        {"sampler": index, "target": {"node": len(cameras), "path": path}}
+        for index, path in enumerate(outputs)
     ]
-    samplers = [{"input": times, "output": output} for output in moves.values()]
-    flight = {"name": "flight", "channels": channels, "samplers": samplers}
-    return {"cameras": lenses, "nodes": nodes, "animations": [flight]}
+    samplers = [{"input": times, "output": output} for output in outputs.values()]
+    return {
+        "cameras": [_lens(camera, near) for camera in cameras.values()],
+        "nodes": nodes,
+        "animations": [{"name": FLIGHT, "channels": channels, "samplers": samplers}],
+    }
 
 
 def load_glb(path: Path) -> Gaussians:
