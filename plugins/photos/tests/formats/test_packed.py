@@ -61,7 +61,7 @@ def node(*words, folder):
 @pytest.mark.skipif(shutil.which("npm") is None, reason="there is no npm: apt install npm")
 def test_splat_transform_and_three_read_our_files(tmp_path):
     node("npm", "install", "three@0.187", "@playcanvas/splat-transform@2.7", folder=tmp_path)
-    given = cloud(300).replace(sh=torch.rand(1, 300, 8, 3) - 0.5)
+    given = cloud(300).replace(sh=torch.rand(1, 300, 15, 3) - 0.5)
     for name in ("a.spz", "a.compressed.ply"):
         save_gaussians(given, tmp_path / name)
         node("npx", "splat-transform", "-w", name, "back.ply", folder=tmp_path)
