@@ -9,14 +9,17 @@ from itertools import count
 import pytest
 import torch
 from qgs_photos.refine import refine
+from qgs_photos.refine.adjusting import Adjustments
 from qgs_photos.refine.growth import FreeGaussians
 from qgs_photos.refine.refining import Extras
 from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
 from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
+from qgs_photos.viewing import VIEWER
 from tables import assert_equal, must_refuse
 from textured_room import INTRINSICS, photos_of, walk
+from torch.testing import assert_close
 from walk import arc, cloud, pinhole
 
 from qgs.containers import map_tensors
@@ -203,14 +206,31 @@ def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay():
     assert torch.allclose(turns @ turns.mT, torch.eye(3), 0, 1e-5)
 
 
-def test_a_darker_photo_leaves_the_gaussians_alone():
-    true = photos(3)
-    dark = true.images * torch.tensor([1.0, 0.6, 1])[:, None, None, None]
-    plain, adjusted = (
-        refined(true.replace(images=dark), 120, adjust=adjust).gaussians
-        for adjust in ((), ("exposure",))
-    )
-    assert mean_psnr(adjusted, true) > mean_psnr(plain, true) + 0.5
+def test_exposures_of_photos_have_the_mean_0():
+    gains = (0.5, 1.0, 1.5)
+    rgb = torch.rand(1, 1, 3, 9, 9)
+    adjustments = Adjustments(3, ("exposure",), 1.0, rgb)
+    for _ in range(40):
+        seen = [adjustments.seen(i, rgb, gain * rgb) for i, gain in enumerate(gains)]
+    assert_close(torch.cat(seen), torch.cat([gain * rgb for gain in gains]), atol=0.02, rtol=0.02)
+    brighter = [adjustments.seen(i, rgb, 2 * gain * rgb) for i, gain in enumerate(gains)]
+    assert_close(torch.cat(brighter).mean(0), rgb[0], atol=1e-5, rtol=0)
+
+
+def test_exposures_of_photos_leave_the_mean_to_the_gaussians():
+    """A black background is as bright in all photos."""
+    cameras = ring(3, 24)
+    gains = torch.tensor([1.0, 0.6, 1])
+    true = VIEWER(cloud(60), cameras).rgb
+    dark = Views(true * gains[:, None, None, None], cameras)
+
+    def error(*adjust):
+        extras = Extras(adjust=adjust)
+        found = refine(cloud(60), dark, 150, swept=0.0, renderer=VIEWER, extras=extras)
+        with torch.no_grad():
+            return (VIEWER(found.gaussians, cameras).rgb - gains.mean() * true).norm()
+
+    assert error("exposure") < 0.8 * error()
 
 
 def test_harmonics_grow_with_time():

@@ -17,6 +17,7 @@ app = typer.Typer(help="Make the best 3D scene from photos in a given time.")
 class Adjustment(StrEnum):
     """Properties of each photo that can be optimised together with the Gaussians."""
 
+    NOTHING = "nothing"
     POSES = "poses"
     EXPOSURE = "exposure"
 
@@ -83,7 +84,8 @@ Adjust = Annotated[
     list[Adjustment] | None,
     typer.Option(
         help="Optimise a property of each photo together with the Gaussians. poses: its camera. "
-        "exposure: an affine map of its colours. Repeatable. Default: neither."
+        "exposure: an affine map of its colours. Repeatable. Default: exposure if photos differ in "
+        "brightness, else nothing."
     ),
 ]
 Masks = Annotated[
@@ -143,7 +145,7 @@ def scene(
         holdout=holdout,
         scene=scene_name,
         device=choose_device(device),
-        extras=Extras(degree, adjust or ()),
+        extras=Extras(degree, adjust),
         masks=masks,
     )
     try:

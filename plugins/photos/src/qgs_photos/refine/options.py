@@ -57,7 +57,7 @@ class Options:
         words = ["qgs", "scene", photos]
         for name, value in values.items():
             words += [] if value is None else [name, str(value)]
-        for what in self.extras.adjust:
+        for what in self.extras.adjust or ():
             words += ["--adjust", what]
         words += ["--masks"] if self.masks else []
         return shlex.join(words)

@@ -84,11 +84,11 @@ class Extras:
 
     degree: spherical harmonics up to this degree, 0 to 3, are added in steps if the first Gaussians
     have none; 0 adds none. adjust: properties of each photo: "poses", its camera, and "exposure",
-    an affine map of its colours.
+    an affine map of its colours. Other words have no effect; None leaves the choice to `qgs scene`.
     """
 
     degree: int = 0
-    adjust: Collection[str] = ()
+    adjust: Collection[str] | None = None
 
 
 NO_EXTRAS = Extras()
@@ -196,7 +196,7 @@ class _Run:
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
         self.free = FreeGaussians(gaussians, self.rates)
         self.photos = views.images.shape[1]
-        self.adjustments = Adjustments(self.photos, extras.adjust, self.size, gaussians.means)
+        self.adjustments = Adjustments(self.photos, extras.adjust or (), self.size, gaussians.means)
         self.step = 0
         self.grown = 0
         # half of the time is for steps, however long a slow machine matches photos
@@ -238,7 +238,7 @@ class _Run:
         gaussians = self.free.gaussians()
         cameras = self.adjustments.cameras(place, photo.cameras)
         rgb = self.renderer(replace(gaussians, features=None), cameras).rgb
-        rgb = self.adjustments.seen(place, rgb)
+        rgb = self.adjustments.seen(place, rgb, photo.images)
         error = mean_squared_error(rgb, photo.images)
         spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
         loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))

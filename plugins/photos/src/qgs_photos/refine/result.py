@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from rich.console import Console
+from torch import Tensor
 
 from qgs.containers import concatenated
 from qgs.data.samples import in_photos_world
@@ -30,6 +31,7 @@ from qgs.reconstruction.scene_formats import (
 )
 from qgs.terminal import print_lines
 from qgs.types import Cameras, Gaussians, Rendering, Views, World
+from qgs_photos.refine.adjusting import exposed, fitted_exposure
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.viewing import VIEWER, in_own_world
@@ -39,7 +41,7 @@ _SHOWN = 6
 # Views on the page: of photos for the optimisation, and of held-out ones.
 _ON_PAGE = 12
 _JUDGED_ON_PAGE = 4
-_SCORES = ("psnr", "ssim", "alpha", "nearest_input")
+_SCORES = ("psnr", "ssim", "exposed_psnr", "alpha", "nearest_input")
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,11 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
             f"{mean['ssim']:.3f}, alpha {mean['alpha']:.3f}; a copy of the nearest photo: PSNR "
             f"{mean['nearest_input']:.2f} dB"
         )
+        if "exposure" in result.command:
+            lines.append(
+                "their right halves, with the exposure that fits their left halves: PSNR "
+                f"{mean['exposed_psnr']:.2f} dB"
+            )
         if mean["psnr"] < mean["nearest_input"]:
             lines.append(
                 "the scene is worse than the nearest photo: the poses are wrong, or the time is "
@@ -178,6 +185,7 @@ def scores(result: Result) -> dict[str, Any]:
                 "photo": name_of(frame),
                 "psnr": float(psnr(rendering.rgb, photo.images).mean()),
                 "ssim": float(ssim(rendering.rgb, photo.images).mean()),
+                "exposed_psnr": exposed_psnr(rendering.rgb, photo.images),
                 "alpha": float(rendering.alpha.mean()),
                 "nearest_input": float(psnr(nearest, photo.images).mean()),
             }
@@ -196,6 +204,17 @@ def scores(result: Result) -> dict[str, Any]:
         "mean": mean,
         "held_out": rows,
     }
+
+
+def exposed_psnr(rgb: Tensor, image: Tensor) -> float:
+    """Return the PSNR of the right half of `rgb`, with the exposure that fits the left half best.
+
+    rgb, image: render and photo (1, 1, 3, H, W). The exposure is an affine map of colours.
+    """
+    middle = rgb.shape[-1] // 2
+    exposure = fitted_exposure(rgb[..., :middle], image[..., :middle], 1e-6)
+    right = exposed(rgb[..., middle:], exposure).clamp(0, 1)
+    return float(psnr(right, image[..., middle:]).mean())
 
 
 def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> images.Picture:

@@ -19,6 +19,7 @@ from qgs.terminal import print_lines
 from qgs.types import Gaussians, Views, World
 from qgs_photos.datatools.check import faults_of_poses
 from qgs_photos.datatools.findings import Finding
+from qgs_photos.refine.adjusting import DIFFER, brightness
 from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.initial import Initialisation, photos_start
@@ -67,7 +68,7 @@ def make_scene(
         color = (0.0, 0.0, 0.0) if options.masks else edge_color(small)
         renderer = AutoRenderer(AutoRenderer.Config(background=color))
         few, seconds_of_pixel = timed_sweep(small)
-        # exposure and harmonics cost time too
+        options = with_exposure(options, few, small, console)
         step, compiling = seconds_of_step(few, small, renderer, options.extras)
         # once for each version of qgs: that time would be missing in the scene
         began += compiling
@@ -110,6 +111,23 @@ def views_of(photos: ScenePhotos, world: World, size: Size, options: Options) ->
     frames = (*photos.frames, *photos.held_out)
     views = views_in(world, photos.at(size), frames).to(options.device)
     return masked(views) if options.masks else views
+
+
+def with_exposure(
+    options: Options, gaussians: Gaussians, views: Views, console: Console
+) -> Options:
+    """Return `options` with the exposure of photos (1, V) adjusted if they differ, and say so.
+
+    gaussians: (1, G) in the colours of their pixels. Options that choose what is adjusted are kept.
+    """
+    if options.extras.adjust is not None:
+        return options
+    spread = float(brightness(gaussians, views).nan_to_num().std(correction=0))
+    if spread > DIFFER:
+        differs = f"the brightness of photos differs by {spread:.0%}"
+        print_lines(console, [f"{differs}: the exposure of each is optimised"])
+    adjust = ("exposure",) if spread > DIFFER else ("nothing",)
+    return replace(options, extras=replace(options.extras, adjust=adjust))
 
 
 def faults_of_given_poses(photos: ScenePhotos) -> Sequence[Finding]:
