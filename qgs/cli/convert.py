@@ -7,13 +7,11 @@ import typer
 
 
 def convert(
-    source: Annotated[
-        Path, typer.Argument(metavar="IN", help="File of Gaussians: PLY, .spz or .splat.")
-    ],
+    source: Annotated[Path, typer.Argument(metavar="IN", help="File of Gaussians.")],
     out: Annotated[
         Path,
         typer.Argument(
-            metavar="OUT", help="New file: .ply, .splat or a plug-in's format. Must not exist yet."
+            metavar="OUT", help="New file, whose suffix names the format. Must not exist yet."
         ),
     ],
     count: Annotated[
@@ -21,7 +19,7 @@ def convert(
         typer.Option(min=1, help="Number of Gaussians to keep: the most opaque. Default: all."),
     ] = None,
 ) -> None:
-    """Convert a file of Gaussians (PLY, .spz or .splat) to PLY, .splat or a plug-in's format.
+    """Convert a file of Gaussians to another format: .ply, .compressed.ply, .spz, .splat or .glb.
 
     --count keeps only the most opaque Gaussians.
     """
