@@ -149,7 +149,7 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     page.open(file.as_uri())
     page.until("the scene", "window.tour && !document.querySelector('#veil')")
     buttons = "[...document.querySelectorAll('#tour nav button')]"
-    assert page.evaluate(f"{buttons}.map(b => b.innerText)") == ["play", *names]
+    assert page.evaluate(f"{buttons}.map(b => b.innerText)") == ["play", "record", *names]
 
     def away():
         """Of the window from each photo, as a mean of differences."""
@@ -160,12 +160,12 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
 
     left, middle, _ = away()
     assert left < 4 < middle / 2
-    page.evaluate(f"{buttons}[3].click()")
+    page.evaluate(f"{buttons}[4].click()")
     *_, middle, right = away()
     assert right < 4 < middle / 2
     photo = "document.querySelector('#tour img')"
     assert page.evaluate(f"{photo}.hidden")
-    page.evaluate(f"{buttons}[2].click()")
+    page.evaluate(f"{buttons}[3].click()")
     assert not page.evaluate(f"{photo}.hidden")
     rendered = away()[1]
     slider = "document.querySelector('#tour input')"

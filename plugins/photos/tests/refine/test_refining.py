@@ -12,7 +12,6 @@ from qgs_photos.refine import refine
 from qgs_photos.refine.adjusting import Adjustments
 from qgs_photos.refine.growth import FreeGaussians
 from qgs_photos.refine.refining import Extras
-from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
 from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
@@ -165,6 +164,13 @@ def test_colors_beside_harmonics_may_have_any_value():
     assert (given.gaussians().colors < grown).all()
 
 
+def test_colors_beside_harmonics_move_into_the_range_of_files():
+    """Even where no photo shows them."""
+    hidden = {"colors": torch.full((1, 60, 3), 1.5), "opacities": torch.full((1, 60), 1e-3)}
+    given = cloud(60).replace(sh=torch.zeros(1, 60, 3, 3), **hidden)
+    assert refine(given, photos(3), 30, swept=0.0).gaussians.colors.max() < 1.4
+
+
 def test_growth_leaves_the_rendering_as_it_is():
     """Also of fog, Gaussians that are all faint, of which many copies are made at once.
 
@@ -273,33 +279,6 @@ def test_surroundings_hide_what_is_behind_them():
     empty = surrounded(cloud(60).replace(opacities=torch.zeros(1, 60)), views, color)
     seen = render(empty, views.cameras, torch.zeros(3))
     assert torch.allclose(seen.rgb[0, 0, :, 12, 12], torch.tensor(color), 0, 0.01)
-
-
-def coloured():
-    return cloud(60).replace(sh=0.3 * torch.randn(1, 60, 3, 3))
-
-
-def test_one_photo_is_rendered_as_with_harmonics():
-    gaussians = coloured()
-    cameras = ring(1, 48)
-    found = plain(gaussians, cameras)
-    assert found.sh is None
-    full, same, flat = (
-        RENDERER(g, cameras).rgb for g in (gaussians, found, gaussians.replace(sh=None))
-    )
-    assert torch.allclose(same, full, 0, 1e-4)
-    assert (flat - full).abs().max() > 0.05
-
-
-def test_photos_that_do_not_show_a_gaussian_do_not_count():
-    gaussians = coloured()
-    cameras = ring(2, 48)
-    away = cameras.c2w.clone()
-    away[:, 1, :3, [0, 2]] *= -1
-    one = plain(gaussians, cameras[:, :1]).colors
-    alike = (plain(gaussians, cameras.replace(c2w=away)).colors - one).abs().amax(-1) < 1e-5
-    assert alike.float().mean() > 0.95  # but for those that no photo shows
-    assert not torch.allclose(plain(gaussians, cameras).colors, one, atol=0.01)
 
 
 def walked(count):

@@ -49,6 +49,9 @@ _SSIM = 0.25
 # photos, because few photos leave more freedom to fill space with fog.
 _SMALL = 0.06
 _SMALL_OF_FEW = 0.4
+# Weight of squares of what lies outside of 0 to 1 in colours beside harmonics: .spz, .splat and many
+# viewers cannot hold it.
+_OUTSIDE = 10.0
 # Part of the budget at which growth is complete.
 _GROWN = 0.6
 # Part of the budget at which relocation ends.
@@ -243,7 +246,8 @@ class _Run:
         spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
         loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
         loss = loss + max(_SMALL, _SMALL_OF_FEW / self.photos) * spread
-        loss = loss + self.adjustments.cost(place)
+        outside = gaussians.colors - gaussians.colors.clamp(0, 1)
+        loss = loss + _OUTSIDE * outside.square().mean() + self.adjustments.cost(place)
         self.free.optimizer.zero_grad()
         loss.backward()
         self.free.optimizer.step()

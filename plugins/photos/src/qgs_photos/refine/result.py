@@ -18,8 +18,7 @@ from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import rgb_picture
 from qgs.extensions import INSTALL_ALL
 from qgs.files import replacing_entries, write_text
-from qgs.geometry.harmonics import seen_colors
-from qgs.geometry.transforms import depths_in_view, moved
+from qgs.geometry.transforms import moved
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.reconstruction.scene_formats import (
@@ -132,7 +131,7 @@ def _write_files(result: Result, folder: Path, page: bool, began: float) -> dict
     refined = result.refined
     save_ply(result.in_photos_world(refined.gaussians), folder / "scene.ply")
     # .splat files have no harmonics
-    shown = plain(refined.gaussians, refined.cameras)
+    shown = replace(refined.gaussians, sh=None)
     save_splat(result.in_photos_world(shown), folder / "scene.splat")
     result = result.read_back(folder / "scene.ply")
     record = scores(result)
@@ -244,29 +243,3 @@ def has_viewer(console: Console) -> bool:
         print_lines(console, [lacking])
         return False
     return True
-
-
-@torch.no_grad()
-def plain(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
-    """Return Gaussians (1, G) without `sh`: colours are means over the cameras (1, V).
-
-    A Gaussian's mean is over the cameras in whose image its centre lies, or over all cameras if its
-    centre lies in no image.
-    """
-    if gaussians.sh is None:
-        return gaussians
-    views = cameras.shape[1]
-    total = torch.zeros_like(gaussians.colors)
-    mean_of_all = torch.zeros_like(total)
-    count = torch.zeros_like(gaussians.opacities)[..., None]
-    # all views at once would take gigabytes
-    for view in range(views):
-        camera = cameras[:, [view]]
-        depths = depths_in_view(gaussians.means[0], camera)
-        seen = depths.isfinite()[..., None].float()
-        colors = seen_colors(gaussians, camera)[:, 0]
-        total += seen * colors
-        count += seen
-        mean_of_all += colors / views
-    mean = total / count.clamp_min(1)
-    return replace(gaussians, colors=torch.where(count > 0, mean, mean_of_all), sh=None)
