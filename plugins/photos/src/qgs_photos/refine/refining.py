@@ -49,8 +49,8 @@ _SSIM = 0.25
 # photos, because few photos leave more freedom to fill space with fog.
 _SMALL = 0.06
 _SMALL_OF_FEW = 0.4
-# Weight of squares of what lies outside of 0 to 1 in colours beside harmonics: .spz, .splat and many
-# viewers cannot hold it.
+# Weight of squares of what lies outside of 0 to 1 in colours beside harmonics, which .spz, .splat
+# and many viewers cannot hold.
 _OUTSIDE = 10.0
 # Part of the budget at which growth is complete.
 _GROWN = 0.6
