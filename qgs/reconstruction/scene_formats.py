@@ -68,10 +68,7 @@ def save_gaussians(
     """
     writer = writer_of(path)
     if writer is None:
-        raise ValueError(
-            f"{path} must end in {listed(_writers(), between=' or ')}; for others give a PLY to "
-            "PlayCanvas' converter: `npx @playcanvas/splat-transform IN.ply OUT`"
-        )
+        raise _unwritable(path)
     writer()(gaussians, path, cameras or {})
 
 
@@ -79,9 +76,19 @@ def writer_of(path: str | Path) -> Callable[[], SceneWriter] | None:
     """Return a function that returns the writer of files such as `path`; None if there is none.
 
     For a writer of another package (entry points WRITER_GROUP), the function raises ExtensionError
-    if the package cannot be imported.
+    if the package cannot be imported. Raises ValueError for files that can only be read.
     """
-    return _of_suffix(path, _writers())
+    found = _of_suffix(path, _writers())
+    if found is None and _of_suffix(path, _added(READER_GROUP)):
+        raise _unwritable(path)
+    return found
+
+
+def _unwritable(path: str | Path) -> ValueError:
+    return ValueError(
+        f"{path} must end in {listed(_writers(), between=' or ')}; for others give a PLY to "
+        "PlayCanvas' converter: `npx @playcanvas/splat-transform IN.ply OUT`"
+    )
 
 
 def _writers() -> dict[str, Callable[[], SceneWriter]]:

@@ -5,25 +5,23 @@ factor = gamma / (2 sigma^2) and lower = gamma * bias_min, with the weight gamma
 of the bias. A token is a column of six numbers: moment m and direction d of its ray.
 """
 
-from qgs.kernels import TWO, ZERO, kernel
+from qgs.kernels import ONE, TWO, ZERO, kernel
+from qgs.kernels.projection import cross, dot, plus, vector
 
 
 @kernel
 def _query(row):
-    """Return x, y, z, factor and lower of a query."""
-    return row[0], row[1], row[2], row[3], row[4]
+    """Return mu, factor and lower of a query."""
+    return vector(row), row[3], row[4]
 
 
 @kernel
-def _moment(x, y, z, t, j):
-    """Return e = mu x d - m, the moment of ray j around the point mu = (x, y, z).
-
-    t: columns of all tokens: moment m and direction d of a ray.
-    """
+def _ray(tokens, j):
+    """Return moment m and direction d of ray j."""
+    # Not by `vector` of a slice, whose strides would keep the compiler from vectors of rays.
     return (
-        y * t[5, j] - z * t[4, j] - t[0, j],
-        z * t[3, j] - x * t[5, j] - t[1, j],
-        x * t[4, j] - y * t[3, j] - t[2, j],
+        (tokens[0, j], tokens[1, j], tokens[2, j]),
+        (tokens[3, j], tokens[4, j], tokens[5, j]),
     )
 
 
@@ -34,11 +32,12 @@ def write(queries, tokens, out):
     D = |mu x d - m| is the distance of the anchor's centre mu from the ray (moment m, direction d).
     """
     for n in range(queries.shape[0]):
-        x, y, z, factor, lower = _query(queries[n])
+        mu, factor, lower = _query(queries[n])
         row = out[n]
         for j in range(row.shape[0]):
-            e0, e1, e2 = _moment(x, y, z, tokens, j)
-            bias = -factor * (e0 * e0 + e1 * e1 + e2 * e2)
+            m, d = _ray(tokens, j)
+            e = plus(cross(mu, d), -ONE, m)
+            bias = -factor * dot(e, e)
             # Not max(): a NaN must stay, so that training sees it.
             row[j] = lower if bias <= lower else bias
 
@@ -51,21 +50,20 @@ def gradients(queries, tokens, gradient, out):
     e = mu x d - m. The gradient of |e|^2 with respect to the anchor's centre mu is 2 d x e.
     """
     for n in range(queries.shape[0]):
-        x, y, z, factor, lower = _query(queries[n])
+        mu, factor, lower = _query(queries[n])
         row = gradient[n]
-        of_x = of_y = of_z = of_factor = of_lower = ZERO
+        of_mu = (ZERO, ZERO, ZERO)
+        of_factor = of_lower = ZERO
         for j in range(row.shape[0]):
-            e0, e1, e2 = _moment(x, y, z, tokens, j)
-            distance_sq = e0 * e0 + e1 * e1 + e2 * e2
+            m, d = _ray(tokens, j)
+            e = plus(cross(mu, d), -ONE, m)
+            distance_sq = dot(e, e)
             # At the clamp the gradient goes to the bound, which contains gamma.
             inside = ZERO if -factor * distance_sq <= lower else row[j]
-            of_x += inside * (tokens[4, j] * e2 - tokens[5, j] * e1)
-            of_y += inside * (tokens[5, j] * e0 - tokens[3, j] * e2)
-            of_z += inside * (tokens[3, j] * e1 - tokens[4, j] * e0)
+            of_mu = plus(of_mu, inside, cross(d, e))
             of_factor += inside * distance_sq
             of_lower += row[j] - inside
-        out[n, 0] = -TWO * factor * of_x
-        out[n, 1] = -TWO * factor * of_y
-        out[n, 2] = -TWO * factor * of_z
+        for axis in range(3):
+            out[n, axis] = -TWO * factor * of_mu[axis]
         out[n, 3] = -of_factor
         out[n, 4] = of_lower

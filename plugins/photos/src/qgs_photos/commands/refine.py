@@ -47,7 +47,7 @@ def refine(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="New folder, or a .ply or .splat file, for the result. Default: "
+            help="New folder, or file of Gaussians (.ply, .glb, ...), for the result. Default: "
             "RECONSTRUCTION/refined."
         ),
     ] = None,

@@ -97,7 +97,9 @@ Masks = Annotated[
 @app.command()
 def scene(
     photos: Annotated[str, typer.Argument(help="Folder of photos, its URL, or a video.")],
-    out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("scene"),
+    out: Annotated[
+        Path, typer.Option(help="New folder for results, or file for Gaussians: .glb, .spz, ...")
+    ] = Path("scene"),
     minutes: Minutes = 5.0,
     model: Model = None,
     earlier: From = None,
@@ -115,10 +117,10 @@ def scene(
 ) -> None:
     """Make the best 3D scene from photos in a given time.
 
-    Writes a PLY, a .splat file, an HTML page, and scores on held-out photos. First, Gaussians are
-    made from depth in the photos or by a model; then they are optimised on the photos. The settings
-    that were chosen are printed as a command that makes the scene again. Ctrl-C ends the
-    optimisation early and writes its result.
+    Writes a PLY, a .splat file, an HTML page, and scores on held-out photos; or one file, .glb with
+    the photos' cameras. First, Gaussians are made from depth in the photos or by a model; then they
+    are optimised on the photos. The settings that were chosen are printed as a command that makes
+    the scene again. Ctrl-C ends the optimisation early and writes its result.
     """
     began = perf_counter() - process_time()
     # what can be refused is refused before anything heavy is imported

@@ -7,12 +7,13 @@ Source: glTF 2.0 and its extension KHR_gaussian_splatting. In glTF, +Y is up and
 import json
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from kornia.geometry.conversions import (
     quaternion_to_rotation_matrix,
     rotation_matrix_to_quaternion,
@@ -30,7 +31,7 @@ from qgs.types import Cameras, Gaussians
 EXTENSION = "KHR_gaussian_splatting"
 COLORS = "srgb_rec709_display"
 UPRIGHT = "upright"
-"""Extra of the asset: the rotation (4, 4) from the world of the Gaussians to that of the file."""
+"""Extra of the asset: the pose (4, 4) from the world of the Gaussians to that of the file."""
 FLIGHT = "flight"
 """Name of the camera that moves, and of its animation."""
 SECONDS = 1.0
@@ -65,9 +66,10 @@ def save_glb(
     """
     given = cameras or {}
     poses = [camera.c2w[0].double().cpu() for camera in given.values()]
-    c2w = torch.cat(poses) if poses else torch.eye(4).double()[None]
-    upright = _upright(c2w)
-    scene, _ = one_scene(moved(gaussians, upright, 1.0), ".glb", "features")
+    upright = _upright(torch.cat(poses)) if poses else _TURN.clone()
+    scene, origin = one_scene(moved(gaussians, upright, 1.0), ".glb", "features")
+    if origin:
+        upright[:3, 3] = -torch.tensor([*map(float, origin.split())], dtype=torch.float64)
     arrays = _Arrays()
     attributes = {name: arrays.add(values) for name, values in _attributes(scene)}
     splats = {
@@ -82,7 +84,7 @@ def save_glb(
         "nodes": [{"name": "scene", "mesh": 0}],
     }
     if given:
-        filmed = {**given, FLIGHT: next(iter(given.values()))}
+        filmed = [*given.items(), (FLIGHT, next(iter(given.values())))]
         content |= _filmed(filmed, upright, scene.means.median(0).values, arrays)
     content |= {
         "scene": 0,
@@ -130,7 +132,7 @@ class _Arrays:
 def _attributes(scene: Gaussians) -> Iterator[tuple[str, Tensor]]:
     """Yield names and values (G, C) of what the extension stores of Gaussians (G,)."""
     yield "POSITION", scene.means
-    yield f"{EXTENSION}:ROTATION", scene.quats.roll(-1, -1)
+    yield f"{EXTENSION}:ROTATION", F.normalize(scene.quats, dim=-1).roll(-1, -1)
     yield f"{EXTENSION}:SCALE", scene.scales
     yield f"{EXTENSION}:OPACITY", scene.opacities[:, None]
     yield f"{EXTENSION}:SH_DEGREE_0_COEF_0", (scene.colors - 0.5) / SH_C0
@@ -142,8 +144,10 @@ def _attributes(scene: Gaussians) -> Iterator[tuple[str, Tensor]]:
 
 def _upright(c2w: Tensor) -> Tensor:
     """Return the rotation (4, 4) that turns the mean up direction of cameras (V, 4, 4) to +Y."""
-    _, down, forward, _ = c2w.mean(0)[:3].unbind(-1)
-    left, back, down = look_at(torch.zeros_like(down), down, forward)[:3, :3].unbind(-1)
+    # The first counts a little more: cameras that are turned over would have no mean.
+    down = c2w[:, :3, 1].sum(0) + 1e-3 * c2w[0, :3, 1]
+    aside = torch.eye(3).double()[down.abs().argmin()]
+    left, back, down = look_at(torch.zeros_like(down), down, aside)[:3, :3].unbind(-1)
     pose = torch.eye(4).double()
     pose[:3, :3] = -torch.stack([left, down, back])
     return pose
@@ -162,19 +166,19 @@ def _lens(camera: Cameras, near: float) -> dict[str, Any]:
 
 
 def _filmed(
-    cameras: Mapping[str, Cameras], upright: Tensor, middle: Tensor, arrays: _Arrays
+    cameras: Sequence[tuple[str, Cameras]], upright: Tensor, middle: Tensor, arrays: _Arrays
 ) -> dict[str, Any]:
     """Return cameras with their nodes, after the scene's, and the animation of the last of them.
 
-    upright: rotation (4, 4) from their world to the file's. middle: middle of the scene, (3,).
+    upright: pose (4, 4) from their world to the file's. middle: middle of the scene, (3,).
     """
-    c2w = torch.cat([camera.c2w[0].double().cpu() for camera in cameras.values()])
+    c2w = torch.cat([camera.c2w[0].double().cpu() for _, camera in cameras])
     c2w = upright @ c2w @ _TURN
     places = c2w[:, :3, 3]
     quats = rotation_matrix_to_quaternion(c2w[:, :3, :3].contiguous()).roll(-1, -1)
     near = NEAREST * float((places - middle).norm(dim=-1).median())
     nodes = [{"name": "scene", "mesh": 0}]
-    for index, name in enumerate(cameras):
+    for index, (name, _) in enumerate(cameras):
         place = {"translation": places[index].tolist(), "rotation": quats[index].tolist()}
         nodes.append({"name": name, "camera": index, **place})
     # from each of the others to the next
@@ -186,7 +190,7 @@ def _filmed(
     ]
     samplers = [{"input": times, "output": output} for output in outputs.values()]
     return {
-        "cameras": [_lens(camera, near) for camera in cameras.values()],
+        "cameras": [{"name": name, **_lens(camera, near)} for name, camera in cameras],
         "nodes": nodes,
         "animations": [{"name": FLIGHT, "channels": channels, "samplers": samplers}],
     }
@@ -206,14 +210,22 @@ def load_glb(path: Path) -> Gaussians:
     content = json.loads(data[20 : 20 + length])
     numbers = data[28 + length :]
     parts = list[Gaussians]()
-    turned = content["asset"].get("extras", {}).get(UPRIGHT, _TURN.tolist())
+    buffer, *others = content["buffers"]
+    if others or "uri" in buffer or content.get("extensionsRequired", [EXTENSION]) != [EXTENSION]:
+        raise ValueError("it needs other files or other extensions")
+    upright = content["asset"].get("extras", {}).get(UPRIGHT, _TURN.tolist())
+    back = torch.linalg.inv(torch.tensor(upright, dtype=torch.float64))
     for pose, mesh in _meshes(content):
         factor = float(pose[:3, 0].norm())
-        rigid = torch.tensor(turned).double().T @ pose
+        rigid = back @ pose
         rigid[:3, :3] /= factor
+        if not torch.allclose(rigid[:3, :3].inverse(), rigid[:3, :3].T, atol=1e-4):
+            raise ValueError("it has a node that scales axes by different factors")
         for primitive in mesh["primitives"]:
             if EXTENSION in primitive.get("extensions", ()):
                 parts.append(moved(_splats(content, primitive, numbers), rigid, factor))
+        if sum(part.count for part in parts) > len(data):
+            raise ValueError("it repeats its Gaussians")
     if not parts:
         raise ValueError(f"it has no primitives with {EXTENSION}")
     return concatenated(parts, 0)
@@ -222,8 +234,11 @@ def load_glb(path: Path) -> Gaussians:
 def _meshes(content: Mapping[str, Any]) -> Iterator[tuple[Tensor, Mapping[str, Any]]]:
     """Yield the transform to the world (4, 4), and the mesh, of each node that has a mesh."""
 
+    unseen = dict(enumerate(content["nodes"]))
+
     def below(index: int, outer: Tensor) -> Iterator[tuple[Tensor, Mapping[str, Any]]]:
-        node = content["nodes"][index]
+        # each comes once, so that a small file cannot stand for a large one
+        node = unseen.pop(index)
         pose = outer @ _transform(node)
         if "mesh" in node:
             yield pose, content["meshes"][node["mesh"]]
@@ -238,11 +253,11 @@ def _transform(node: Mapping[str, Any]) -> Tensor:
     """Return the transform (4, 4) of a node to its parent."""
     if "matrix" in node:
         # column by column
-        return torch.tensor(node["matrix"]).double().view(4, 4).T
+        return torch.tensor(node["matrix"], dtype=torch.float64).view(4, 4).T
     pose = torch.eye(4).double()
     quat = torch.tensor(node.get("rotation", [0.0, 0, 0, 1])).double().roll(1)
     pose[:3, :3] = quaternion_to_rotation_matrix(quat) * torch.tensor(node.get("scale", 1.0))
-    pose[:3, 3] = torch.tensor(node.get("translation", 0.0))
+    pose[:3, 3] = torch.tensor(node.get("translation", 0.0), dtype=torch.float64)
     return pose
 
 
@@ -271,7 +286,8 @@ def _values(content: Mapping[str, Any], index: int, numbers: bytes) -> Tensor:
     kind = np.dtype(_NUMBERS[accessor["componentType"]])
     shape = (accessor["count"], _WIDTHS[accessor["type"]])
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    strides = (view.get("byteStride", shape[1] * kind.itemsize), kind.itemsize)
+    least = shape[1] * kind.itemsize
+    strides = (max(view.get("byteStride", 0), least), kind.itemsize)
     array = np.ndarray(shape, kind, numbers, start, strides)
     found = torch.from_numpy(array.astype(np.float32))
     return found if kind.kind == "f" else (found / np.iinfo(kind).max).clamp_min(-1)

@@ -71,7 +71,7 @@ class Adjustments:
             return rgb
         exposure = self._exposures[photo].clone()
         with torch.no_grad():
-            best = fitted_exposure(rgb, image, _PULL)
+            best = fitted_exposure(rgb, image)
             self._exposures[photo].lerp_(best, _FOLLOWED)
             self._exposures -= self._exposures.mean(0)
         return exposed(rgb, exposure)
@@ -97,14 +97,14 @@ def exposed(rgb: Tensor, exposure: Tensor) -> Tensor:
     return rgb + (colors @ exposure).movedim(-1, -3)
 
 
-def fitted_exposure(rgb: Tensor, image: Tensor, pull: float) -> Tensor:
+def fitted_exposure(rgb: Tensor, image: Tensor) -> Tensor:
     """Return the affine map (4, 3) for `exposed` that makes `rgb` most like `image`.
 
-    rgb, image: (..., 3, H, W). pull: weight of its squares beside the mean squared error.
+    rgb, image: (..., 3, H, W). Squares of the map cost a little, so that noise is not followed.
     """
     colors = F.pad(rgb.movedim(-3, -1), (0, 1), value=1.0).flatten(0, -2)
     missing = (image - rgb).movedim(-3, -1).flatten(0, -2)
-    squares = colors.T @ colors / len(colors) + pull * torch.eye(4).to(colors)
+    squares = colors.T @ colors / len(colors) + _PULL * torch.eye(4).to(colors)
     return torch.linalg.solve(squares, colors.T @ missing / len(colors))
 
 
@@ -124,5 +124,7 @@ def brightness(gaussians: Gaussians, views: Views) -> Tensor:
         rows, columns = pixels.flip(-1).long().minimum(last.to(pixels.device)).T
         shown = image[:, rows, columns].mean(0)
         own = gaussians.colors[0, seen].mean(-1)
-        found.append(((shown + _DARK) / (own + _DARK)).log().nanmedian())
+        # those of the photo's own pixels say nothing
+        ratios = ((shown + _DARK) / (own + _DARK))[shown != own]
+        found.append(ratios.log().nanmedian())
     return torch.stack(found)

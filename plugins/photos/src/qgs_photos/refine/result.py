@@ -95,7 +95,7 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
     refined = result.refined
     if writer_of(out):
         save_gaussians(result.in_photos_world(refined.gaussians), out, result.cameras())
-        record = scores(result)
+        record = scores(result.read_back(out))
         written = [out]
     else:
         # all files or none: a scene without its scores is none
@@ -113,7 +113,7 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
             f"{mean['ssim']:.3f}, alpha {mean['alpha']:.3f}; a copy of the nearest photo: PSNR "
             f"{mean['nearest_input']:.2f} dB"
         )
-        if "exposure" in result.command:
+        if " --adjust exposure" in result.command:
             lines.append(
                 "their right halves, with the exposure that fits their left halves: PSNR "
                 f"{mean['exposed_psnr']:.2f} dB"
@@ -163,7 +163,7 @@ def page_of(result: Result, record: Mapping[str, Any]) -> str:
     note = f"{refined.gaussians.count:,} Gaussians"
     if mean := record["mean"]:
         note += f"; held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}"
-    title = Path(result.photos.path).name
+    title = Path(result.photos.path).resolve().name
     tour = Tour(title, note, stops, names, len(best), refined.cameras)
     return gaussians_html(refined.gaussians, tour, (0, 0, 0))
 
@@ -211,7 +211,7 @@ def exposed_psnr(rgb: Tensor, image: Tensor) -> float:
     rgb, image: render and photo (1, 1, 3, H, W). The exposure is an affine map of colours.
     """
     middle = rgb.shape[-1] // 2
-    exposure = fitted_exposure(rgb[..., :middle], image[..., :middle], 1e-6)
+    exposure = fitted_exposure(rgb[..., :middle], image[..., :middle])
     right = exposed(rgb[..., middle:], exposure).clamp(0, 1)
     return float(psnr(right, image[..., middle:]).mean())
 
