@@ -6,7 +6,7 @@ copies images on one thread, because threads of torch would wait for cores that 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -178,11 +178,15 @@ def in_world(world: World, cameras: Cameras) -> Cameras:
     return cameras.replace(c2w=c2w).to(torch.float32)
 
 
-def in_photos_world(world: World, cameras: Cameras) -> Cameras:
-    """Return cameras (B, V), float64, in the frame of the photos: the inverse of `in_world`."""
+def in_photos_world(world: World, cameras: Cameras, names: Iterable[str]) -> dict[str, Cameras]:
+    """Return cameras (1, 1), float64, in the frame of the photos by their names.
+
+    cameras: (1, V) in the frame `world`; `in_world` is the inverse.
+    """
     reference, scale = world
     c2w = reference.double() @ scaled(cameras.c2w.to(reference.device, torch.float64), 1 / scale)
-    return cameras.replace(c2w=c2w)
+    placed = cameras.replace(c2w=c2w)
+    return {name: placed[:, [view]] for view, name in enumerate(names)}
 
 
 def from_0_to_1(times: Tensor) -> Tensor:

@@ -78,9 +78,8 @@ class Reconstruction:
     @property
     def input_cameras(self) -> dict[str, Cameras]:
         """Cameras (1, 1) of the input photos, in the photos' world, by their labels."""
-        placed = in_photos_world(self.sample.world, self.sample.inputs.cameras)
         labels = map(self.sample.short_label, self.sample.input_frames)
-        return {label: placed[:, [view]] for view, label in enumerate(labels)}
+        return in_photos_world(self.sample.world, self.sample.inputs.cameras, labels)
 
     def render(self, cameras: Cameras) -> Rendering:
         """Render from cameras (1, V) in the photos' world; depths are in the unit of that world."""

@@ -145,7 +145,7 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     names = ["</script><b>left</b>", "middle", "right"]
     tour = Tour("walk", "3 photos", Views(photos, cameras), names, 2, cameras)
     file = tmp_path / "scene.html"
-    file.write_text(gaussians_html(given, tour, (0, 0, 0)))
+    file.write_text(gaussians_html(given, tour))
     page.open(file.as_uri())
     page.until("the scene", "window.tour && !document.querySelector('#veil')")
     buttons = "[...document.querySelectorAll('#tour nav button')]"

@@ -83,7 +83,7 @@ def test_cameras_see_what_ours_see(tmp_path):
 def test_files_of_others_are_read(tmp_path):
     """Nodes in nodes, integers as fractions, with gaps, another primitive."""
     given = cloud(6)
-    save_glb(given, tmp_path / "a.glb")
+    save_gaussians(given, tmp_path / "a.glb")
     content, numbers = opened(tmp_path / "a.glb")
     primitives = content["meshes"][0]["primitives"]
     primitives.append({"attributes": {"POSITION": 0}})
@@ -110,7 +110,7 @@ def test_files_of_others_are_read(tmp_path):
 
 
 def test_what_cannot_be_read_is_refused(tmp_path):
-    save_glb(cloud(3), tmp_path / "a.glb")
+    save_gaussians(cloud(3), tmp_path / "a.glb")
     content, numbers = opened(tmp_path / "a.glb")
     mesh = content["meshes"][0]["primitives"][0]
     wrong = tmp_path / "wrong.glb"

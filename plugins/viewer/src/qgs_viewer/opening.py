@@ -40,7 +40,7 @@ from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 PLY = "gaussians.ply"
 MADE = "scene.ply"
 """File of Gaussians that `qgs scene --out FOLDER` writes."""
-_SCENES = (".ply", ".splat", ".spz", ".sog", ".glb", ".ksplat")
+_SCENES = (".ply", ".splat", ".spz", ".sog", ".glb")
 # Photos that are shown beside a scene of `qgs scene`.
 PHOTOS = 12
 _VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")

@@ -30,7 +30,7 @@ from qgs.geometry.poses import look_at_depth
 from qgs.types import Cameras, Gaussians, Views
 from qgs_viewer.drawing import FRUSTUM, Choice, Drawing, distance_to
 from qgs_viewer.look import data_uri
-from qgs_viewer.query_scene import NEUTRAL, Background, QueryScene
+from qgs_viewer.query_scene import QueryScene
 
 # Vertical angle of the viewer's window, radians.
 FIELD_OF_VIEW = 0.95
@@ -282,10 +282,7 @@ def write_page(scene: QueryScene, query: int | None, file: Path, console: Consol
         console.print("--query picks a query for the page; leave out --html to pick by mouse.")
 
 
-def gaussians_html(gaussians: Gaussians, tour: Tour, background: Background = NEUTRAL) -> str:
-    """Return an HTML page that shows Gaussians (1, G) from the views of `tour`.
-
-    background: RGB in [0, 1].
-    """
-    scene = QueryScene(gaussians, tour.stops, background=background)
+def gaussians_html(gaussians: Gaussians, tour: Tour) -> str:
+    """Return an HTML page that shows Gaussians (1, G) over black from the views of `tour`."""
+    scene = QueryScene(gaussians, tour.stops, background=(0.0, 0.0, 0.0))
     return scene_html(scene, tour=tour)

@@ -34,8 +34,6 @@ UPRIGHT = "upright"
 """Extra of the asset: the pose (4, 4) from the world of the Gaussians to that of the file."""
 FLIGHT = "flight"
 """Name of the camera that moves, and of its animation."""
-SECONDS = 1.0
-"""Time of the flight from one camera to the next."""
 NEAREST = 0.01
 """Distance of the near plane, as a fraction of the cameras' distance from the scene's middle."""
 HARMONICS = [
@@ -44,9 +42,7 @@ HARMONICS = [
     for place in range(2 * degree + 1)
 ]
 """Names of coefficients of spherical harmonics from degree 1, in the order of `Gaussians.sh`."""
-# Formats of the chunks and of numbers; integers are fractions of their largest value.
-_JSON = 0x4E4F534A
-_BINARY = 0x004E4942
+# Formats of numbers; integers are fractions of their largest value.
 _FLOAT = 5126
 _NUMBERS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, _FLOAT: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -55,17 +51,14 @@ _KINDS = {width: kind for kind, width in _WIDTHS.items()}
 _TURN = torch.tensor([1.0, -1, -1, 1]).double().diag()
 
 
-def save_glb(
-    gaussians: Gaussians, path: str | Path, cameras: Mapping[str, Cameras] | None = None
-) -> None:
+def save_glb(gaussians: Gaussians, path: str | Path, cameras: Mapping[str, Cameras]) -> None:
     """Write one scene, (G, ...) or (1, G, ...), as KHR_gaussian_splatting.
 
     cameras: cameras (1, 1) by name, in the world of the Gaussians. The file gets them, and one more
     that an animation moves from each to the next. Their mean up direction becomes +Y; without
     cameras, -y does. Warns and raises errors as `save_ply` does.
     """
-    given = cameras or {}
-    poses = [camera.c2w[0].double().cpu() for camera in given.values()]
+    poses = [camera.c2w[0].double().cpu() for camera in cameras.values()]
     upright = _upright(torch.cat(poses)) if poses else _TURN.clone()
     scene, origin = one_scene(moved(gaussians, upright, 1.0), ".glb", "features")
     if origin:
@@ -83,8 +76,8 @@ def save_glb(
         "meshes": [{"primitives": [splats]}],
         "nodes": [{"name": "scene", "mesh": 0}],
     }
-    if given:
-        filmed = [*given.items(), (FLIGHT, next(iter(given.values())))]
+    if cameras:
+        filmed = [*cameras.items(), (FLIGHT, next(iter(cameras.values())))]
         content |= _filmed(filmed, upright, scene.means.median(0).values, arrays)
     content |= {
         "scene": 0,
@@ -95,8 +88,8 @@ def save_glb(
     }
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<II", len(text), _JSON) + text
-    chunks += struct.pack("<II", len(arrays.data), _BINARY) + arrays.data
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(arrays.data), b"BIN\0") + arrays.data
     with replacing(path) as temporary:
         temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
@@ -181,8 +174,8 @@ def _filmed(
     for index, (name, _) in enumerate(cameras):
         place = {"translation": places[index].tolist(), "rotation": quats[index].tolist()}
         nodes.append({"name": name, "camera": index, **place})
-    # from each of the others to the next
-    times = arrays.add(SECONDS * torch.arange(len(cameras) - 1)[:, None])
+    # from each of the others to the next in a second
+    times = arrays.add(torch.arange(len(cameras) - 1)[:, None])
     outputs = {"translation": arrays.add(places[:-1]), "rotation": arrays.add(quats[:-1])}
     channels = [
         {"sampler": index, "target": {"node": len(cameras), "path": path}}

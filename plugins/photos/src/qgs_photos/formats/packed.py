@@ -3,7 +3,6 @@
 import math
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import gsply
 import torch
@@ -19,7 +18,7 @@ _TURN = torch.tensor([1.0, -1, -1, 1]).diag()
 _BITS = 23
 
 
-def save_compressed(gaussians: Gaussians, path: str | Path, _: Any = None) -> None:
+def save_compressed(gaussians: Gaussians, path: str | Path, _: object) -> None:
     """Write one scene, (G, ...) or (1, G, ...), as compressed PLY of SuperSplat.
 
     Warns and raises errors as `save_ply` does.
@@ -29,7 +28,7 @@ def save_compressed(gaussians: Gaussians, path: str | Path, _: Any = None) -> No
         temporary.write_bytes(content)
 
 
-def save_spz(gaussians: Gaussians, path: str | Path, _: Any = None) -> None:
+def save_spz(gaussians: Gaussians, path: str | Path, _: object) -> None:
     """Write one scene, (G, ...) or (1, G, ...), as .spz of version 3.
 
     Positions get as many bits after the point as the farthest allows. Warns and raises errors as

@@ -93,8 +93,7 @@ class Adjustments:
 
 def exposed(rgb: Tensor, exposure: Tensor) -> Tensor:
     """Return `rgb` (..., 3, H, W) plus an affine map (4, 3) of it."""
-    colors = F.pad(rgb.movedim(-3, -1), (0, 1), value=1.0)
-    return rgb + (colors @ exposure).movedim(-1, -3)
+    return rgb + (_colors(rgb) @ exposure).movedim(-1, -3)
 
 
 def fitted_exposure(rgb: Tensor, image: Tensor) -> Tensor:
@@ -102,10 +101,15 @@ def fitted_exposure(rgb: Tensor, image: Tensor) -> Tensor:
 
     rgb, image: (..., 3, H, W). Squares of the map cost a little, so that noise is not followed.
     """
-    colors = F.pad(rgb.movedim(-3, -1), (0, 1), value=1.0).flatten(0, -2)
+    colors = _colors(rgb).flatten(0, -2)
     missing = (image - rgb).movedim(-3, -1).flatten(0, -2)
     squares = colors.T @ colors / len(colors) + _PULL * torch.eye(4).to(colors)
     return torch.linalg.solve(squares, colors.T @ missing / len(colors))
+
+
+def _colors(rgb: Tensor) -> Tensor:
+    """Return colours (..., H, W, 4) of `rgb` (..., 3, H, W), with a 1 behind each."""
+    return F.pad(rgb.movedim(-3, -1), (0, 1), value=1.0)
 
 
 def brightness(gaussians: Gaussians, views: Views) -> Tensor:
@@ -115,13 +119,13 @@ def brightness(gaussians: Gaussians, views: Views) -> Tensor:
     of the logarithm of the ratio in each photo.
     """
     means = gaussians.means
-    last = torch.tensor(views.cameras.size) - 1
+    last = means.new_tensor(views.cameras.size) - 1
     found = list[Tensor]()
     for view, image in enumerate(views.images[0]):
         camera = views.cameras[:, [view]]
         seen = depths_in_view(means[0], camera)[0].isfinite()
         pixels = to_pixels(to_camera(means, camera)[0, 0, seen], camera.intrinsics[0, 0])
-        rows, columns = pixels.flip(-1).long().minimum(last.to(pixels.device)).T
+        rows, columns = pixels.flip(-1).minimum(last).long().T
         shown = image[:, rows, columns].mean(0)
         own = gaussians.colors[0, seen].mean(-1)
         # those of the photo's own pixels say nothing

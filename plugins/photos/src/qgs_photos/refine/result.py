@@ -68,9 +68,8 @@ class Result:
 
     def cameras(self) -> dict[str, Cameras]:
         """Return cameras (1, 1) of the V photos in their world, by their names."""
-        placed = in_photos_world(self.world, self.refined.cameras)
         names = map(self.photos.small.frame_name, self.photos.frames)
-        return {name: placed[:, [view]] for view, name in enumerate(names)}
+        return in_photos_world(self.world, self.refined.cameras, names)
 
     def read_back(self, file: Path) -> "Result":
         """Return a copy of this result with the Gaussians in `file`, so as to score the file."""
@@ -165,7 +164,7 @@ def page_of(result: Result, record: Mapping[str, Any]) -> str:
         note += f"; held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}"
     title = Path(result.photos.path).resolve().name
     tour = Tour(title, note, stops, names, len(best), refined.cameras)
-    return gaussians_html(refined.gaussians, tour, (0, 0, 0))
+    return gaussians_html(refined.gaussians, tour)
 
 
 def scores(result: Result) -> dict[str, Any]:
