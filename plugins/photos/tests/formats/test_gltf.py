@@ -80,6 +80,19 @@ def test_cameras_see_what_ours_see(tmp_path):
     assert {channel["target"]["node"] for channel in flight["channels"]} == {4}
 
 
+def test_cameras_in_a_ring_and_maps_keep_the_scene(tmp_path):
+    """Cameras that look everywhere have no mean direction; coordinates of maps are too large."""
+    place = torch.tensor([4_512_345.25, 5e5, 3e6], dtype=torch.float64)
+    c2w = arc([0, 90, 180, 270], 3)
+    c2w[:, :3, 3] += place
+    far = cloud(20).replace(means=cloud(20).means.double() + place)
+    save_glb(far, tmp_path / "a.glb", {f"{i}": pinhole(c2w[[i]])[None] for i in range(4)})
+    found = qgs.load_ply(tmp_path / "a.glb")
+    assert_close(found.means - place, far.means - place, atol=1e-5, rtol=0)
+    content, _ = opened(tmp_path / "a.glb")
+    assert np.linalg.norm(content["nodes"][1]["translation"]) < 9
+
+
 def test_files_of_others_are_read(tmp_path):
     """Nodes in nodes, integers as fractions, with gaps, another primitive."""
     given = cloud(6)
@@ -111,15 +124,18 @@ def test_files_of_others_are_read(tmp_path):
 
 def test_what_cannot_be_read_is_refused(tmp_path):
     save_gaussians(cloud(3), tmp_path / "a.glb")
-    content, numbers = opened(tmp_path / "a.glb")
-    mesh = content["meshes"][0]["primitives"][0]
     wrong = tmp_path / "wrong.glb"
-    for part, key, value, words in (
-        (content["accessors"][0], "count", 10**9, "strides"),
-        (mesh["extensions"]["KHR_gaussian_splatting"], "colorSpace", "linear", "linear"),
-        (mesh, "extensions", {}, "no primitives"),
+    extension = {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "linear"}}
+    for part, change, words in (
+        (lambda c: c["accessors"][0], {"count": 10**9}, "strides"),
+        (lambda c: c["meshes"][0]["primitives"][0], {"extensions": extension}, "linear"),
+        (lambda c: c["meshes"][0]["primitives"][0], {"extensions": {}}, "no primitives"),
+        (lambda c: c, {"extensionsRequired": ["EXT_meshopt"]}, "other extensions"),
+        (lambda c: c["nodes"][0], {"scale": [1, 2, 1]}, "different factors"),
+        (lambda c: c["scenes"][0], {"nodes": [0, 0]}, "0"),
     ):
-        part[key] = value
+        content, numbers = opened(tmp_path / "a.glb")
+        part(content).update(change)
         write(wrong, content, numbers)
         must_refuse(f"wrong.glb cannot be read.*{words}", qgs.load_ply, wrong)
     wrong.write_bytes(b"solid cube of another program")
