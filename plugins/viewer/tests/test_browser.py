@@ -178,8 +178,9 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     slider = "document.querySelector('#tour input')"
     page.evaluate(f"{slider}.value = 100; {slider}.oninput()")
     assert away(1 - photos)[1] < 1
+    still = page.picture()
     page.evaluate(f"{buttons}[0].click()")
-    page.until("a flight", lambda: away()[1] > 8)
+    page.until("a flight", lambda: abs(page.picture() - still).mean() > 8)
     page.evaluate(f"{buttons}[0].click()")
     phone = {"width": 420, "height": 800, "deviceScaleFactor": 1, "mobile": True}
     page.call("Emulation.setDeviceMetricsOverride", **phone)
