@@ -9,10 +9,9 @@ from torch import Tensor
 from qgs.geometry.transforms import depths_in_view, quat_to_matrix, to_camera, to_pixels
 from qgs.types import Cameras, Gaussians, Views
 
-DIFFER = 0.03
+DIFFER = 0.035
 """Spread of the brightness of photos from which the exposure of each is optimised by default: the
-standard deviation of `brightness`. Photos of one exposure have up to 0.02, of +-1/4 stop 0.04."""
-
+standard deviation of `brightness`. Photos of one exposure have up to 0.03, of +-1/4 stop 0.04."""
 # Added to colours, so that dark ones count less.
 _DARK = 0.02
 # Learning rates of poses: the first, and the last over the first.
