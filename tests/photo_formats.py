@@ -237,7 +237,7 @@ def numbered_photos(path, count=10, size=(64, 48), cameras=(), **top):
     return write_row(path, images, cameras=cameras, **given | top)
 
 
-def noisy_photos(folder, count=7):
-    """Nerfstudio photos of noise, 24 x 20, by cameras 0.1 apart that look the same way."""
+def noisy_photos(folder, count=7, step=0.1):
+    """Nerfstudio photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
     images = np.random.default_rng(0).integers(0, 256, (count, 20, 24, 3), dtype=np.uint8)
-    return write_row(folder, images, 0.1, **listed_lens(20, 20, 12, 10, 20, 24))
+    return write_row(folder, images, step, **listed_lens(20, 20, 12, 10, 20, 24))

@@ -117,10 +117,9 @@ def scene(
 ) -> None:
     """Make the best 3D scene from photos in a given time.
 
-    Writes a PLY, a .splat file, an HTML page, and scores on held-out photos; or one file, .glb with
-    the photos' cameras. First, Gaussians are made from depth in the photos or by a model; then they
-    are optimised on the photos. The settings that were chosen are printed as a command that makes
-    the scene again. Ctrl-C ends the optimisation early and writes its result.
+    Writes a PLY, a page, and scores on held-out photos; or one file, .glb with the photos' cameras.
+    First, Gaussians are made from depth in the photos or by a model; then they are optimised. The
+    chosen settings are printed as a command. Ctrl-C ends the optimisation and writes its result.
     """
     began = perf_counter() - process_time()
     # what can be refused is refused before anything heavy is imported
