@@ -10,11 +10,11 @@ TEXTS = ("qgs", "plugins", "tests", "tools", "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 491_090},
-    "qgs": {"tokens": 99_790, "parallel": 1, "why": 3},
+    "all": {"tokens": 489_780},
+    "qgs": {"tokens": 99_680, "parallel": 1, "why": 3},
     "plugins": {"tokens": 203_970, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 163_880, "parallel": 1},
-    "tools": {"tokens": 19_100, "parallel": 1},
+    "tests": {"tokens": 163_810, "parallel": 1},
+    "tools": {"tokens": 17_970, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,
 comments that say why at least. They only get stricter: a change that adds removes as much."""
