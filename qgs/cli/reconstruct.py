@@ -100,8 +100,7 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
     from qgs.reconstruction.scene_formats import writer_of
 
     # The import of a plug-in's writer may fail.
-    if find := writer_of(out):
-        find()
+    writer_of(out)
 
 
 def show(result: "Reconstruction", console: Console) -> None:

@@ -69,19 +69,19 @@ def save_gaussians(
     writer = writer_of(path)
     if writer is None:
         raise _unwritable(path)
-    writer()(gaussians, path, cameras or {})
+    writer(gaussians, path, cameras or {})
 
 
-def writer_of(path: str | Path) -> Callable[[], SceneWriter] | None:
-    """Return a function that returns the writer of files such as `path`; None if there is none.
+def writer_of(path: str | Path) -> SceneWriter | None:
+    """Return the writer of files such as `path`; None if there is none, as for a folder.
 
-    For a writer of another package (entry points WRITER_GROUP), the function raises ExtensionError
-    if the package cannot be imported. Raises ValueError for files that can only be read.
+    Raises ExtensionError if the package of a writer (entry points WRITER_GROUP) cannot be imported,
+    and ValueError for files that can only be read.
     """
-    found = _of_suffix(path, _writers())
-    if found is None and _of_suffix(path, _added(READER_GROUP)):
+    find = _of_suffix(path, _writers())
+    if find is None and _of_suffix(path, _added(READER_GROUP)):
         raise _unwritable(path)
-    return found
+    return find() if find else None
 
 
 def _unwritable(path: str | Path) -> ValueError:
