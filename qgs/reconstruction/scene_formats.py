@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
@@ -27,13 +27,16 @@ from qgs.geometry.transforms import narrowed
 from qgs.types import SH_COUNTS, Cameras, Gaussians
 from qgs.wording import listed, one_line, warn_once
 
+if TYPE_CHECKING:
+    from gsply import GSData
+
 WRITER_GROUP = "qgs.scene_writers"
 """Group of entry points of writers (see `SceneWriter`). An entry point has the suffix of its files
 as its name, without the first dot."""
 READER_GROUP = "qgs.scene_readers"
 """Group of entry points of readers, which are functions: path -> Gaussians (G,). Their numbers need
 not be finite, and quaternions not be unit. Entry points are named as those of writers."""
-SceneWriter: TypeAlias = Callable[[Gaussians, str | Path, Mapping[str, Cameras]], None]
+SceneWriter = Callable[[Gaussians, str | Path, Mapping[str, Cameras]], None]
 """Function (gaussians, path, cameras) that writes one scene. Cameras (1, 1), in the world of the
 Gaussians, have names; formats that hold no cameras leave them out."""
 
@@ -81,7 +84,7 @@ def writer_of(path: str | Path) -> SceneWriter | None:
     find = _of_suffix(path, _writers())
     if find is None and _of_suffix(path, _added(READER_GROUP)):
         raise _unwritable(path)
-    return find() if find else None
+    return find and find()
 
 
 def _unwritable(path: str | Path) -> ValueError:
@@ -208,13 +211,11 @@ def _of_splat(path: Path) -> Gaussians:
     return Gaussians(means, scales, quats - 128, rgba[:, 3] / 255, rgba[:, :3] / 255)
 
 
-def _of_packed(path: Path) -> Gaussians:
-    """Read a compressed PLY of SuperSplat."""
-    from gsply import plyread
-
+def of_gsply(content: "GSData") -> Gaussians:
+    """Return the Gaussians (G,) of what gsply has read, as they are stored."""
     with TemporaryDirectory() as folder:
         plain = Path(folder, "plain.ply")
-        plyread(path).save(plain)
+        content.save(plain)
         return read_ply(plain)
 
 
@@ -230,8 +231,11 @@ def read_ply(path: Path) -> Gaussians:
             "elements than the file can hold"
         )
     content = PlyData.read(str(path))
+    # A compressed PLY of SuperSplat.
     if "chunk" in content:
-        return _of_packed(path)
+        from gsply import plyread
+
+        return of_gsply(plyread(path))
     vertices = content["vertex"].data
     names = vertices.dtype.names or ()
     count = sum(name.startswith("f_rest_") for name in names)

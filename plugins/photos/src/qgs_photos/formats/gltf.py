@@ -27,6 +27,7 @@ from qgs.geometry.poses import look_at
 from qgs.geometry.transforms import moved
 from qgs.reconstruction.scene_formats import one_scene
 from qgs.types import Cameras, Gaussians
+from qgs_photos.formats import TURN
 
 EXTENSION = "KHR_gaussian_splatting"
 COLORS = "srgb_rec709_display"
@@ -47,8 +48,6 @@ _FLOAT = 5126
 _NUMBERS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, _FLOAT: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _KINDS = {width: kind for kind, width in _WIDTHS.items()}
-# Right, down, forward to right, up, back.
-_TURN = torch.tensor([1.0, -1, -1, 1]).double().diag()
 
 
 def save_glb(gaussians: Gaussians, path: str | Path, cameras: Mapping[str, Cameras]) -> None:
@@ -59,7 +58,7 @@ def save_glb(gaussians: Gaussians, path: str | Path, cameras: Mapping[str, Camer
     cameras, -y does. Warns and raises errors as `save_ply` does.
     """
     poses = [camera.c2w[0].double().cpu() for camera in cameras.values()]
-    upright = _upright(torch.cat(poses)) if poses else _TURN.clone()
+    upright = _upright(torch.cat(poses)) if poses else TURN.clone()
     scene, origin = one_scene(moved(gaussians, upright, 1.0), ".glb", "features")
     if origin:
         upright[:3, 3] = -torch.tensor([*map(float, origin.split())], dtype=torch.float64)
@@ -166,7 +165,7 @@ def _filmed(
     upright: pose (4, 4) from their world to the file's. middle: middle of the scene, (3,).
     """
     c2w = torch.cat([camera.c2w[0].double().cpu() for _, camera in cameras])
-    c2w = upright @ c2w @ _TURN
+    c2w = upright @ c2w @ TURN
     places = c2w[:, :3, 3]
     quats = rotation_matrix_to_quaternion(c2w[:, :3, :3].contiguous()).roll(-1, -1)
     near = NEAREST * float((places - middle).norm(dim=-1).median())
@@ -206,7 +205,7 @@ def load_glb(path: Path) -> Gaussians:
     buffer, *others = content["buffers"]
     if others or "uri" in buffer or content.get("extensionsRequired", [EXTENSION]) != [EXTENSION]:
         raise ValueError("it needs other files or other extensions")
-    upright = content["asset"].get("extras", {}).get(UPRIGHT, _TURN.tolist())
+    upright = content["asset"].get("extras", {}).get(UPRIGHT, TURN.tolist())
     back = torch.linalg.inv(torch.tensor(upright, dtype=torch.float64))
     for pose, mesh in _meshes(content):
         factor = float(pose[:3, 0].norm())
@@ -226,7 +225,6 @@ def load_glb(path: Path) -> Gaussians:
 
 def _meshes(content: Mapping[str, Any]) -> Iterator[tuple[Tensor, Mapping[str, Any]]]:
     """Yield the transform to the world (4, 4), and the mesh, of each node that has a mesh."""
-
     unseen = dict(enumerate(content["nodes"]))
 
     def below(index: int, outer: Tensor) -> Iterator[tuple[Tensor, Mapping[str, Any]]]:
@@ -259,7 +257,6 @@ def _splats(content: Mapping[str, Any], primitive: Mapping[str, Any], numbers: b
     if (colors := primitive["extensions"][EXTENSION]["colorSpace"]) != COLORS:
         raise ValueError(f"its colours are {colors}, not {COLORS}")
     attributes = primitive["attributes"]
-
     values = {name: _values(content, index, numbers) for name, index in attributes.items()}
     harmonics = [values[name] for name in HARMONICS if name in values]
     return Gaussians(

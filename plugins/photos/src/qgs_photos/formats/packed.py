@@ -5,15 +5,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import gsply
-import torch
 
 from qgs.files import replacing
 from qgs.geometry.transforms import moved
-from qgs.reconstruction.scene_formats import read_ply, save_ply
+from qgs.reconstruction.scene_formats import of_gsply, save_ply
 from qgs.types import SH_COUNTS, Gaussians
+from qgs_photos.formats import TURN
 
-# Right, down, forward to right, up, back, the axes of .spz.
-_TURN = torch.tensor([1.0, -1, -1, 1]).diag()
 # Bits of a coordinate in .spz, without its sign.
 _BITS = 23
 
@@ -34,7 +32,7 @@ def save_spz(gaussians: Gaussians, path: str | Path, _: object) -> None:
     Positions get as many bits after the point as the farthest allows. Warns and raises errors as
     `save_ply` does.
     """
-    content = _stored(moved(gaussians, _TURN, 1.0))
+    content = _stored(moved(gaussians, TURN, 1.0))
     _, whole = math.frexp(abs(content.means).max())
     with replacing(path) as temporary:
         gsply.write_spz(temporary, content, fractional_bits=min(_BITS - whole, _BITS))
@@ -61,18 +59,11 @@ def _stored(gaussians: Gaussians) -> gsply.GSData:
 
 def load_spz(path: Path) -> Gaussians:
     """Return the Gaussians (G,) of an .spz file. Errors of gsply pass through."""
-    return moved(_loaded(gsply.read_spz(path)), _TURN, 1.0)
+    return moved(of_gsply(gsply.read_spz(path)), TURN, 1.0)
 
 
 def load_sog(path: Path) -> Gaussians:
     """Return the Gaussians (G,) of a .sog file. Errors of gsply pass through."""
     from gsply.sog_reader import sogread
 
-    return _loaded(sogread(path))
-
-
-def _loaded(content: gsply.GSData) -> Gaussians:
-    with TemporaryDirectory() as folder:
-        plain = Path(folder, "plain.ply")
-        content.save(plain)
-        return read_ply(plain)
+    return of_gsply(sogread(path))
