@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from qgs.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from qgs.checkpoint.hub import from_pretrained, push_to_hub
     from qgs.checkpoint.model_file import load, save
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
     from qgs.model import QueryGaussianModel
@@ -45,8 +46,10 @@ _ELSEWHERE = {
     "QueryGaussianModel": "qgs.model",
     "Reconstruction": "qgs.reconstruction.result",
     "compose": "qgs.recipe",
+    "from_pretrained": "qgs.checkpoint.hub",
     "load": "qgs.checkpoint.model_file",
     "load_ply": "qgs.reconstruction.scene_formats",
+    "push_to_hub": "qgs.checkpoint.hub",
     "read_photos": "qgs.reconstruction.scenes",
     "reconstruct": "qgs.reconstruction.reconstruct",
     "save": "qgs.checkpoint.model_file",
@@ -67,8 +70,10 @@ __all__ = [
     "Rendering",
     "Views",
     "compose",
+    "from_pretrained",
     "load",
     "load_ply",
+    "push_to_hub",
     "read_photos",
     "reconstruct",
     "save",

@@ -119,8 +119,8 @@ class Domain:
             if name == "views" and trained[1] == 2:
                 most = 3
             if low * TOLERANCE < trained[0] or high > most:
-                words = WORDS[name].format(_shown((low, high)))
-                phrases.append(f"{words} (trained: {_shown(trained)})")
+                words = WORDS[name].format(shown((low, high)))
+                phrases.append(f"{words} (trained: {shown(trained)})")
         return phrases
 
 
@@ -143,7 +143,7 @@ def verdict(trained: Domain, found: Domain) -> str:
     )
 
 
-def _shown(values: tuple[float, float]) -> str:
+def shown(values: tuple[float, float]) -> str:
     """Return a range as text, its numbers with three digits."""
     low, high = (f"{value:.3g}" if math.isfinite(value) else "infinitely far" for value in values)
     return low if low == high else f"{low} to {high}"
