@@ -3,7 +3,7 @@
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from qgs.data.images import decode_rgb, read_image, to_tensor
 from qgs.data.samples import make_sample, own_world
 from qgs.data.view_samplers import evenly
 from qgs.domain import Domain, verdict
+from qgs.geometry.poses import scaled
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import checked_window, choose_frames, reconstruct
@@ -259,6 +260,8 @@ def open_made(folder: Path) -> Source:
         size = parse_size(words[words.index("--size") + 1])
         # qgs scene PHOTOS
         views = read_photos(words[2], size=size, frames=evenly(record["refined_on"], PHOTOS))
+        c2w = scaled(views.cameras.c2w, record.get("factor", 1.0))
+        views = replace(views, cameras=views.cameras.replace(c2w=c2w))
     except (OSError, ValueError, LookupError) as error:
         notes.append(f"The photos of the scene are not shown: {one_line(error)}")
     shown = QueryScene(gaussians, views, background=(0.0, 0.0, 0.0))

@@ -23,7 +23,7 @@ import viser
 import websockets.asyncio.server as sockets
 from rich.console import Console
 
-from qgs.drawing.images import rgb_picture
+from qgs.drawing.images import Picture, rgb_picture
 from qgs.files import refuse_existing, write_text
 from qgs.geometry.harmonics import rotated
 from qgs.geometry.poses import look_at_depth
@@ -167,7 +167,8 @@ class Tour:
 
     title, note: heading, and the line below it. stops: views (1, V) that have a button each; the
     page opens at the first. names: texts of the buttons. photos: number of stops, from the first,
-    that can be compared with their photo. path: cameras (1, P).
+    that can be compared with their photo. path: cameras (1, P). errors: maps of expected errors
+    of the stops, as pictures.
     """
 
     title: str
@@ -176,6 +177,7 @@ class Tour:
     names: Sequence[str]
     photos: int
     path: Cameras
+    errors: Sequence[Picture]
 
     def script(self, distance: float) -> str:
         """Return the tour as a script.
@@ -185,6 +187,7 @@ class Tour:
         stops = _stations(self.stops.cameras, distance)
         for index, (stop, name) in enumerate(zip(stops, self.names, strict=True)):
             stop["name"] = name
+            stop["errors"] = data_uri(self.errors[index], photo=True)
             if index < self.photos:
                 stop["photo"] = data_uri(rgb_picture(self.stops.images[0, index]), photo=True)
         path = _stations(self.path, distance)

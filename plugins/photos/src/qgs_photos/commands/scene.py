@@ -93,6 +93,15 @@ Masks = Annotated[
     typer.Option("--masks", help="Treat pixels outside the masks of photos as background."),
 ]
 
+ScaleBy = Annotated[
+    tuple[str, str, float] | None,
+    typer.Option(
+        metavar="A B METRES",
+        help="Two points and the metres between them; files are then in metres. A point is the "
+        "name of a photo, for its camera, or NAME:X,Y for what is at a pixel of a photo.",
+    ),
+]
+
 
 @app.command()
 def scene(
@@ -112,6 +121,7 @@ def scene(
     degree: Degree = 1,
     adjust: Adjust = None,
     masks: Masks = False,
+    scale_by: ScaleBy = None,
     scene_name: SceneName = None,
     device: Device = "auto",
 ) -> None:
@@ -148,6 +158,7 @@ def scene(
         device=choose_device(device),
         extras=Extras(degree, adjust),
         masks=masks,
+        scale_by=scale_by,
     )
     try:
         make_scene(photos, out, options, began, 60 * minutes, Console())

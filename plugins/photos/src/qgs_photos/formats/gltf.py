@@ -35,6 +35,8 @@ UPRIGHT = "upright"
 """Extra of the asset: the pose (4, 4) from the world of the Gaussians to that of the file."""
 FLIGHT = "flight"
 """Name of the camera that moves, and of its animation."""
+FEATURE = "_FEATURE_"
+"""Name of an attribute for a channel of features, before the channel's index."""
 NEAREST = 0.01
 """Distance of the near plane, as a fraction of the cameras' distance from the scene's middle."""
 HARMONICS = [
@@ -43,6 +45,10 @@ HARMONICS = [
     for place in range(2 * degree + 1)
 ]
 """Names of coefficients of spherical harmonics from degree 1, in the order of `Gaussians.sh`."""
+# The ground is found among Gaussians up to this many times as far as half of them are. A small part
+# of them is below it.
+_AROUND = 2.0
+_LOWEST = 0.02
 # Formats of numbers; integers are fractions of their largest value.
 _FLOAT = 5126
 _NUMBERS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, _FLOAT: np.float32}
@@ -54,14 +60,18 @@ def save_glb(gaussians: Gaussians, path: str | Path, cameras: Mapping[str, Camer
     """Write one scene, (G, ...) or (1, G, ...), as KHR_gaussian_splatting.
 
     cameras: cameras (1, 1) by name, in the world of the Gaussians. The file gets them, and one more
-    that an animation moves from each to the next. Their mean up direction becomes +Y; without
-    cameras, -y does. Warns and raises errors as `save_ply` does.
+    that an animation moves from each to the next. Their mean up direction becomes +Y, and the
+    ground gets height 0; without cameras, -y becomes +Y. Warns and raises errors as `save_ply`
+    does.
     """
     poses = [camera.c2w[0].double().cpu() for camera in cameras.values()]
-    upright = _upright(torch.cat(poses)) if poses else TURN.clone()
-    scene, origin = one_scene(moved(gaussians, upright, 1.0), ".glb", "features")
+    upright = TURN.clone()
+    if poses:
+        upright = _upright(torch.cat(poses))
+        upright[1, 3] = -_ground(gaussians, upright @ torch.cat(poses), upright)
+    scene, origin = one_scene(moved(gaussians, upright, 1.0), ".glb")
     if origin:
-        upright[:3, 3] = -torch.tensor([*map(float, origin.split())], dtype=torch.float64)
+        upright[:3, 3] -= torch.tensor([*map(float, origin.split())], dtype=torch.float64)
     arrays = _Arrays()
     attributes = {name: arrays.add(values) for name, values in _attributes(scene)}
     splats = {
@@ -130,6 +140,9 @@ def _attributes(scene: Gaussians) -> Iterator[tuple[str, Tensor]]:
     yield f"{EXTENSION}:SH_DEGREE_0_COEF_0", (scene.colors - 0.5) / SH_C0
     if scene.sh is not None:
         yield from zip(HARMONICS, scene.sh.unbind(1), strict=False)
+    if scene.features is not None:
+        for place, feature in enumerate(scene.features.split(1, -1)):
+            yield f"{FEATURE}{place}", feature
     # for viewers that do not know the extension
     yield "COLOR_0", torch.cat([scene.colors.clamp(0, 1), scene.opacities[:, None]], 1)
 
@@ -143,6 +156,18 @@ def _upright(c2w: Tensor) -> Tensor:
     pose = torch.eye(4).double()
     pose[:3, :3] = -torch.stack([left, down, back])
     return pose
+
+
+def _ground(gaussians: Gaussians, c2w: Tensor, upright: Tensor) -> float:
+    """Return the height of the lowest Gaussians that are not far behind what cameras look at.
+
+    c2w: upright poses of the cameras (V, 4, 4). upright: pose (4, 4) of the Gaussians' world.
+    """
+    points = moved(gaussians, upright, 1.0).means.flatten(0, -2).double().cpu()
+    eyes = c2w[:, :3, 3].mean(0)
+    away = (points - eyes).norm(dim=-1)
+    heights = points[away < _AROUND * away.median(), 1]
+    return float(heights.quantile(_LOWEST))
 
 
 def _lens(camera: Cameras, near: float) -> dict[str, Any]:
@@ -259,6 +284,8 @@ def _splats(content: Mapping[str, Any], primitive: Mapping[str, Any], numbers: b
     attributes = primitive["attributes"]
     values = {name: _values(content, index, numbers) for name, index in attributes.items()}
     harmonics = [values[name] for name in HARMONICS if name in values]
+    count = sum(name.startswith(FEATURE) for name in values)
+    features = [values[f"{FEATURE}{place}"] for place in range(count)]
     return Gaussians(
         values["POSITION"],
         values[f"{EXTENSION}:SCALE"],
@@ -266,6 +293,7 @@ def _splats(content: Mapping[str, Any], primitive: Mapping[str, Any], numbers: b
         values[f"{EXTENSION}:OPACITY"][:, 0],
         values[f"{EXTENSION}:SH_DEGREE_0_COEF_0"] * SH_C0 + 0.5,
         torch.stack(harmonics, 1) if harmonics else None,
+        torch.cat(features, 1) if features else None,
     )
 
 

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
-from pydantic import BaseModel, PositiveInt, ValidationError
+from pydantic import BaseModel, PositiveFloat, PositiveInt, ValidationError
 
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.types import Size
 from qgs_photos.refine.initial import Initialisation, chosen_initialisation, photos_world
+from qgs_photos.refine.metric import Distance, in_metres
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.viewing import in_own_world
@@ -19,13 +20,16 @@ class _Record(BaseModel):
     optimised: PositiveInt
     size: Size
     camera_centres: list[list[float]]
+    factor: PositiveFloat
+    scale_by: Distance | None
 
 
 def chosen_start(photos: ScenePhotos, options: Options) -> tuple[Initialisation, Options]:
     """Return the start of the optimisation: from the scene `options.earlier`, if it is given.
 
     Surroundings of that scene are left out, since they are made anew. The options are returned with
-    the photo size and the number of Gaussians of that scene, unless they have their own. Raises
+    the photo size, the number of Gaussians and the measured distance of that scene, unless they
+    have their own. Raises
     FileNotFoundError if the folder is no scene, ValueError for options of a model, for a file that
     is not as `qgs scene` writes it, for a scene that was made from other photos, other poses, or
     with other photos held out, and the errors of `chosen_initialisation`.
@@ -51,10 +55,11 @@ def chosen_start(photos: ScenePhotos, options: Options) -> tuple[Initialisation,
             f"other photos held out: give what its command names, {record.command}"
         )
     world = photos_world(photos)
-    every = in_own_world(world, load_ply(file)).to(options.device)
+    every = in_own_world(in_metres(world, record.factor), load_ply(file)).to(options.device)
     # surroundings come first
     gaussians = every[:, -record.optimised :]
     count = options.gaussians or gaussians.count
     size = options.size or record.size
     start = Initialisation(None, world, gaussians)
-    return start, replace(options, size=size, gaussians=count)
+    scale_by = options.scale_by or record.scale_by
+    return start, replace(options, size=size, gaussians=count, scale_by=scale_by)

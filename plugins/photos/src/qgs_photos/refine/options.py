@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qgs.reconstruction.scenes import Size
+from qgs_photos.refine.metric import Distance
 from qgs_photos.refine.refining import NO_EXTRAS, Extras
 
 NONE = "none"
@@ -21,6 +22,7 @@ class Options:
     gaussians: number of Gaussians. seconds: time of the optimisation alone.
     holdout: N to hold out every Nth photo, or NONE. scene: name of the scene if there are several.
     extras: further quantities to optimise. masks: treat pixels outside masks as background.
+    scale_by: a measured distance, so that files are in metres.
     """
 
     model: str | None = None
@@ -35,6 +37,7 @@ class Options:
     device: str = "cpu"
     extras: Extras = NO_EXTRAS
     masks: bool = False
+    scale_by: Distance | None = None
 
     def command(self, photos: str, out: str) -> str:
         """Return a command line that repeats `qgs scene`. `size` and `seconds` must be set."""
@@ -60,4 +63,5 @@ class Options:
         for what in self.extras.adjust or ():
             words += ["--adjust", what]
         words += ["--masks"] if self.masks else []
+        words += ["--scale-by", *map(str, self.scale_by)] if self.scale_by else []
         return shlex.join(words)

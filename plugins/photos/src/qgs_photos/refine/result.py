@@ -15,7 +15,7 @@ from qgs.containers import concatenated
 from qgs.data.samples import in_photos_world
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
-from qgs.drawing.images import rgb_picture
+from qgs.drawing.images import rgb_picture, shaded
 from qgs.extensions import INSTALL_ALL
 from qgs.files import replacing_entries, write_text
 from qgs.geometry.transforms import moved
@@ -31,6 +31,8 @@ from qgs.reconstruction.scene_formats import (
 from qgs.terminal import print_lines
 from qgs.types import Cameras, Gaussians, Rendering, Views, World
 from qgs_photos.refine.adjusting import exposed, fitted_exposure
+from qgs_photos.refine.evidence import Evidence, errors_of
+from qgs_photos.refine.metric import Distance, in_metres, metres
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.viewing import VIEWER, in_own_world
@@ -40,7 +42,12 @@ _SHOWN = 6
 # Views on the page: of photos for the optimisation, and of held-out ones.
 _ON_PAGE = 12
 _JUDGED_ON_PAGE = 4
-_SCORES = ("psnr", "ssim", "exposed_psnr", "alpha", "nearest_input")
+_SCORES = ("psnr", "ssim", "exposed_psnr", "error", "expected_error", "alpha", "nearest_input")
+# Largest error in pictures, and their colours from 0 to this.
+_LARGEST_ERROR = 0.2
+_ERROR_MAP = "inferno"
+# Equal groups of pixels by the expected error.
+_GROUPS = 10
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,9 @@ class Result:
     command: command line that makes the scene again. optimised: number of Gaussians that were
     optimised; others, which come before them, are surroundings. world: reference pose (4, 4) and
     scale of the world of the Gaussians, see `own_world`. views: the V photos of the optimisation,
-    (1, V). judged: the H held-out photos on which the scene is scored, (1, H).
+    (1, V). judged: the H held-out photos on which the scene is scored, (1, H). evidence: what the
+    photos show of the Gaussians. factor: by which the photos' world is multiplied in files,
+    because of the measured distance `scale_by`.
     """
 
     command: str
@@ -60,6 +69,21 @@ class Result:
     photos: ScenePhotos
     views: Views
     judged: Views
+    evidence: Evidence
+    factor: float = 1.0
+    scale_by: Distance | None = None
+
+    def in_metres(self, distance: Distance | None) -> "Result":
+        """Return the result in metres by a measured distance; unchanged without one."""
+        if distance is None:
+            return self
+        every = concatenated([self.refined.cameras, self.judged.cameras], 1)
+        # in the order of the photos
+        frames = torch.tensor([*self.photos.frames, *self.photos.held_out]).argsort()
+        units = metres(distance, self.refined.gaussians, every[:, frames], self.photos.small)
+        factor = units * float(self.world[1])
+        world = in_metres(self.world, factor)
+        return replace(self, world=world, factor=factor, scale_by=distance)
 
     def in_photos_world(self, gaussians: Gaussians) -> Gaussians:
         """Return Gaussians (1, G) in the world coordinates of the photos' cameras."""
@@ -93,7 +117,10 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
     """
     refined = result.refined
     if writer_of(out):
-        save_gaussians(result.in_photos_world(refined.gaussians), out, result.cameras())
+        stored = refined.gaussians
+        if out.suffix.lower() == ".glb":
+            stored = replace(stored, features=result.evidence.errors[None, :, None])
+        save_gaussians(result.in_photos_world(stored), out, result.cameras())
         record = scores(result.read_back(out))
         written = [out]
     else:
@@ -111,6 +138,10 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
             f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
             f"{mean['ssim']:.3f}, alpha {mean['alpha']:.3f}; a copy of the nearest photo: PSNR "
             f"{mean['nearest_input']:.2f} dB"
+        )
+        lines.append(
+            f"mean error of their colours {mean['error']:.3f}, expected "
+            f"{mean['expected_error']:.3f}"
         )
         if " --adjust exposure" in result.command:
             lines.append(
@@ -163,7 +194,11 @@ def page_of(result: Result, record: Mapping[str, Any]) -> str:
     if mean := record["mean"]:
         note += f"; held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}"
     title = Path(result.photos.path).resolve().name
-    tour = Tour(title, note, stops, names, len(best), refined.cameras)
+    errors = [
+        error_picture(result.evidence.error_map(stops.cameras[:, [stop]]))
+        for stop in range(len(names))
+    ]
+    tour = Tour(title, note, stops, names, len(best), refined.cameras, errors)
     return gaussians_html(refined.gaussians, tour)
 
 
@@ -172,11 +207,15 @@ def scores(result: Result) -> dict[str, Any]:
     refined = result.refined
     name_of = result.photos.small.frame_name
     rows = list[dict[str, Any]]()
+    errors = list[Tensor]()
     for place, frame in enumerate(result.photos.held_out):
         photo = result.judged.select([place])
         rendering = result.render(photo)
         # what no optimisation is needed for
         nearest = nearest_input(result.views, photo.cameras)
+        expected = result.evidence.error_map(photo.cameras)
+        error = errors_of(rendering.rgb, photo.images)[0, 0]
+        errors.append(torch.stack([expected, error]).flatten(1))
         rows.append(
             {
                 "frame": frame,
@@ -184,6 +223,8 @@ def scores(result: Result) -> dict[str, Any]:
                 "psnr": float(psnr(rendering.rgb, photo.images).mean()),
                 "ssim": float(ssim(rendering.rgb, photo.images).mean()),
                 "exposed_psnr": exposed_psnr(rendering.rgb, photo.images),
+                "error": float(error.mean()),
+                "expected_error": float(expected.mean()),
                 "alpha": float(rendering.alpha.mean()),
                 "nearest_input": float(psnr(nearest, photo.images).mean()),
             }
@@ -199,9 +240,21 @@ def scores(result: Result) -> dict[str, Any]:
         "size": result.views.cameras.size,
         "refined_on": [*map(name_of, result.photos.frames)],
         "camera_centres": result.photos.centres,
+        "factor": result.factor,
+        "scale_by": result.scale_by,
         "mean": mean,
+        "expected_and_error": groups(torch.cat(errors, 1)) if rows else [],
         "held_out": rows,
     }
+
+
+def groups(errors: Tensor) -> list[list[float]]:
+    """Return means of pixels in _GROUPS groups of equal size, from the least expected error on.
+
+    errors: expected and true error of P pixels, (2, P). Returns a pair for each group.
+    """
+    order = errors[0].argsort()
+    return [group.mean(1).tolist() for group in errors[:, order].tensor_split(_GROUPS, 1)]
 
 
 def exposed_psnr(rgb: Tensor, image: Tensor) -> float:
@@ -222,12 +275,21 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
     """
     every = -(-len(rows) // _SHOWN)
     views = result.judged.select(slice(None, None, every))
+    renders = result.render(views).rgb[0]
+    errors = [result.evidence.error_map(views.cameras[:, [view]]) for view in range(len(renders))]
     pictures = {
         "photo": [rgb_picture(image) for image in views.images[0]],
-        "render": [rgb_picture(image) for image in result.render(views).rgb[0]],
+        "render": [rgb_picture(image) for image in renders],
+        "error": [error_picture(error) for error in errors_of(renders, views.images[0])],
+        "expected error": [error_picture(error) for error in errors],
     }
     titles = [f"{Path(row['photo']).name}\n{row['psnr']:.2f} dB" for row in rows[::every]]
     return figure_picture(grid_figure(pictures, titles), 120)
+
+
+def error_picture(errors: Tensor) -> images.Picture:
+    """Draw errors of pixels (H, W), bright where they are large."""
+    return shaded(errors[None], 0.0, _LARGEST_ERROR, _ERROR_MAP)
 
 
 def has_viewer(console: Console) -> bool:

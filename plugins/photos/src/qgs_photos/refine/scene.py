@@ -22,9 +22,10 @@ from qgs_photos.datatools.findings import Finding
 from qgs_photos.refine.adjusting import DIFFER, brightness
 from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
+from qgs_photos.refine.evidence import MOST, evidence
 from qgs_photos.refine.initial import Initialisation, photos_start
 from qgs_photos.refine.options import Options
-from qgs_photos.refine.refining import refine, seconds_of_step
+from qgs_photos.refine.refining import RefinedScene, refine, seconds_of_step
 from qgs_photos.refine.result import Result, has_viewer, write_scene
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.refine.surroundings import edge_color, surrounded
@@ -75,6 +76,7 @@ def make_scene(
         plan = Budget(step, small.cameras.size, photos, options)
         size = plan.affordable(left())
         count = plan.count(size)
+        end += min(len(photos.frames), MOST) * plan.mean_step(size)
         every = views_of(photos, start.world, size, options)
     budget = left()
     chosen = replace(options, size=size, gaussians=count, seconds=budget)
@@ -97,13 +99,36 @@ def make_scene(
         extras=options.extras,
         begin=BEGIN if options.earlier else 0.0,
     )
-    optimised = refined.gaussians.count
-    if not options.masks:
-        refined = replace(refined, gaussians=surrounded(refined.gaussians, every, color))
-    held_out = every.select(slice(len(photos.frames), None))
-    result = Result(command, optimised, start.world, refined, photos, views, held_out)
     with console.status("scoring held-out photos and writing files"):
+        around = None if options.masks else color
+        result = finished(command, start.world, refined, photos, every, around)
+        result = result.in_metres(options.scale_by)
         write_scene(result, out, page, began, console)
+
+
+def finished(
+    command: str,
+    world: World,
+    refined: RefinedScene,
+    photos: ScenePhotos,
+    every: Views,
+    color: Sequence[float] | None,
+) -> Result:
+    """Return the result of an optimisation with surroundings, and without floaters.
+
+    every: photos of the optimisation, then the held-out photos: (1, V). color: RGB of surroundings;
+    None leaves them out.
+    """
+    optimised = refined.gaussians
+    whole = optimised if color is None else surrounded(optimised, every, color)
+    around = whole.count - optimised.count
+    views = every.select(slice(len(photos.frames)))
+    judged = every.select(slice(len(photos.frames), None))
+    found = evidence(whole, replace(views, cameras=refined.cameras))
+    found = found.cleaned(judged, around).calibrated(judged)
+    refined = replace(refined, gaussians=found.gaussians)
+    count = found.gaussians.count - around
+    return Result(command, count, world, refined, photos, views, judged, found)
 
 
 def views_of(photos: ScenePhotos, world: World, size: Size, options: Options) -> Views:

@@ -3,6 +3,7 @@
 from qgs.contracts import Frames, Scene
 from qgs.data.view_samplers import held_out_frames
 from qgs.reconstruction.scenes import Size, photo_scene
+from qgs_photos.refine.metric import points_of
 from qgs_photos.refine.options import NONE, Options
 
 SMALL = 128
@@ -21,6 +22,9 @@ class ScenePhotos:
         self.name = options.scene
         found = self.at(None)
         self.small = self.at(sized(found, SMALL))
+        if options.scale_by:
+            # what is wrong shows before the optimisation
+            points_of(options.scale_by, self.small)
         self.held_out = judged_frames(found, options.holdout)
         self.frames = tuple(frame for frame in range(len(found)) if frame not in self.held_out)
         # a model's inputs are chosen among the others

@@ -1,0 +1,166 @@
+"""What photos of a scene show of its Gaussians: errors to expect in renders, and floaters."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.data.view_samplers import evenly
+from qgs.geometry.transforms import to_camera
+from qgs.metrics.images import psnr
+from qgs.types import Cameras, Gaussians, Views
+from qgs_photos.viewing import VIEWER
+
+MOST = 64
+"""Largest number of photos that are compared with their renders."""
+# Pixels that a Gaussian must fill in a photo, so that the photo shows it.
+_SHOWN = 0.5
+# The expected error: factor on the error in photos, exponent of the number of photos, exponent
+# for each radian between a view and the nearest photo. docs/refine.md says how they were fitted.
+_FACTOR = 4.7
+_OF_COUNT = -0.5
+_OF_ANGLE = 0.5
+_LARGEST_ANGLE = 1.0
+# Least error in photos, and error where no Gaussian is.
+_LEAST = 0.003
+_NOTHING = 0.3
+# Floaters: their distance from a camera over the median depth of its photo, if few photos show
+# them or if many do; their standard deviation over the photo's longer side.
+_FEW = 2
+_NEAR = 0.3
+_NEARER = 0.15
+_LARGE = 0.5
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What P photos of a scene show of its G Gaussians.
+
+    gaussians: (1, G). eyes: centres of the photos' cameras (P, 3). shown: which photos show which
+    Gaussians (P, G). nearest, largest: over the photos that show a Gaussian (G,), its least depth
+    in units of the photo's median depth, and its largest standard deviation in units of the photo's
+    longer side. errors: errors to expect in views from the directions of the photos (G,).
+    """
+
+    gaussians: Gaussians
+    eyes: Tensor
+    shown: Tensor
+    nearest: Tensor
+    largest: Tensor
+    errors: Tensor
+
+    def kept(self, keep: Tensor) -> "Evidence":
+        """Return the evidence of the Gaussians in a mask (G,)."""
+        return Evidence(
+            self.gaussians[:, keep],
+            self.eyes,
+            self.shown[:, keep],
+            self.nearest[keep],
+            self.largest[keep],
+            self.errors[keep],
+        )
+
+    def error_map(self, cameras: Cameras) -> Tensor:
+        """Return the error to expect in each pixel of the render from a camera (1, 1): (H, W).
+
+        It grows with the angle between the directions of the view and of the nearest photo.
+        """
+        means = self.gaussians.means[0]
+        to_photos = F.normalize(self.eyes[:, None] - means, dim=-1)
+        to_view = F.normalize(cameras.c2w[0, 0, :3, 3] - means, dim=-1)
+        cosines = (to_photos * to_view).sum(-1).where(self.shown, -1.0)
+        angles = cosines.amax(0).clamp(math.cos(_LARGEST_ANGLE), 1).acos()
+        errors = self.errors * (_OF_ANGLE * angles).exp()
+        render = VIEWER(replace(self.gaussians, features=errors[None, :, None]), cameras)
+        return (render.features + _NOTHING * (1 - render.alpha))[0, 0, 0]
+
+    def calibrated(self, judged: Views) -> "Evidence":
+        """Return a copy whose errors are scaled to those in photos (1, H) that were left out.
+
+        The fewer photos, the less: the best scale differs between photos of a scene, too.
+        """
+        expected = found = 0.0
+        for view in _each(judged):
+            expected += float(self.error_map(view.cameras).mean())
+            rgb = VIEWER(self.gaussians, view.cameras).rgb
+            found += float(errors_of(rgb, view.images).mean())
+        count = judged.images.shape[1]
+        scale = (found / expected) ** (count / (count + 0.5)) if count else 1.0
+        return replace(self, errors=scale * self.errors)
+
+    def cleaned(self, judged: Views, surroundings: int) -> "Evidence":
+        """Return a copy without the floaters that photos (1, H), which were left out, contradict.
+
+        Kinds of Gaussians that probably float are left out one after the other, and stay out if the
+        mean PSNR of `judged` does not fall. surroundings: number of first Gaussians that stay.
+        """
+        keep = torch.ones_like(self.nearest, dtype=torch.bool)
+        best = quality(self.gaussians, judged)
+        few = self.shown.sum(0) <= _FEW
+        kinds = (self.nearest < _NEAR) & few, self.nearest < _NEARER, self.largest > _LARGE
+        for kind in kinds:
+            tried = keep & ~kind
+            tried[:surroundings] = True
+            found = quality(self.gaussians[:, tried], judged)
+            # without photos both are NaN
+            if found >= best:
+                keep, best = tried, found
+        return self.kept(keep)
+
+
+def quality(gaussians: Gaussians, views: Views) -> float:
+    """Return the mean PSNR of renders of Gaussians (1, G) as photos (1, V); NaN without photos."""
+    scores = [psnr(VIEWER(gaussians, view.cameras).rgb, view.images) for view in _each(views)]
+    return float(torch.stack(scores).mean()) if scores else math.nan
+
+
+def errors_of(rgb: Tensor, images: Tensor) -> Tensor:
+    """Return the absolute error of renders (..., 3, H, W), a mean over RGB: (..., H, W)."""
+    return (rgb.clamp(0, 1) - images).abs().mean(-3)
+
+
+def evidence(gaussians: Gaussians, views: Views) -> Evidence:
+    """Gather the evidence on Gaussians (1, G) from photos (1, V), at most MOST of them."""
+    photos = views.images.shape[1]
+    compared = evenly(range(photos), MOST)
+    shares = [_shares(gaussians, views.select([photo])) for photo in compared]
+    weights, sums, depths, sizes = torch.stack(shares).unbind(1)
+    shown = weights > _SHOWN
+    # as if one more pixel had the usual error
+    errors = (sums.sum(0) + sums.sum() / weights.sum()) / (weights.sum(0) + 1)
+    count = shown.sum(0) * photos / len(compared)
+    return Evidence(
+        gaussians,
+        views.cameras.c2w[0, compared, :3, 3],
+        shown,
+        depths.where(shown, math.inf).amin(0),
+        sizes.where(shown, 0.0).amax(0),
+        _FACTOR * (errors + _LEAST) * (1 + count) ** _OF_COUNT,
+    )
+
+
+def _each(views: Views) -> Iterator[Views]:
+    return (views.select([view]) for view in range(views.images.shape[1]))
+
+
+def _shares(gaussians: Gaussians, view: Views) -> Tensor:
+    """Return what a photo (1, 1) shows of each of G Gaussians: (4, G).
+
+    The rows are the sums over pixels of a Gaussian's weight, and of the weight times the error of
+    the render; its depth in units of the photo's median depth; its largest standard deviation in
+    units of the photo's longer side.
+    """
+    with torch.enable_grad():
+        features = gaussians.means.new_zeros(1, gaussians.count, 2).requires_grad_()
+        render = VIEWER(replace(gaussians, features=features), view.cameras)
+        errors = errors_of(render.rgb.detach(), view.images)[0, 0]
+        sums = (render.features[0, 0] * torch.stack([torch.ones_like(errors), errors])).sum()
+        # the derivatives by features are weights
+        (weights,) = torch.autograd.grad(sums, features)
+    depths = to_camera(gaussians.means, view.cameras)[0, 0, :, 2]
+    usual = render.depth.detach()[render.alpha > 0.5].median()
+    widths = gaussians.scales[0].amax(-1) * view.cameras.intrinsics[0, 0, 0] / depths
+    return torch.stack([*weights[0].T, depths / usual, widths / max(view.cameras.size)])
