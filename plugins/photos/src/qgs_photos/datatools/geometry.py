@@ -142,11 +142,37 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
     """
     if len(usable) < 2:
         return Geometry("fewer than 2 usable frames")
-    matcher = _Matcher(scene, [frame for run in _runs(usable, most) for frame in run])
+    frames = [frame for run in _runs(usable, most) for frame in run]
+    poses = np.stack([scene.photos[frame].listed.c2w for frame in frames])
     # no baseline, no epipolar lines
-    if not np.ptp(matcher.centres, axis=0).any():
+    if not np.ptp(poses[:, :3, 3], axis=0).any():
         return Geometry("all cameras on one point")
-    pairs = matcher.pairs()
+    features = [_detected(scene, frame) for frame in frames]
+
+    @cache
+    def distance(first: int, second: int) -> float | None:
+        one, lens_of_one, diagonal = features[first]
+        two, lens_of_two, _ = features[second]
+        matches = match(one, two)
+        if matches is None:
+            return None
+        both = poses[[first, second]]
+        lenses = np.stack([lens_of_one, lens_of_two])
+        there = off_lines(matches, both, lenses)
+        back = off_lines(matches[::-1], both[::-1], lenses[::-1])
+        # a fraction of the diagonal
+        return float(np.median(there + back) / 2 / diagonal)
+
+    pairs = Pairs()
+    for start in range(len(frames)):
+        # the next shares most and says least; a farther one has a baseline
+        partners = list(_partners(poses[:, :3, 3], start))
+        for group in ({start + 1}.intersection(partners), partners):
+            for place in group:
+                one, two = sorted((start, place))
+                if (apart := distance(one, two)) is not None:
+                    pairs[frames[one], frames[two]] = apart
+                    break
     if not pairs:
         return Geometry(TOO_FEW)
     first, _ = next(iter(pairs))
@@ -164,69 +190,22 @@ def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
     return [frames[start : start + length] for start in starts]
 
 
-class _Matcher:
-    """Matcher of pairs of a scene's frames.
+def _detected(scene: DecodedScene, frame: int) -> tuple[Features, np.ndarray, float]:
+    """Return the features, the intrinsics and the diagonal of a photo, reduced to SIDE pixels."""
+    picture, intrinsics = scene.photos[frame].picture(scene.decoded[frame].size, SIDE)
+    return detect(picture), intrinsics, float(np.hypot(*picture.shape[:2]))
 
-    Methods take indices into `frames`. Features of each photo are detected once.
-    """
 
-    def __init__(self, scene: DecodedScene, frames: Sequence[int]) -> None:
-        self.scene = scene
-        self.frames = frames
-        self.poses = np.stack([scene.photos[frame].listed.c2w for frame in frames])
-        self.centres = self.poses[:, :3, 3]
-        self._features = [self._detected(frame) for frame in frames]
-
-    def pairs(self) -> Pairs:
-        """Match each frame with the next, and with the first of `partners` that has matches."""
-        found = Pairs()
-        distance = cache(self.distance)
-        for start in range(len(self.frames)):
-            # the next shares most and says least; a farther one has a baseline
-            partners = list(self.partners(start))
-            for group in ({start + 1}.intersection(partners), partners):
-                for place in group:
-                    one, two = sorted((start, place))
-                    if (apart := distance(one, two)) is not None:
-                        found[self.frames[one], self.frames[two]] = apart
-                        break
-        return found
-
-    def distance(self, first: int, second: int) -> float | None:
-        """Return the median distance of two photos' matched points from their epipolar lines.
-
-        The distance is a fraction of the photos' diagonal. Returns None if the photos have too few
-        matches.
-        """
-        one, lens_of_one, diagonal = self._features[first]
-        two, lens_of_two, _ = self._features[second]
-        matches = match(one, two)
-        if matches is None:
-            return None
-        poses = self.poses[[first, second]]
-        lenses = np.stack([lens_of_one, lens_of_two])
-        there = off_lines(matches, poses, lenses)
-        back = off_lines(matches[::-1], poses[::-1], lenses[::-1])
-        return float(np.median(there + back) / 2 / diagonal)
-
-    def _detected(self, frame: int) -> tuple[Features, np.ndarray, float]:
-        """Return the features, the intrinsics and the diagonal of a photo, reduced to SIDE pixels.
-
-        frame: index in the scene.
-        """
-        picture, intrinsics = self.scene.photos[frame].picture(self.scene.decoded[frame].size, SIDE)
-        return detect(picture), intrinsics, float(np.hypot(*picture.shape[:2]))
-
-    def partners(self, start: int) -> Iterator[int]:
-        """Yield frames that may show what `start` shows: near in the list, then near in space."""
-        along = [start + gap for gap in _GAPS if 0 <= start + gap < len(self.frames)]
-        forward = [place for place in along if place > start] or along
-        distances = np.linalg.norm(self.centres - self.centres[start], axis=1)
-        near = np.argsort(distances)[1:4].tolist()
-        least = _NO_BASELINE * np.ptp(self.centres, axis=0).max()
-        for place in dict.fromkeys([*forward, *near]):
-            if distances[place] > least:
-                yield place
+def _partners(centres: np.ndarray, start: int) -> Iterator[int]:
+    """Yield places that may show what `start` shows: near in the list, then near in space."""
+    along = [start + gap for gap in _GAPS if 0 <= start + gap < len(centres)]
+    forward = [place for place in along if place > start] or along
+    distances = np.linalg.norm(centres - centres[start], axis=1)
+    near = np.argsort(distances)[1:4].tolist()
+    least = _NO_BASELINE * np.ptp(centres, axis=0).max()
+    for place in dict.fromkeys([*forward, *near]):
+        if distances[place] > least:
+            yield place
 
 
 def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Finding]:
