@@ -56,15 +56,14 @@ _DIVIDED_TWICE = 0.02
 class Record:
     """A scene of V frames as stored in a chunk file; the module's docstring gives the formats.
 
-    where: names of the file and the scene, for error messages. key: name of the scene. cameras:
-    (V, 18). images, masks: bytes of image files. names: names of the frames, or their time stamps
-    if the file has no names. sizes: (V, 2), height and width of the images. held_out: indices of
-    frames that training must not use. times: (V,), times of the frames. sizes, masks and times are
-    None if the file does not have them.
+    where: names of the file and the scene, for error messages. cameras: (V, 18). images,
+    masks: bytes of image files. names: names of the frames, or their time stamps if the file has no
+    names. sizes: (V, 2), height and width of the images. held_out: indices of frames that training
+    must not use. times: (V,), times of the frames. sizes, masks and times are None if the file does
+    not have them.
     """
 
     where: str
-    key: str
     cameras: Tensor
     images: Sequence[Tensor]
     names: Sequence[str]
@@ -150,7 +149,7 @@ def parse_record(file: str, data: Any) -> Record:
         times = _tensor(where, "times", times, (count,)).to(torch.float64, copy=True)
         _expect(bool(times.isfinite().all()), where, "'times' must be finite numbers")
     names = [str(name) for name in names]
-    return Record(where, data["key"], cameras, images, names, sizes, masks, tuple(held_out), times)
+    return Record(where, cameras, images, names, sizes, masks, tuple(held_out), times)
 
 
 def _expect(valid: bool, where: str, reason: str) -> None:
