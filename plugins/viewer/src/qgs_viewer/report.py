@@ -55,26 +55,27 @@ def score_rows(
     marked.
     """
     first = models[0].evaluation
-    table: list[tuple[str, Mapping[str, float | None], Sequence[str]]] = []
+    means: dict[str, Mapping[str, float | None]] = {}
+    sizes = {}
     for model in models:
         found = model.evaluation
         # of the views that the evaluation has scored
-        means = {**found.means(), "coverage": 100 * trust.means(model.views).coverage}
-        table.append((model.name, means, [f"{found.gaussians:,}", f"{model.parameters:,}"]))
+        coverage = 100 * trust.means(model.views).coverage
+        means[model.name] = {**found.means(), "coverage": coverage}
+        sizes[model.name] = [f"{found.gaussians:,}", f"{model.parameters:,}"]
     for baseline in BASELINES:
-        # baselines have neither Gaussians nor parameters
-        name = baseline.replace("_", " ").capitalize()
-        table.append((name, first.means(baseline), ["–", "–"]))
+        means[baseline.replace("_", " ").capitalize()] = first.means(baseline)
     rows = {}
-    for place, (label, means, sizes) in enumerate(table):
+    for label, own in means.items():
         cells = rows[label] = list[tuple[str, bool]]()
         for name, column in columns.items():
-            cell = column.shown(means.get(name))
-            best = column.best(other.get(name) for _, other, _ in table)
+            cell = column.shown(own.get(name))
+            best = column.best(other.get(name) for other in means.values())
             # cells that read alike are both best
             alike = best is not None and cell == column.shown(best)
-            cells.append((cell, alike and place < len(models) and first.samples >= RANKED))
-        cells += [(size, False) for size in sizes]
+            cells.append((cell, alike and label in sizes and first.samples >= RANKED))
+        # baselines have neither Gaussians nor parameters
+        cells += [(size, False) for size in sizes.get(label, ["–", "–"])]
     return rows
 
 
