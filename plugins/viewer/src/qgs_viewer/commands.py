@@ -290,14 +290,13 @@ def figures(
 
     The file figures.md explains each figure.
     """
-    from qgs.train.distributed import choose_device
     from qgs_viewer.comparison import open_models
     from qgs_viewer.figures import write_figures
     from qgs_viewer.remarks import scale_remarks
     from qgs_viewer.scenes import model_scenes
 
     folder = new_folder(out, "figures")
-    models = open_models(runs, photos, choose_device(device))
+    models = open_models(runs, photos, device)
     shown = model_scenes(models, scene=scene)
     # before the first figure is drawn, which may take minutes
     for model in shown:

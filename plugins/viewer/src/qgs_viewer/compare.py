@@ -9,7 +9,6 @@ import typer
 from rich.console import Console
 
 from qgs.cli.options import parse_size, scale_settings
-from qgs.train.distributed import choose_device
 from qgs.train.folder import RunFolder
 from qgs.train.guard import TrainingError
 from qgs.train.training import train
@@ -45,9 +44,7 @@ def compare_models(
     scenes = "Unseen scenes" if photos is None else "Your photos"
     # warnings about photos concern whoever reads the page, not only the terminal
     with kept_warnings() as warnings:
-        opened = open_models(
-            names, photos, choose_device(device), pixels, scale_settings(scale), gaussians
-        )
+        opened = open_models(names, photos, device, pixels, scale_settings(scale), gaussians)
         for model in opened:
             if model.size:
                 console.print(f"{model.size.text}; --size HxW sets another", style="dim")
@@ -71,7 +68,7 @@ def compare_trainings(
     if the user stops a training.
     """
     console = Console()
-    resolved = resolve_fairly([Path(recipe) for recipe in recipes], seconds, seed)
+    resolved = resolve_fairly(recipes, seconds, seed)
     names = [str(target / name) for name in resolved]
     for number, (name, recipe) in enumerate(resolved.items(), start=1):
         console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
@@ -83,7 +80,7 @@ def compare_trainings(
         if stopped:
             raise typer.Abort
     # judged as saved: from files, like all other models
-    models = open_models(names, None, choose_device(device))
+    models = open_models(names, None, device)
     for model in models:
         model.evaluation.write(RunFolder(target / model.name).evaluation)
     facts = {"Budget": f"{seconds:g} seconds of training each, seed {seed}"}

@@ -40,6 +40,7 @@ from qgs.reconstruction.scenes import (
     size_multiple,
     whole_size,
 )
+from qgs.train.distributed import choose_device
 from qgs_viewer.trust import ScoredView, scored_views
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
@@ -226,10 +227,11 @@ def open_models(
     """Load models for a comparison on unseen scenes of their data, or on held-out `photos`.
 
     names: run folders, checkpoints, URLs or shipped models. photos, size, overrides: passed on to
-    `recipes_alike`. gaussians: as for `CheckpointFile`. Without `size`, the first model decides on
-    the size of photos by `find_size`.
+    `recipes_alike`. device: as for `choose_device`. gaussians: as for `CheckpointFile`. Without
+    `size`, the first model decides on the size of photos by `find_size`.
     Raises ValueError if models cannot be compared under one protocol.
     """
+    device = choose_device(device)
     with ExitStack() as opened:
         paths = map(checkpoint_path, names)
         files = [opened.enter_context(CheckpointFile(path, gaussians)) for path in paths]
@@ -274,7 +276,7 @@ def _found_size(model: Model, windows: PhotoWindows, data: SceneSource) -> Found
     return find_size(model.network, scene, *window, views)
 
 
-def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
+def resolve_fairly(files: Sequence[str | Path], seconds: float, seed: int) -> dict[str, Recipe]:
     """Return checked recipes by short name, all with one time budget (seconds) and one seed.
 
     Raises ValueError if two recipes differ in data, views, evaluation, metrics, optimizer or
