@@ -108,6 +108,61 @@ class Record:
         fx, fy, cx, cy = self.cameras[frame, :4].double().tolist()
         return fx * size[1], fy * size[0], cx * size[1], cy * size[0]
 
+    def mask(self, frame: int) -> np.ndarray | None:
+        """Decode the mask of a frame, (H, W) uint8; None if the frame has no mask.
+
+        Raises ValueError for a mask that cannot be read or has another size than its image.
+        """
+        data = None if self.masks is None else self.masks[frame].numpy().tobytes()
+        if not data:
+            return None
+        try:
+            mask = decode_mask(io.BytesIO(data))
+        except OSError as error:
+            fix = "pack the chunk again, or remove the scene from index.json"
+            raise ValueError(
+                f"the mask of {self.place(frame)} cannot be read ({error}): {fix}"
+            ) from error
+        for problem in size_problems(mask.shape[:2], self.image_sizes[frame]):
+            raise ValueError(f"the mask of {self.place(frame)} has a wrong size: {problem}")
+        return mask
+
+    def require_usable(self) -> None:
+        """Raise ValueError that names the first frame with an invalid pose or intrinsics."""
+        rotation = self.w2c[:, :3, :3]
+        error = rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)
+        focal = self.cameras[:, :2]
+        usable = (
+            torch.isfinite(self.cameras).all()
+            and error.abs().max() < _RIGID
+            and torch.linalg.det(rotation).min() > 0
+            and focal.min() > 0
+            and focal.max() < _IN_PIXELS
+        )
+        # checking all frames at once first is ten times as fast as one by one
+        for frame in () if usable else range(len(self)):
+            size = self.image_sizes[frame]
+            problems = (
+                *pose_problems(self.w2c[frame].numpy()),
+                *self.unit_problems(frame),
+                *intrinsics_problems(self.intrinsics(frame, size), size),
+            )
+            for problem in problems:
+                raise ValueError(f"{self.place(frame)}: {problem}")
+
+    def unit_problems(self, frame: int) -> Iterator[FrameProblem]:
+        """Yield a problem if a frame's intrinsics were not divided by the image's size once."""
+        values = self.cameras[frame, :4].tolist()
+        focal = max(values[:2])
+        divided_twice = 0 < focal < _DIVIDED_TWICE
+        if divided_twice or focal >= _IN_PIXELS:
+            numbers = ", ".join(f"{value:.6g}" for value in values)
+            unit = "divided twice" if divided_twice else "like pixels"
+            yield FrameProblem(
+                f"the intrinsics ({numbers}) look {unit}",
+                "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
+            )
+
 
 def parse_record(file: str, data: Any) -> Record:
     """Return the scene in an entry `data` of a chunk `file`. Raises ValueError if it is invalid."""
@@ -184,64 +239,6 @@ def _files(where: str, name: str, data: Any) -> Sequence[Tensor]:
     wanted = "a list of one-dimensional uint8 tensors with the bytes of image files"
     _expect(valid, where, f"{name!r} must be {wanted}, got {type(data).__name__}")
     return data
-
-
-def read_mask(record: Record, frame: int) -> np.ndarray | None:
-    """Decode the mask of a frame, (H, W) uint8; None if the frame has no mask.
-
-    Raises ValueError for a mask that cannot be read or has another size than its image.
-    """
-    data = None if record.masks is None else record.masks[frame].numpy().tobytes()
-    if not data:
-        return None
-    try:
-        mask = decode_mask(io.BytesIO(data))
-    except OSError as error:
-        fix = "pack the chunk again, or remove the scene from index.json"
-        raise ValueError(
-            f"the mask of {record.place(frame)} cannot be read ({error}): {fix}"
-        ) from error
-    for problem in size_problems(mask.shape[:2], record.image_sizes[frame]):
-        raise ValueError(f"the mask of {record.place(frame)} has a wrong size: {problem}")
-    return mask
-
-
-def require_usable(record: Record) -> None:
-    """Raise ValueError that names the first frame with an invalid pose or invalid intrinsics."""
-    rotation = record.w2c[:, :3, :3]
-    error = rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)
-    focal = record.cameras[:, :2]
-    usable = (
-        torch.isfinite(record.cameras).all()
-        and error.abs().max() < _RIGID
-        and torch.linalg.det(rotation).min() > 0
-        and focal.min() > 0
-        and focal.max() < _IN_PIXELS
-    )
-    # checking all frames at once first is ten times as fast as one by one
-    for frame in () if usable else range(len(record)):
-        size = record.image_sizes[frame]
-        problems = (
-            *pose_problems(record.w2c[frame].numpy()),
-            *unit_problems(record, frame),
-            *intrinsics_problems(record.intrinsics(frame, size), size),
-        )
-        for problem in problems:
-            raise ValueError(f"{record.place(frame)}: {problem}")
-
-
-def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
-    """Yield a problem if a frame's intrinsics were not divided by the image's size exactly once."""
-    values = record.cameras[frame, :4].tolist()
-    focal = max(values[:2])
-    divided_twice = 0 < focal < _DIVIDED_TWICE
-    if divided_twice or focal >= _IN_PIXELS:
-        numbers = ", ".join(f"{value:.6g}" for value in values)
-        unit = "divided twice" if divided_twice else "like pixels"
-        yield FrameProblem(
-            f"the intrinsics ({numbers}) look {unit}",
-            "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
-        )
 
 
 def load_chunk(path: UPath) -> list[Any]:

@@ -27,8 +27,6 @@ from qgs_photos.datasets.chunk_files import (
     Record,
     has_chunks,
     list_scenes,
-    read_mask,
-    require_usable,
 )
 
 # Chunks kept open.
@@ -105,7 +103,7 @@ class ChunkScene(Scene):
         """
         record = self.record
         target = self.config.image_size
-        require_usable(record)
+        record.require_usable()
         intrinsics = record.cameras[:, :4].double()
         sizes = torch.tensor(record.image_sizes)
         for height, width in set(record.image_sizes):
@@ -160,7 +158,7 @@ class ChunkScene(Scene):
         return CropResize(size, self.config.image_size).image(image)
 
     def _mask(self, record: Record, frame: int) -> np.ndarray:
-        mask = read_mask(record, frame)
+        mask = record.mask(frame)
         if mask is None:
             return np.full(self.config.image_size, 255, np.uint8)
         crop = CropResize((mask.shape[0], mask.shape[1]), self.config.image_size)

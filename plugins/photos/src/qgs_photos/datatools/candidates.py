@@ -33,8 +33,6 @@ from qgs_photos.datasets.chunk_files import (
     load_chunk,
     parse_record,
     read_chunk_index,
-    read_mask,
-    unit_problems,
 )
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
 from qgs_photos.datatools.findings import Finding, Severity
@@ -299,12 +297,12 @@ def chunk_photo(record: Record, frame: int, size: Size) -> Photo:
         intrinsics=record.intrinsics(frame, size),
         size=size,
         time=None if record.times is None else float(record.times[frame]),
-        problems=tuple(unit_problems(record, frame)),
+        problems=tuple(record.unit_problems(frame)),
     )
     return Photo(
         photo,
         lambda: record.images[frame].numpy().tobytes(),
-        {"mask": lambda: read_mask(record, frame)},
+        {"mask": lambda: record.mask(frame)},
     )
 
 
