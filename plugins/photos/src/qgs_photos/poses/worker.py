@@ -149,8 +149,8 @@ def _connected(job: Job, learned: Path | None) -> tuple[Any, list[str]]:
     remarks = list[str]()
     estimated = False
     refused = RefusedError(ONE_PLACE)
+    tell("features", 0, total)
     if learned:
-        tell("features", 0, total)
         links = import_module("qgs_photos.poses.learned").learn(job, learned)
     else:
         _find_features(job)
@@ -175,8 +175,6 @@ def _connected(job: Job, learned: Path | None) -> tuple[Any, list[str]]:
 
 def _find_features(job: Job) -> None:
     """Find features by SIFT. Raises RefusedError if fewer than two photos have enough."""
-    total = len(job.sizes)
-    tell("features", 0, total)
     for group in job.groups:
         # octave -1 is twice the size of the photo
         small = max(job.sizes[group[0]]) <= SMALL_SIDE
@@ -196,8 +194,9 @@ def _find_features(job: Job) -> None:
         counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
     if sum(count >= FEW_FEATURES for count in counts) < 2:
         raise RefusedError(
-            f"fewer than two of {total} photos have enough features to match: the photos are "
-            "blurred, or show surfaces without texture. Take sharp photos of something with texture"
+            f"fewer than two of {len(job.sizes)} photos have enough features to match: the photos "
+            "are blurred, or show surfaces without texture. Take sharp photos of something with "
+            "texture"
         )
 
 
