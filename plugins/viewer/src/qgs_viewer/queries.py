@@ -225,8 +225,8 @@ def query_picture(
     """
     scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
     per_query = model.head.gaussians_per_query
-    members = torch.arange(gaussians.count, device=gaussians.means.device).view(-1, per_query)
-    shown = gaussians[:, members[[query.index for query in chosen]].flatten()]
+    members = [query.index * per_query + k for query in chosen for k in range(per_query)]
+    shown = gaussians[:, members]
     paint = torch.tensor([q.color for q in chosen]).view(-1, 3).to(shown.colors) / 255
     colors = paint.repeat_interleave(per_query, 0)[None]
     # a query whose Gaussians are nearly clear is still seen
