@@ -100,11 +100,11 @@ def write_figure(figure: Figure, folder: Path, name: str) -> None:
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     # a date would change the file at every run; type 42 keeps fonts that journals ask for
-    metadata = {"pdf": {"CreationDate": None}, "png": {}}
-    for kind, entries in metadata.items():
+    metadata = {"CreationDate": None}
+    for kind in ("pdf", "png"):
         with (
             replacing(folder / f"{name}.{kind}") as temporary,
             figure_style(),
             rc_context({"pdf.fonttype": 42}),
         ):
-            figure.savefig(temporary, format=kind, dpi=DPI, metadata=entries)
+            figure.savefig(temporary, format=kind, dpi=DPI, metadata=metadata)
