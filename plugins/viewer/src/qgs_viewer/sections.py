@@ -12,12 +12,12 @@ from torch import Tensor
 from qgs.containers import map_tensors
 from qgs.contracts import LearnedQueries
 from qgs.data.view_samplers import evenly
-from qgs.drawing import images
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import (
     Picture,
     depth_picture,
     depth_range,
+    finer,
     rgb_picture,
     shaded,
     side_by_side,
@@ -99,7 +99,7 @@ def scene_to_turn(models: Shown) -> Section:
     """
     tiles = []
     for model in models:
-        camera = images.finer(model.target_camera, Detail.side)
+        camera = finer(model.target_camera, Detail.side)
         picture = rgb_picture(model.network.render(model.gaussians[0], camera).rgb[0, 0])
         page = scene_html(model.scene, Choice(anchors=False))
         tiles.append(Tile(picture, model.name, page=page))
@@ -113,7 +113,7 @@ def queries(models: Shown, detail: Detail) -> Section:
     """
     tiles = []
     for model in models:
-        camera = images.finer(model.target_camera, detail.side)
+        camera = finer(model.target_camera, detail.side)
         chosen = model.notable(QUERIES, camera, detail.query)
         picture = query_picture(model.network, model.gaussians[0], chosen, camera)
         tiles.append(Tile(picture, model.name, chosen))
