@@ -118,6 +118,11 @@ def source_photo(
     camera = scene.cameras[frame]
     fx, fy, cx, cy = camera.intrinsics.tolist()
     name = scene.frame_name(frame)
+
+    def mask() -> np.ndarray | None:
+        masks = scene.masks([frame])
+        return None if masks is None else rgb_picture(masks[0])[..., 0]
+
     listed = PhotoFrame(
         name=name,
         path=UPath(name),
@@ -129,13 +134,8 @@ def source_photo(
     return Photo(
         listed,
         lambda: encode(rgb_picture(scene.images([frame])[0])),
-        {"mask": lambda: _read_mask(scene, frame)},
+        {"mask": mask},
     )
-
-
-def _read_mask(scene: Scene, frame: int) -> np.ndarray | None:
-    masks = scene.masks([frame])
-    return None if masks is None else rgb_picture(masks[0])[..., 0]
 
 
 def photo_folders(root: UPath, wanted: str, images: str | None, name: str = "") -> Items:
@@ -167,33 +167,27 @@ def dl3dv_scenes(path: UPath, images: str | None) -> Iterator[Candidate]:
     """Yield the DL3DV scenes in `path`. Raises FileNotFoundError if there is no scene."""
     for name, place in find_scenes(path).items():
         # an archive is opened when its scene's turn comes
-        yield Candidate(name, "dl3dv", partial(_archived_photos, place, images))
-
-
-def _archived_photos(place: UPath, images: str | None) -> Photos:
-    return _of_folder(scene_folder(place), "nerfstudio", images)
+        yield Candidate(
+            name, "dl3dv", lambda place=place: _of_folder(scene_folder(place), "nerfstudio", images)
+        )
 
 
 def _of_folder(folder: UPath, kind: str, images: str | None) -> Photos:
     listing = read_listing(folder, kind, images)
-    photos = [
-        Photo(
-            listed=frame,
-            read=partial(read_file, frame.path),
-            maps={"mask": partial(_mask, frame), "depth map": partial(_depth, frame)},
-            exists=frame.path in listing.present,
-        )
-        for frame in map(upright, listing.frames)
-    ]
-    return photos, ()
+    frames = map(upright, listing.frames)
+    return [_folder_photo(frame, frame.path in listing.present) for frame in frames], ()
 
 
-def _mask(frame: PhotoFrame) -> np.ndarray | None:
-    return None if frame.mask is None else np.array(whole_mask(frame))
-
-
-def _depth(frame: PhotoFrame) -> np.ndarray | None:
-    return None if frame.depth is None else read_image(frame.depth, decode_depth)
+def _folder_photo(frame: PhotoFrame, exists: bool) -> Photo:
+    return Photo(
+        frame,
+        lambda: read_file(frame.path),
+        {
+            "mask": lambda: frame.mask and np.array(whole_mask(frame)),
+            "depth map": lambda: frame.depth and read_image(frame.depth, decode_depth),
+        },
+        exists,
+    )
 
 
 _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
@@ -277,8 +271,13 @@ _entries = lru_cache(maxsize=1)(load_chunk)
 def _of_chunk(file: UPath, place: int) -> Photos:
     record = parse_record(str(file), _entries(file)[place])
     if record.sizes is None:
-        # without sizes each image would be opened again to know its own
-        record = replace(record, sizes=torch.tensor([_usual_size(record)] * len(record)))
+        # the most frequent in the headers; without it each image would be opened again
+        stored = Counter({(1, 1): 0})
+        for frame in range(len(record)):
+            with suppress(ValueError):
+                stored[record.stored_size(frame)] += 1
+        usual, _ = stored.most_common(1)[0]
+        record = replace(record, sizes=torch.tensor([usual] * len(record)))
     return [chunk_photo(record, *item) for item in enumerate(record.image_sizes)], ()
 
 
@@ -304,12 +303,3 @@ def chunk_photo(record: Record, frame: int, size: Size) -> Photo:
         lambda: record.images[frame].numpy().tobytes(),
         {"mask": lambda: record.mask(frame)},
     )
-
-
-def _usual_size(record: Record) -> Size:
-    """Return the most frequent (H, W) in the headers of images; (1, 1) if none can be read."""
-    stored = Counter({(1, 1): 0})
-    for frame in range(len(record)):
-        with suppress(ValueError):
-            stored[record.stored_size(frame)] += 1
-    return stored.most_common(1)[0][0]
