@@ -76,30 +76,22 @@ def _read(photo: Photo) -> EncodedFrame:
     return EncodedFrame(photo.listed, photo.read(), photo.maps["mask"]())
 
 
-def _encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
-    """Return a photo as an encoded file, with its camera.
-
-    The bytes are those of the photo's file, encoded again only if its EXIF data rotate it. Raises
-    ValueError for a file that cannot be read.
-    """
-    photo = scene.photos[frame]
-    size = scene.stored_size(frame)
-    data = read_file(photo.path)
-    # pixels are stored again only where EXIF turns them
-    if photo.turns:
-        file = io.BytesIO()
-        turned(decode_rgb(io.BytesIO(data), scene.config.background), photo).save(file, "png")
-        data = file.getvalue()
-    listed = replace(photo, intrinsics=photo.at_size(size), size=size)
-    mask = photo.mask and np.array(turned(whole_mask(photo), photo))
-    return EncodedFrame(listed, data, mask)
-
-
 def _stored(scene: PhotoScene | ChunkScene, index: int, encoding: Encoding) -> EncodedFrame:
+    """Return a frame with its file as stored, if all readers show it alike; else encoded again."""
+    size = scene.stored_size(index)
     if isinstance(scene, PhotoScene):
-        frame = _encoded_photo(scene, index)
+        photo = scene.photos[index]
+        data = read_file(photo.path)
+        # pixels are stored again only where EXIF turns them
+        if photo.turns:
+            file = io.BytesIO()
+            turned(decode_rgb(io.BytesIO(data), scene.config.background), photo).save(file, "png")
+            data = file.getvalue()
+        listed = replace(photo, intrinsics=photo.at_size(size), size=size)
+        mask = photo.mask and np.array(turned(whole_mask(photo), photo))
+        frame = EncodedFrame(listed, data, mask)
     else:
-        frame = _read(chunk_photo(scene.record, index, scene.stored_size(index)))
+        frame = _read(chunk_photo(scene.record, index, size))
     try:
         pixels = np.array(decode_rgb(io.BytesIO(frame.data), scene.config.background))
     except OSError as error:
@@ -171,8 +163,7 @@ def chunk_entry(
 
 
 def _bytes(data: bytes) -> Tensor:
-    # a copy: torch wants memory that may be written to
-    return torch.from_numpy(np.frombuffer(data, np.uint8).copy())
+    return torch.tensor(np.frombuffer(data, np.uint8))
 
 
 def _camera(frame: EncodedFrame) -> np.ndarray:
