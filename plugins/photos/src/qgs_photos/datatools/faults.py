@@ -1,6 +1,7 @@
 """Find faults of single photos and poses, and photos that have the same pose or position."""
 
 from collections.abc import Iterator, Sequence
+from itertools import compress
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -70,8 +71,7 @@ def _with_exchanged_masks(photos: Sequence[Decoded]) -> list[int]:
     best = fits.argmax(1)
     better = fits.max(1) > _BETTER * fits.diagonal()
     mutual = best[best] == np.arange(len(best))
-    frames = [*masked]
-    return [frames[place] for place in np.flatnonzero(better & mutual)]
+    return [*compress(masked, better & mutual)]
 
 
 def pose_findings(scene: DecodedScene) -> Iterator[Finding]:
