@@ -142,12 +142,15 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
     """
     if len(usable) < 2:
         return Geometry("fewer than 2 usable frames")
-    frames = [frame for run in _runs(usable, most) for frame in run]
+    frames = _in_runs(usable, most)
     poses = np.stack([scene.photos[frame].listed.c2w for frame in frames])
     # no baseline, no epipolar lines
     if not np.ptp(poses[:, :3, 3], axis=0).any():
         return Geometry("all cameras on one point")
-    features = [_detected(scene, frame) for frame in frames]
+    features = []
+    for frame in frames:
+        picture, lens = scene.photos[frame].picture(scene.decoded[frame].size, SIDE)
+        features.append((detect(picture), lens, float(np.hypot(*picture.shape[:2]))))
 
     @cache
     def distance(first: int, second: int) -> float | None:
@@ -181,19 +184,13 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
     return Geometry(pairs=pairs, diagonal=float(np.hypot(*size)))
 
 
-def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
-    """Return [frames], or a few evenly spread slices of it if there are more than `most` frames."""
+def _in_runs(frames: Sequence[int], most: int) -> Sequence[int]:
+    """Return `frames`, or those of a few evenly spread slices if there are more than `most`."""
     if len(frames) <= most:
-        return [frames]
+        return frames
     length = max(most // _RUNS, 2)
     starts = np.linspace(0, len(frames) - length, most // length).astype(int)
-    return [frames[start : start + length] for start in starts]
-
-
-def _detected(scene: DecodedScene, frame: int) -> tuple[Features, np.ndarray, float]:
-    """Return the features, the intrinsics and the diagonal of a photo, reduced to SIDE pixels."""
-    picture, intrinsics = scene.photos[frame].picture(scene.decoded[frame].size, SIDE)
-    return detect(picture), intrinsics, float(np.hypot(*picture.shape[:2]))
+    return [frame for start in starts for frame in frames[start : start + length]]
 
 
 def _partners(centres: np.ndarray, start: int) -> Iterator[int]:
