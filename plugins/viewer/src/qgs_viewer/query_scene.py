@@ -23,12 +23,14 @@ class Inside:
     """The model that made a scene, with its intermediate results.
 
     memory: tokens of the input photos. states: states of the queries before the first decoder layer
-    and after each layer.
+    and after each layer. traces: records of passes in which one query's attention was asked for, by
+    index of the query.
     """
 
     model: QueryGaussianModel
     memory: ImageMemory
     states: Sequence[QueryState]
+    traces: dict[int, Trace] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,6 @@ class QueryScene:
     placement: Placement = IDENTITY
     inside: Inside | None = None
     background: Background = NEUTRAL
-    _traces: dict[int, Trace] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def queries(self) -> int:
@@ -105,12 +106,12 @@ class QueryScene:
         inside = self.inside
         if inside is None or inside.memory.grid is None or self.views is None or not layer:
             return None
-        if query not in self._traces:
+        if query not in inside.traces:
             # all layers at once: users walk through them, and one pass costs as much as any
             with torch.no_grad(), trace(inside.model, queries=[query]) as record:
                 inside.model.predict(self.views, inside.memory, inside.states[0])
-            self._traces[query] = record
-        return self._traces[query].layers[layer].cross_attention
+            inside.traces[query] = record
+        return inside.traces[query].layers[layer].cross_attention
 
     @property
     def grid(self) -> tuple[int, int, int]:
