@@ -84,7 +84,7 @@ def spread_windows(
     frusta = Frusta(scene, trained_on)
     ranked = ranked_windows(frusta, inputs)
     good = {target: window for cost, window, target in ranked if cost <= ranked[0][0] + POOR}
-    chosen = [target for *_, target in ranked[:1]]
+    chosen = [*good][:1]
     while len(chosen) < min(count, len(good)):
         # the farthest from all chosen ones; of equal ones the best
         chosen.append(max(good.keys() - {*chosen}, key=lambda t: frusta.far[t, chosen].min()))

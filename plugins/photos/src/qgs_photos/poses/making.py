@@ -193,5 +193,5 @@ def _made(source: Path, out: Path, working: Path, options: Options, show: Show) 
     posed, told = run(job, show)
     (out / "sparse").mkdir()
     (models / "best").rename(out / "sparse/0")
-    without = [photo.name for photo in photos if photo.name not in {*posed}]
+    without = [photo.name for photo in photos if photo.name not in posed]
     return Poses(posed, without, faulty, [*remarks, *told])
