@@ -62,7 +62,15 @@ class AnchorOffsetCenters(Centers):
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
-        return state[CENTER][:, :, None] + self.config.displacement(offsets)
+        steps = self.steps(self.config.displacement(offsets), state)
+        return state[CENTER][:, :, None] + steps
+
+    def steps(self, displaced: Tensor, state: QueryState) -> Tensor:
+        """Return steps (B, N, K, 3) from the anchor's centre, world frame.
+
+        displaced: displacements (B, N, K, 3), in the unit and along the axes of the component.
+        """
+        return displaced
 
 
 class RadiusScaledCenters(AnchorOffsetCenters):
@@ -83,8 +91,8 @@ class RadiusScaledCenters(AnchorOffsetCenters):
     def fields_read(cls, config: Config) -> Fields:
         return {**CENTER_FIELD, **radius_field(config)}
 
-    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
-        # Offsets are in radii: a query with a large support spreads its Gaussians widely.
+    def steps(self, displaced: Tensor, state: QueryState) -> Tensor:
+        """Return steps from the anchor's centre, for displacements in radii of the anchor."""
+        # A query with a large support spreads its Gaussians widely.
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
-        return state[CENTER][:, :, None] + r_BN1[:, :, None] * self.config.displacement(offsets)
+        return r_BN1[:, :, None] * displaced

@@ -267,8 +267,6 @@ class AxisScaledCenters(RadiusScaledCenters):
         return {**CENTER_FIELD, **shape_fields(config)}
 
     @full_precision
-    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
-        # Offsets are along the axes of the ellipsoid, in units of its radii.
-        displaced = self.config.displacement(offsets)
-        return state[CENTER][:, :, None] + displaced @ anchor_axes(state, self.config).mT
+    def steps(self, displaced: Tensor, state: QueryState) -> Tensor:
+        """Return steps from the centre, for displacements in radii along the ellipsoid's axes."""
+        return displaced @ anchor_axes(state, self.config).mT

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from pydantic import PositiveFloat, PositiveInt
 from qgs_locus.decoding import RadiusScaledCenters
-from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, radius_field, support_radius
+from qgs_locus.fields import RAW_RADIUS, RadiusOptions, radius_field, support_radius
 from qgs_locus.refinement import AnchorRefinement
 from torch import Tensor
 
@@ -52,17 +52,15 @@ class FootprintCenters(RadiusScaledCenters):
     def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
         return {**super().fields_read(config), **FRAME_FIELD, **FOOTPRINT_FIELD}
 
-    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """Return world-frame means (B, N, K, 3) for the head's raw offsets (B, N, K, 3)."""
-        count = offsets.shape[2]
+    def steps(self, displaced: Tensor, state: QueryState) -> Tensor:
+        """Return steps from the centre, for displacements in radii along the camera's axes."""
+        count = displaced.shape[2]
         size_BN2, rows_BN1 = state[FOOTPRINT].tensor_split([2], -1)
         rows = rows_BN1[0, 0, 0].round().long().clamp_max(count)
         rows = torch.where(rows > 0, rows, rows_in_square(count))
-        cell_BNK2 = size_BN2[:, :, None] * cells(count, rows, offsets)
-        steps_BNK3 = F.pad(cell_BNK2, (0, 1)) + self.config.displacement(offsets)
-        r_BN1 = support_radius(state[RAW_RADIUS], self.config)
-        steps_BNK3 = in_world(r_BN1[:, :, None] * steps_BNK3, state[FRAME])
-        return state[CENTER][:, :, None] + steps_BNK3
+        cell_BNK2 = size_BN2[:, :, None] * cells(count, rows, displaced)
+        steps_BNK3 = super().steps(F.pad(cell_BNK2, (0, 1)) + displaced, state)
+        return in_world(steps_BNK3, state[FRAME])
 
 
 class ColoredHead(GaussianHead):
