@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic_core import to_jsonable_python
@@ -16,7 +16,7 @@ from qgs.evaluate.plan import EvaluationPlan, read_index
 from qgs.files import write_text
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.recipe.errors import Origin, Problems
-from qgs.recipe.files import merge
+from qgs.recipe.files import merge, read_recipe
 from qgs.recipe.recipe import annotated, differing_options
 from qgs.recipe.yaml_text import dump, from_plain
 from qgs.train.folder import RunFolder
@@ -156,11 +156,16 @@ def composed(study: Study) -> dict[tuple[str, str], Recipe]:
     """
     problems = Problems("study")
     recipes: dict[str, Recipe] = {}
+    # A budget of steps removes the recipe's limit on seconds.
+    limits = {"seconds": None, **study.settings.budget.model_dump(exclude_none=True)}
+    # With an origin, because `qgs compose` shows who set the budget.
+    budget = from_plain({"training": limits}, Origin("the study's budget"))
     for name, node in study.variants.items():
         with _collected(problems, f"variants.{name}", node.origin):
             # A recipe has one seed, which each run replaces by its own.
-            recipe = resolve(node, [f"seed={study.settings.seeds[0]}"])
-            recipes[name] = _with_budget(study, with_absolute_path(recipe))
+            tree = merge(read_recipe(node, Problems()), budget)
+            recipe = resolve(tree, [f"seed={study.settings.seeds[0]}"])
+            recipes[name] = with_absolute_path(recipe)
     found = {(name, MAIN): recipe for name, recipe in recipes.items()}
     # Differences to a variant that cannot be composed are unknown.
     if len(recipes) == len(study.variants):
@@ -195,16 +200,6 @@ def _collected(problems: Problems, place: str, origin: Origin) -> Iterator[None]
         for found in error.problems:
             at = Origin(found.file, found.line) if found.line else origin
             problems.add(at, f"{place}: {found.option}", found.reason, found.fix, found.cause)
-
-
-def _with_budget(study: Study, recipe: Recipe) -> Recipe:
-    changes = study.settings.budget.model_dump()
-    if changes["steps"] is None:
-        del changes["steps"]
-    # With an origin, because `qgs compose` shows who set the budget.
-    tree = {**recipe.tree, "training": {**recipe.tree["training"], **changes}}
-    origins = {f"training.{name}": "the study's budget" for name in changes}
-    return replace(resolve(tree), provenance={**recipe.provenance, **origins})
 
 
 def _build(recipe: Recipe) -> None:
