@@ -281,13 +281,12 @@ def check_data(plan: Plan) -> None:
     """
     settings = plan.study.settings
     metrics = [settings.metric, *(h.metric for h in settings.hypotheses if h.metric)]
-    opened = set[str]()
-    for recipe in plan.recipes.values():
-        # Most variants share their data, and opening it takes seconds.
-        key = dump([recipe.tree[section] for section in ("data", "evaluation", "metrics")])
-        if key in opened:
-            continue
-        opened.add(key)
+    # Most variants share their data, and opening it takes seconds.
+    distinct = {
+        dump([recipe.tree[section] for section in ("data", "evaluation", "metrics")]): recipe
+        for recipe in plan.recipes.values()
+    }
+    for recipe in distinct.values():
         measures = Measures(recipe)
         # For example, the weights of LPIPS may be missing; after training it would be too late.
         unavailable = dict(measures.incomplete([]))
