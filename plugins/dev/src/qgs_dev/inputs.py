@@ -155,9 +155,12 @@ class Maker:
         """Return random offsets (B, N, K, 3)."""
         return self.normal("BNK3")
 
-    def cameras(self) -> Cameras:
-        """Return cameras side by side that look along z and slightly inwards."""
-        height, width = self.shape("HW")
+    def cameras(self, multiple: int = 1) -> Cameras:
+        """Return cameras side by side that look along z and slightly inwards.
+
+        multiple: number to whose multiples both sides of the images are rounded up.
+        """
+        height, width = (-(-side // multiple) * multiple for side in self.shape("HW"))
         scene = torch.arange(self.axes["B"])[:, None]
         view = torch.arange(self.axes["V"])
         # The views overlap. No two cameras are equal, because that would hide a mix-up.
@@ -182,18 +185,16 @@ class Maker:
 
     def memory(self) -> ImageMemory:
         """Return a random `ImageMemory` with one camera ray per patch of PATCH x PATCH pixels."""
-        height, width = self.shape("HW")
-        grid = (self.axes["V"], -(-height // PATCH), -(-width // PATCH))
+        # The image size need not be a multiple of PATCH; rays exist for whole patches only.
+        whole = self.cameras(PATCH)
+        grid = (self.axes["V"], whole.size[0] // PATCH, whole.size[1] // PATCH)
         dims = self.case.dims
         per_head = (math.prod(grid), dims.width // dims.heads)
-        # The image size need not be a multiple of PATCH; rays exist for whole patches only.
-        whole = Maker(self.case)
-        whole.axes = {**self.axes, "H": grid[1] * PATCH, "W": grid[2] * PATCH}
         return ImageMemory(
             keys=self.normal("Bh", *per_head),
             values=self.normal("Bh", *per_head),
             features=self.normal("B", math.prod(grid), memory_width(self.case)),
-            patch_rays=patch_rays(plucker_rays(whole.cameras()), PATCH),
+            patch_rays=patch_rays(plucker_rays(whole), PATCH),
             grid=grid,
         )
 
