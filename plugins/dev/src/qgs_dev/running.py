@@ -8,11 +8,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
-from qgs.contracts import Component, ComponentConfig, MissingExtraError, ModelComponent, ModelDims
+from qgs.contracts import Component, ComponentConfig, MissingExtraError, ModelComponent
 from qgs.recipe.registry import InstalledPlugin, PluginError, default_config, load_plugin
 from qgs.recipe.slots import SLOTS, summary_of
 from qgs.wording import did_you_mean
-from qgs_dev.case import SMALL, CannotCheck, Case, ContractError
+from qgs_dev.case import CannotCheck, Case, ContractError
 from qgs_dev.inputs import FACTS, data_file
 
 Tier = Literal["core", "construction", "extended"]
@@ -233,8 +233,7 @@ def cases_of(installed: InstalledPlugin) -> list[Case]:
         if getattr(type(example), "__component__", None) not in plugin.components:
             fault = f"{example!r} is not a Config of its components; give MyComponent.Config()"
             raise _unsound(installed, "examples", fault)
-    defaults = map(default_config, plugin.components)
-    configs = [config for config in defaults if config is not None]
+    configs = [*filter(None, map(default_config, plugin.components))]
     configs += [example for example in plugin.examples if example not in configs]
     return [_case(config) for config in configs]
 
@@ -286,7 +285,7 @@ def check_plugin(name: str, tiers: Iterable[Tier]) -> Iterator[CheckResult]:
 
 def _case(config: ComponentConfig) -> Case:
     """Return a case with as few decoder layers as the options allow."""
-    cases = [Case(config, ModelDims(SMALL.width, SMALL.heads, depth)) for depth in DEPTHS]
+    cases = [Case(config).with_dims(depth=depth) for depth in DEPTHS]
     return next((case for case in cases if _accepts(case)), cases[0])
 
 
