@@ -250,10 +250,10 @@ def _head_with(look: Fields) -> Any:
     """
 
     def forward(self: GaussianHead, state: QueryState) -> Any:
-        x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)
-        parts = {"sh": x_BNKD[..., :9].unflatten(-1, (3, 3)), "features": x_BNKD[..., :4]}
+        made = GaussianHead.forward(self, state)
+        parts = {"sh": torch.stack([made.offsets] * 3, -2), "features": made.quats}
         chosen = {name: x for name, x in parts.items() if f"gaussians.{name}" in look}
-        return replace(GaussianHead.forward(self, state), **chosen)
+        return replace(made, **chosen)
 
     return _given(GaussianHead, look, forward=forward)
 
