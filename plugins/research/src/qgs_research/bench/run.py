@@ -238,22 +238,21 @@ def measure_recipes(
         for name, workload in zip(names, works, strict=True)
     ]
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
-    for operation in operations if memory else ():
-        for entry, recipe, workload in zip(entries, recipes, works, strict=True):
+    for entry, recipe, workload in zip(entries, recipes, works, strict=True):
+        for operation in operations if memory else ():
             say(f"{entry['recipe']}: measuring memory of the {operation}")
             peak = asdict(peak_memory(recipe, operation, workload, torch.get_num_threads()))
             entry["memory"][operation] = peak
             first = entries[0]["memory"][operation]
             peak["ratio"] = peak["peak_bytes"] / first["peak_bytes"]
+        entry |= _sizes(recipe.build_model("meta"))
+        entry["flops"] = forward_flops(recipe, workload)
+        first = entries[0]["parameters"]
+        entry["parameters"]["ratio"] = entry["parameters"]["count"] / first["count"]
     if renderer:
         # The step comes last, because it changes the weights.
         operations.insert(1, "render")
     models = [recipe.build_model(work["device"]) for recipe in recipes]
-    for entry, recipe, workload, model in zip(entries, recipes, works, models, strict=True):
-        entry |= _sizes(model)
-        entry["flops"] = forward_flops(recipe, workload)
-        first = entries[0]["parameters"]
-        entry["parameters"]["ratio"] = entry["parameters"]["count"] / first["count"]
     for operation in operations:
         tasks = [*map(partial(make_task, operation), recipes, models, works)]
         say(f"measuring seconds of the {operation}")
