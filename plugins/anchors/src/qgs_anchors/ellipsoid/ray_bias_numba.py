@@ -6,6 +6,8 @@ and bias_min. A token is a column of nine numbers: moment m, direction d and uni
 of its ray. In the code, a vector is a tuple, and a matrix is a tuple of its rows.
 """
 
+from qgs_locus.kernels.ray_bias_numba import of_ray
+
 from qgs.kernels import ONE, TWO, ZERO, kernel
 from qgs.kernels.projection import combine, cross, dot, dots, plus, vector
 
@@ -31,12 +33,7 @@ def _query(row):
 @kernel
 def _ray(tokens, j):
     """Return moment m, direction d and unit direction d / |d| of ray j."""
-    # Not by `vector` of a slice, whose strides would keep the compiler from vectors of rays.
-    return (
-        (tokens[0, j], tokens[1, j], tokens[2, j]),
-        (tokens[3, j], tokens[4, j], tokens[5, j]),
-        (tokens[6, j], tokens[7, j], tokens[8, j]),
-    )
+    return of_ray(tokens, 0, j), of_ray(tokens, 3, j), of_ray(tokens, 6, j)
 
 
 @kernel

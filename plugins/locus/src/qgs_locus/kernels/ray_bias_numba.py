@@ -16,13 +16,16 @@ def _query(row):
 
 
 @kernel
+def of_ray(tokens, first, j):
+    """Return three numbers of ray j, from the number `first` on, as a vector."""
+    # Not by `vector` of a slice, whose strides would keep the compiler from vectors of rays.
+    return (tokens[first, j], tokens[first + 1, j], tokens[first + 2, j])
+
+
+@kernel
 def _ray(tokens, j):
     """Return moment m and direction d of ray j."""
-    # Not by `vector` of a slice, whose strides would keep the compiler from vectors of rays.
-    return (
-        (tokens[0, j], tokens[1, j], tokens[2, j]),
-        (tokens[3, j], tokens[4, j], tokens[5, j]),
-    )
+    return of_ray(tokens, 0, j), of_ray(tokens, 3, j)
 
 
 @kernel
