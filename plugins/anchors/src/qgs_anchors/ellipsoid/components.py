@@ -134,9 +134,9 @@ def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """
     converted = {name: _tripled(name, values) for name, values in weights.items()}
     converted["queries.raw_radii"] = converted.pop("queries.raw_radius")
-    # A ball has no orientation, so any rotation is right.
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).to(weights["queries.raw_radius"])
-    converted["queries.rotation"] = identity.repeat(len(weights["queries.raw_radius"]), 1)
+    # A ball has no orientation, so any rotation is right: the identity has w = 1.
+    w_N1 = torch.ones_like(weights["queries.raw_radius"])
+    converted["queries.rotation"] = F.pad(w_N1, (0, 3))
     return converted
 
 
