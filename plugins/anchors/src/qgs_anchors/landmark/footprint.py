@@ -114,10 +114,11 @@ class ColoredHead(GaussianHead):
 
     def forward(self, state: QueryState) -> GaussianAttributes:
         raw_BNC = at_least_float32(self.linear(self.norm(state.features)))
-        position, rgb, rest = raw_BNC.unflatten(-1, (-1, sum(CHANNELS))).tensor_split([3, 6], -1)
+        raw_BNKC = raw_BNC.unflatten(-1, (-1, sum(CHANNELS)))
         seen_BNK3 = state[COLORS].clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)
-        raw_BNKC = torch.cat([position, rgb + torch.atanh(2 * seen_BNK3 - 1), rest], -1)
-        found = self.activate(raw_BNKC)
+        # Colours come after the position.
+        start_BNKC = F.pad(torch.atanh(2 * seen_BNK3 - 1), (CHANNELS[0], sum(CHANNELS[2:])))
+        found = self.activate(raw_BNKC + start_BNKC)
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         return found.replace(scales=found.scales * r_BN1[:, :, None])
 
