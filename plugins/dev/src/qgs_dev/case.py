@@ -174,10 +174,9 @@ class Case:
     def lively(self, seed: int = 0) -> Any:
         """Return a new instance in evaluation mode, with random noise added to all parameters."""
         module = self.build(seed).eval()
-        generator = torch.Generator().manual_seed(seed + 1)
-        with torch.no_grad():
+        with seeded(seed + 1), torch.no_grad():
             for parameter in module.parameters():
-                parameter += NOISE * torch.randn(parameter.shape, generator=generator).to(parameter)
+                parameter += NOISE * torch.randn(parameter.shape).to(parameter)
         return module
 
     def with_at_most(self, **sizes: int) -> "Case":
