@@ -249,7 +249,7 @@ class ObservedQueries(Queries):
         config = self.config
         cameras = views.cameras
         z_BN1 = self._depth(nearness_BN1)
-        origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_N2)
+        origin_BN3, direction_BN13 = rays_at(cameras, view_N, place_N2[:, None])
         side = side_of(len(view_N), cameras.shape[1], cameras.size)
         # A footprint of s pixels is s z / f wide at depth z.
         focal_BN1 = cameras.intrinsics[:, view_N, :2].mean(-1, keepdim=True)
@@ -264,7 +264,7 @@ class ObservedQueries(Queries):
         )
         anchors = {
             # The direction has z = 1 in the camera, so z is a depth, not a distance.
-            CENTER: origin_BN3 + z_BN1 * direction_BN3,
+            CENTER: origin_BN3 + z_BN1 * direction_BN13[:, :, 0],
             RAW_RADIUS: raw_radii(radii_BN1, config),
             FRAME: cameras.c2w[:, view_N, :3, :3].mT,
             FOOTPRINT: shape_3.expand(*z_BN1.shape[:2], -1),

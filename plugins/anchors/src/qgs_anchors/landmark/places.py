@@ -182,14 +182,14 @@ def window(place_N2: Tensor, images_BV3HW: Tensor, side: float, samples: int) ->
     return place_N2[:, None] + step_P2
 
 
-def rays_at(cameras: Cameras, view_N: Tensor, place_N2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return world-frame origins and directions, each (B, N, 3), of rays through points of photos.
+def rays_at(cameras: Cameras, view_N: Tensor, place_NX2: Tensor) -> tuple[Tensor, Tensor]:
+    """Return world-frame origins (B, N, 3) and directions (B, N, X, 3) of rays through points.
 
-    Directions have z = 1 in the frame of their camera.
+    There are X points in each of N photos. Directions have z = 1 in the frame of their camera.
     """
     c2w_BN44 = cameras.c2w[:, view_N]
-    lens_BN4 = cameras.intrinsics[:, view_N]
-    pixel_N2 = place_N2.to(lens_BN4) * constant(cameras.size[::-1], lens_BN4)
-    slope_BN2 = (pixel_N2 - lens_BN4[..., 2:]) / lens_BN4[..., :2]
-    local_BN3 = F.pad(slope_BN2, (0, 1), value=1.0)
-    return c2w_BN44[..., :3, 3], torch.einsum("bnij,bnj->bni", c2w_BN44[..., :3, :3], local_BN3)
+    lens_BN14 = cameras.intrinsics[:, view_N, None]
+    pixel_NX2 = place_NX2.to(lens_BN14) * constant(cameras.size[::-1], lens_BN14)
+    slope_BNX2 = (pixel_NX2 - lens_BN14[..., 2:]) / lens_BN14[..., :2]
+    local_BNX3 = F.pad(slope_BNX2, (0, 1), value=1.0)
+    return c2w_BN44[..., :3, 3], torch.einsum("bnij,bnxj->bnxi", c2w_BN44[..., :3, :3], local_BNX3)

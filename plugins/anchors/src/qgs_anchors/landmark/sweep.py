@@ -57,11 +57,7 @@ def reprojected(
     points, divided by the photo's width and height. Returns positions in the second photo
     (B, N, D, P, 2), and whether each is in front of the camera and inside the photo.
     """
-    points = place_NP2.shape[1]
-    view_X = view_N.repeat_interleave(points)
-    origin_BX3, direction_BX3 = rays_at(cameras, view_X, place_NP2.flatten(0, 1))
-    origin_BN3 = origin_BX3[:, ::points]
-    direction_BNP3 = direction_BX3.unflatten(1, (-1, points))
+    origin_BN3, direction_BNP3 = rays_at(cameras, view_N, place_NP2)
     c2w_BN44 = cameras.c2w[:, other_N]
     lens_BN4 = cameras.intrinsics[:, other_N]
     turn_BN33 = c2w_BN44[..., :3, :3]
