@@ -31,15 +31,12 @@ def mismatch(
     color_B3NP = bilinear(views.images, view_N, place_NP2)
     # All other photos at once: torch.compile would make a graph for each length of a loop.
     photos = views.cameras.shape[1]
-    count = len(view_N)
-    other_X = (view_N + torch.arange(1, photos, device=view_N.device)[:, None]).flatten() % photos
-    view_X = view_N.repeat(photos - 1)
-    place_XP2 = place_NP2.repeat(photos - 1, 1, 1)
-    at_BXDP2, seen_BXDP = reprojected(views.cameras, view_X, other_X, place_XP2, depth_D)
-    found_B3XDP = bilinear(views.images, other_X, at_BXDP2.flatten(2, 3))
-    found_B3ANDP = found_B3XDP.unflatten(3, (-1, points**2)).unflatten(2, (photos - 1, count))
+    other_AN = (view_N + torch.arange(1, photos, device=view_N.device)[:, None]) % photos
     # Samples outside of the other photo do not count.
-    seen_BANDP = seen_BXDP.unflatten(1, (photos - 1, count))
+    at_BANDP2, seen_BANDP = reprojected(views.cameras, view_N, other_AN, place_NP2, depth_D)
+    at_BXY2 = at_BANDP2.flatten(3, 4).flatten(1, 2)
+    found_B3XY = bilinear(views.images, other_AN.flatten(), at_BXY2)
+    found_B3ANDP = found_B3XY.unflatten(3, (-1, points**2)).unflatten(2, other_AN.shape)
     error_BANDP = (found_B3ANDP - color_B3NP[:, :, None, :, None]).abs().mean(1)
     error_BAND = (error_BANDP * seen_BANDP).sum(-1) / seen_BANDP.sum(-1).clamp_min(1)
     counts_BAND = seen_BANDP.to(error_BAND).mean(-1) >= LEAST_SEEN
@@ -49,26 +46,26 @@ def mismatch(
 
 
 def reprojected(
-    cameras: Cameras, view_N: Tensor, other_N: Tensor, place_NP2: Tensor, depth_D: Tensor
+    cameras: Cameras, view_N: Tensor, other_AN: Tensor, place_NP2: Tensor, depth_D: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Project P points of a photo, each at D depths, into a second photo, for N pairs of photos.
+    """Project P points in each of N photos, each at D depths, into A other photos.
 
-    view, other: indices of the first and the second photo of each pair. place: x and y of the
-    points, divided by the photo's width and height. Returns positions in the second photo
-    (B, N, D, P, 2), and whether each is in front of the camera and inside the photo.
+    view, other: indices of the N photos, and of the other photos of each. place: x and y of the
+    points, divided by the photo's width and height. Returns positions in the other photos
+    (B, A, N, D, P, 2), and whether each is in front of the camera and inside the photo.
     """
     origin_BN3, direction_BNP3 = rays_at(cameras, view_N, place_NP2)
-    c2w_BN44 = cameras.c2w[:, other_N]
-    lens_BN4 = cameras.intrinsics[:, other_N]
-    turn_BN33 = c2w_BN44[..., :3, :3]
+    c2w_BAN44 = cameras.c2w[:, other_AN]
+    lens_BAN114 = cameras.intrinsics[:, other_AN, None, None]
+    turn_BAN33 = c2w_BAN44[..., :3, :3]
     # A point at depth z, divided by z, is the ray's direction + the step between cameras / z.
-    ray_BNP3 = direction_BNP3 @ turn_BN33
-    step_BN13 = (origin_BN3 - c2w_BN44[..., :3, 3])[:, :, None] @ turn_BN33
-    local = ray_BNP3[:, :, None] + step_BN13[:, :, None] / depth_D[:, None, None]
-    ahead_BNDP = local[..., 2] * depth_D[:, None] > LEAST_DEPTH
+    ray_BANP3 = direction_BNP3[:, None] @ turn_BAN33
+    step_BAN13 = (origin_BN3[:, None] - c2w_BAN44[..., :3, 3])[..., None, :] @ turn_BAN33
+    local = ray_BANP3[..., None, :, :] + step_BAN13[..., None, :, :] / depth_D[:, None, None]
+    ahead_BANDP = local[..., 2] * depth_D[:, None] > LEAST_DEPTH
     slope = local[..., :2] / local[..., 2:].clamp_min(LEAST_DEPTH / depth_D.max())
-    focal_BN2, middle_BN2 = lens_BN4[:, :, None, None].split(2, -1)
-    place_BNDP2 = (slope * focal_BN2 + middle_BN2) / constant(cameras.size[::-1], slope)
+    focal, middle = lens_BAN114.split(2, -1)
+    place_BANDP2 = (slope * focal + middle) / constant(cameras.size[::-1], slope)
     # Outside of a photo, sampling would return colours of its edge.
-    inside_BNDP = ((place_BNDP2 > 0) & (place_BNDP2 < 1)).all(-1)
-    return place_BNDP2, ahead_BNDP & inside_BNDP
+    inside_BANDP = ((place_BANDP2 > 0) & (place_BANDP2 < 1)).all(-1)
+    return place_BANDP2, ahead_BANDP & inside_BANDP
