@@ -191,12 +191,13 @@ def _expect_changes(trial: Trial, name: str, gradient: Tensor) -> None:
         along = 0.03 * gradient / gradient.norm().clamp_min(1e-12)
         moves = [along, *(move.expand_as(x) for move in moves)]
     if name == "cameras.c2w":
+        axes = torch.eye(3).to(x)
         motions = torch.zeros(6, 4, 4).to(x)
-        motions[[0, 1, 2], [0, 1, 2], 3] = 0.02
-        # Radians.
-        motions[[3, 4, 5], [2, 0, 1], [1, 2, 0]] = 0.02
-        motions[[3, 4, 5], [1, 2, 0], [2, 0, 1]] = -0.02
-        moves = [*motions]
+        motions[:3, :3, 3] = axes
+        # The cross product with an axis is the start of a turn about it.
+        motions[3:, :3, :3] = torch.linalg.cross(axes[None], axes[:, None])
+        # World units, and radians.
+        moves = [*0.02 * motions]
 
     def value(steps: Tensor) -> Tensor:
         move = torch.einsum("s,s...->...", steps.to(x), torch.stack(moves))
