@@ -94,8 +94,8 @@ def within(pixels, at, side):
 def test_colours_are_means_of_squares():
     images = torch.rand(2, 3, 3, 16, 24).double()
     for x, y, side in ((15, 7, 2), (23, 15, 2), (1, 1, 2), (8.4, 8, 3), (14.7, 6.4, 3)):
-        place = torch.tensor([x / 24, y / 16]).double().expand(3, 2)
-        found = colors_at(images, side, torch.arange(3), place)
+        place = torch.tensor([[[x / 24, y / 16]]] * 3).double()
+        found = colors_at(images, side, torch.arange(3), place).squeeze(2)
         shares = within(16, y, side)[:, None] * within(24, x, side) / side**2
         assert_close(found, (images * shares).sum((-1, -2)), rtol=0, atol=1e-6)
 

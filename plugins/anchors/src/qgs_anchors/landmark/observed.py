@@ -181,7 +181,8 @@ class ObservedQueries(Queries):
             view_N, place_N2, share_2 = spread(count, photos, size, aspect, device)
             # Several tokens of a tile start one query, so that it knows more than the centre.
             middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
-            view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
+            place_X2 = (place_N2[:, None] + share_2 * middle_S2).flatten(0, 1)
+            view_X = view_N.repeat_interleave(config.tokens)
             x_BXD = sampled(memory.features, memory.grid, view_X, place_X2) + self.slots
             x_BND, nearness_BN1 = self._joined(*self._swept(x_BXD, views, view_X, place_X2))
         return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_N2, share_2))
@@ -271,17 +272,11 @@ class ObservedQueries(Queries):
         }
         if config.cells is None:
             return anchors
-        view_X, place_X2 = _divided(view_N, place_N2, share_2 * cells(config.cells, rows, share_2))
+        place_NK2 = place_N2[:, None] + share_2 * cells(config.cells, rows, share_2)
         # The colour of a cell is the mean over its area, which its Gaussian covers.
-        colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_X2)
-        return anchors | {COLORS: colors.unflatten(1, (-1, config.cells))}
+        colors = colors_at(views.images, side / math.sqrt(config.cells), view_N, place_NK2)
+        return anchors | {COLORS: colors}
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Return each anchor as a ball of its support radius."""
         return ball_support(state[CENTER], support_radius(state[RAW_RADIUS], self.config))
-
-
-def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the points `place` + `step` (N * K, 2), and the indices of their photos (N * K,)."""
-    place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
-    return view_N.repeat_interleave(len(step_K2)), place_X2

@@ -164,22 +164,26 @@ def bilinear(maps_BVCHW: Tensor, view_N: Tensor, places: Tensor) -> Tensor:
 
 
 @full_precision
-def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_N2: Tensor) -> Tensor:
-    """Return mean RGB (B, N, 3) over squares of `side` pixels around points of photos.
+def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_NK2: Tensor) -> Tensor:
+    """Return mean RGB (B, N, K, 3) over squares of `side` pixels around K points of N photos.
 
     There is one sample per pixel, so the mean is exact if the side is a whole number. Beyond an
     edge of the photo, the pixels of the edge are repeated.
     """
-    places_NP2 = window(place_N2, images_BV3HW, side, max(1, math.ceil(side - EPS)))
-    return bilinear(images_BV3HW, view_N, places_NP2).mean(-1).mT
+    places_NKP2 = window(place_NK2, images_BV3HW, side, max(1, math.ceil(side - EPS)))
+    found_B3NX = bilinear(images_BV3HW, view_N, places_NKP2.flatten(1, 2))
+    return found_B3NX.unflatten(-1, places_NKP2.shape[1:3]).mean(-1).movedim(1, -1)
 
 
-def window(place_N2: Tensor, images_BV3HW: Tensor, side: float, samples: int) -> Tensor:
-    """Return P = samples * samples points (N, P, 2) of squares of `side` pixels around N points."""
+def window(places: Tensor, images_BV3HW: Tensor, side: float, samples: int) -> Tensor:
+    """Return P = samples * samples points (..., P, 2) of squares of `side` pixels around points.
+
+    places: points (..., 2).
+    """
     height, width = images_BV3HW.shape[-2:]
-    place_N2 = place_N2.to(images_BV3HW)
-    step_P2 = side * cells(samples**2, samples, place_N2) / constant([width, height], place_N2)
-    return place_N2[:, None] + step_P2
+    places = places.to(images_BV3HW)
+    step_P2 = side * cells(samples**2, samples, places) / constant([width, height], places)
+    return places[..., None, :] + step_P2
 
 
 def rays_at(cameras: Cameras, view_N: Tensor, place_NX2: Tensor) -> tuple[Tensor, Tensor]:
