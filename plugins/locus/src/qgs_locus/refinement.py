@@ -59,9 +59,8 @@ class AnchorRefinement(Refinement):
     def _head(self, channels: int) -> Mlp:
         mlp = Mlp(self.dims.width, self.dims.width, channels)
         # The first layer stays random: if both were zero, neither would get a gradient.
-        if self.config.zero_init:
-            nn.init.zeros_(mlp.fc2.weight)
-            nn.init.zeros_(mlp.fc2.bias)
+        for parameter in mlp.fc2.parameters() if self.config.zero_init else ():
+            nn.init.zeros_(parameter)
         return mlp
 
     @classmethod

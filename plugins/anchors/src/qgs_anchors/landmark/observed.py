@@ -129,8 +129,8 @@ class ObservedQueries(Queries):
         self.slots = nn.Parameter(torch.randn(config.per_token, dims.width) * config.std)
         self.depth_mlp = Mlp(dims.width, dims.width, config.sweep or 1)
         # With zero logits, every depth starts in the middle, or where the photos agree best.
-        nn.init.zeros_(self.depth_mlp.fc2.weight)
-        nn.init.zeros_(self.depth_mlp.fc2.bias)
+        for parameter in self.depth_mlp.fc2.parameters():
+            nn.init.zeros_(parameter)
         if config.sweep is not None:
             # As a logarithm, so that it stays positive.
             self.sharpness = nn.Parameter(torch.tensor(math.log(SHARPNESS)))
