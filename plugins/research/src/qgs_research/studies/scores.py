@@ -268,8 +268,8 @@ class Scores:
 
     def results_of(self, evaluation: str) -> list[StoredResults]:
         """Return all results of `evaluation` in one list: every model with every seed."""
-        parts = (runs for (_, of), runs in self.stored.items() if of == evaluation)
-        return [result for runs in parts for result in runs.values()]
+        models = self.models(evaluation)
+        return [result for name in models for result in self.stored[name, evaluation].values()]
 
     def unlike(self, terms: Terms) -> bool:
         """Return True if `terms` compares results of the same evaluation under different protocols.
