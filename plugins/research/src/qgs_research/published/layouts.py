@@ -76,17 +76,16 @@ def names_of(recipe: Recipe) -> Names:
 
 def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
     """Return one line for each component of `recipe` that a published codebase does not have."""
-    found: dict[str, None] = {}
-    types: dict[str, set[str]] = {}
-    for path, chosen in recipe.parts.items():
-        slot = path[-1]
-        if path[0] != "model" or slot not in layout.components:
-            continue
-        known = layout.components[slot]
-        types.setdefault(slot, set()).add(chosen.type)
-        if chosen.type not in known:
-            has = f"{layout.name} has {' or '.join(known)}"
-            found[f"{chosen.path} is {chosen.type}; {has}"] = None
+    known = layout.components
+    # Such as model.encoder: no loss or metric changes the weights.
+    parts = [x for path, x in recipe.parts.items() if path[0] == "model" and x.slot in known]
+    # A component of all layers is listed once.
+    found = dict.fromkeys(
+        f"{part.shown_path} is {part.type}; {layout.name} has {' or '.join(known[part.slot])}"
+        for part in parts
+        if part.type not in known[part.slot]
+    )
+    types = {slot: {part.type for part in parts if part.slot == slot} for slot in known}
     return list(found) + [
         f"decoder layers differ in their {slot} ({', '.join(sorted(several))})"
         for slot, several in types.items()
