@@ -21,13 +21,9 @@ model:
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
 
 
-def run_qgs(*words, **options):
-    return CliRunner().invoke(app, [*map(str, words)], **options)
-
-
-def typed(line):
-    """What a line without quotes gives."""
-    return run_qgs(*line.split())
+def run_qgs(line, *words, **options):
+    """What a line without quotes gives, and words with blanks behind it."""
+    return CliRunner().invoke(app, [*line.split(), *map(str, words)], **options)
 
 
 def done(*words):

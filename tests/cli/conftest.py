@@ -6,7 +6,7 @@ from reconstructing import checkpoint, photos
 
 __all__ = ["checkpoint", "photos"]
 
-RECIPE = "tiny/locus.yaml"
+LINE = "train tiny/locus.yaml --out"
 QUICK = sets(
     "data.image_size=[32, 32]",
     "views.targets=2",
@@ -19,12 +19,12 @@ QUICK = sets(
 
 @pytest.fixture(scope="session")
 def training():
-    """A function: train a tiny model for two steps into a folder, with these words more."""
-    return lambda out, *words: run_qgs("train", RECIPE, "--out", out, *QUICK, *words)
+    """A function: train a tiny model for two steps into a folder, and words more."""
+    return lambda line: run_qgs(f"{LINE} {line}", *QUICK)
 
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
     """What that printed and its folder, which no test changes."""
     out = tmp_path_factory.mktemp("trained") / "run"
-    return done("train", RECIPE, "--out", out, *QUICK).output, out
+    return done(LINE, out, *QUICK).output, out

@@ -34,7 +34,7 @@ def test_an_index_becomes_a_protocol_and_strict_evaluations_that_lack_a_scene_fa
     out = tmp_path / "out"
     entry = {"context": [0, 3], "target": [1, 2]}
     write_json(index, {"test/000001": entry, "absent": entry})
-    words = ("eval", trained[1], "--index", index, "--out", out)
+    words = (f"eval {trained[1]} --out {out} --index", index)
     done(*words)
     assert summary(out)["protocol"]["name"] == "two: rooms"
     content = read_json(out / "protocol.json")
@@ -47,7 +47,7 @@ def test_an_index_becomes_a_protocol_and_strict_evaluations_that_lack_a_scene_fa
 
 def test_other_settings_go_into_a_folder_of_their_own_and_are_told(run):
     before = contents(run)
-    done("eval", run, "--tune", 2, "--set", "evaluation.scenes=1", "--device", "cpu")
+    done(f"eval {run} --tune 2 --set evaluation.scenes=1 --device cpu")
     told = summary(run / "evaluation-2")
     assert told["tuning"]["steps"] == 2
     assert (told["scenes"], told["step"]) == (1, 2)
@@ -69,8 +69,8 @@ def test_a_metric_of_a_plugin_that_was_installed_later(run, tmp_path, install):
     install("mine", "mine", PLUGIN)
     out = tmp_path / "out"
     more = ("plugins=[mine]", "metrics.level.type=mine/mean")
-    words = [word for setting in more for word in ("--set", setting)]
-    done("eval", run / "checkpoint.safetensors", *words, "--out", out)
+    line = f"eval {run}/checkpoint.safetensors --out {out}"
+    done(" --set ".join((line, *more)))
     assert "level" in summary(out)["columns"]
     judged = resolve(resolve(run / "recipe.yaml").tree, ("training.steps=3", *more))
     result = resume(judged, run)
@@ -89,8 +89,8 @@ def test_other_weights_of_a_run_keep_its_evaluation(tmp_path):
 
 def test_settings_of_the_trained_model_are_refused(trained):
     for setting in ("training.steps=1", "model.feedback.rounds_more=1"):
-        words = ("eval", trained[1], "--set", setting)
-        must_refuse("would change the trained model", done, *words)
+        line = f"eval {trained[1]} --set {setting}"
+        must_refuse("would change the trained model", done, line)
 
 
 def test_tune_says_what_and_how_often():
@@ -111,7 +111,7 @@ def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path
     model.head.linear.bias.data.unflatten(0, (-1, 14))[:, 6:9] = 5.0
     domain = '{"samples": 4, "ranges": {"baseline": [0, 9]}}'
     qgs.save(model, tmp_path / "checkpoint.safetensors", extra={"trained_on": domain})
-    done("eval", tmp_path)
+    done(f"eval {tmp_path}")
     folder = tmp_path / "evaluation"
     remarks = summary(folder)["remarks"]
     for word in ("worse than a copy of the nearest", "within"):

@@ -33,7 +33,7 @@ def _in_a_folder_with_a_recipe(here, monkeypatch):
 
 
 def test_compose_prints_a_recipe_that_composes_again(tmp_path):
-    result = done("compose", "a.yaml", "--set", "model.queries.count=5")
+    result = done("compose a.yaml --set model.queries.count=5")
     assert "--set #1" in result.stdout
     assert "a.yaml:3" in result.stdout
     (tmp_path / "again.yaml").write_text(result.stdout)
@@ -96,8 +96,8 @@ def test_other_names_are_refused():
 
 
 def test_a_copy_brings_what_it_extends_and_overwrites_nothing():
-    words = ("recipes", "rooms/locus_64.yaml", "--out", "mine")
-    done(*words)
+    line = "recipes rooms/locus_64.yaml --out mine"
+    done(line)
     copies = sorted(path.name for path in Path("mine").rglob("*.*"))
     assert copies == ["budget_64.yaml", "locus.yaml", "locus_64.yaml", "tokengs.yaml"]
     copy = Path("mine/rooms/locus_64.yaml")
@@ -107,7 +107,7 @@ def test_a_copy_brings_what_it_extends_and_overwrites_nothing():
     copy.unlink()
     other = Path("mine/tiny/locus.yaml")
     other.write_text("mine")
-    must_refuse(None, done, *words, kind=FileExistsError)
+    must_refuse(None, done, line, kind=FileExistsError)
     assert other.read_text() == "mine"
     assert not copy.exists()
 

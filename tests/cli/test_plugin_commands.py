@@ -32,8 +32,8 @@ def offer(install):
 def test_it_is_listed_with_its_help_and_called(offer):
     offer("colours", "paint", APP.replace("Typer()", "Typer(help='Paint a scene.')"))
     assert "Paint a scene." in run_qgs("--help").output
-    assert run_qgs("paint", "first", "21").output == "twice 42\n"
-    assert "second" in run_qgs("paint", "--help").output
+    assert run_qgs("paint first 21").output == "twice 42\n"
+    assert "second" in run_qgs("paint --help").output
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_it_is_listed_with_its_help_and_called(offer):
 )
 def test_one_that_cannot_be_used_is_told_and_the_others_work(offer, code, reason):
     offer("colours", "paint", code)
-    error = must_refuse(r"the command `qgs paint` of colours 2\.1", done, "paint", "first")
+    error = must_refuse(r"the command `qgs paint` of colours 2\.1", done, "paint first")
     assert reason in str(error)
     done("--help")
 
@@ -55,9 +55,9 @@ def test_of_two_with_one_name_neither_runs_and_our_own_are_never_hidden(offer):
     offer("colours", "paint", APP)
     offer("more-colours", "paint", APP)
     reason = r"`qgs paint` of colours 2\.1, more-colours 2\.1"
-    must_refuse(reason, done, "paint", "first", "1")
+    must_refuse(reason, done, "paint first 1")
     offer("trains", "train", "raise RuntimeError")
-    assert "Recipe file" in run_qgs("train", "--help").output
+    assert "Recipe file" in run_qgs("train --help").output
     assert "trains" not in run_qgs("--help").output
 
 

@@ -15,9 +15,9 @@ import qgs
 from qgs.reconstruction.scenes import frame_list
 
 
-def written(*words, out):
+def written(line, *words, out):
     """The record of a run into `out`."""
-    done("reconstruct", *words, "--out", out)
+    done(f"reconstruct --out {out} {line}", *words)
     return record_of(out)
 
 
@@ -27,15 +27,15 @@ def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, 
     notes.write_text("mine")
     put(old, b"")
     for out, flags, word in (
-        (notes, (), "notes"),
-        (tmp_path, (), "--overwrite"),
-        (tmp_path, ("--overwrite",), "views"),
+        (notes, "", "notes"),
+        (tmp_path, "", "--overwrite"),
+        (tmp_path, "--overwrite", "views"),
     ):
-        must_refuse(word, written, checkpoint, photos, *flags, out=out, kind=FileExistsError)
+        line = f"{checkpoint} {photos} {flags}"
+        must_refuse(word, written, line, out=out, kind=FileExistsError)
         assert {*tmp_path.rglob("*")} == {notes, old.parent, old}
     (tmp_path / "gaussians.ply").touch()  # as an earlier result has it
-    words = ("--overwrite", "--set", "views.scale=auto")
-    record = written(checkpoint, photos, *words, out=tmp_path)
+    record = written(f"{line} --set views.scale=auto", out=tmp_path)
     assert notes.read_text() == "mine"
     assert not old.exists()
     assert PlyData.read(tmp_path / "gaussians.ply")["vertex"].count == 32
@@ -57,13 +57,13 @@ def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, 
 
 def test_photos_held_out_are_compared_with(checkpoint, photos, tmp_path, small_pictures):
     for options, compared in (HOLDOUTS | {"--frames 2,4": {3}}).items():
-        record = written(checkpoint, photos, *options.split(), "--overwrite", out=tmp_path)
+        record = written(f"{checkpoint} {photos} {options} --overwrite", out=tmp_path)
         assert {f for f, kind in kinds(record).items() if kind == "novel"} == compared, options
 
 
 def test_a_call_gives_what_the_command_gives(checkpoint, photos, tmp_path, small_pictures):
-    words = ("--frames", "0.png,images/4.png", "--holdout", "1, 3.png", "--set", "views.scale=auto")
-    record = written(checkpoint, photos, *words, out=tmp_path / "command")
+    line = f"{checkpoint} {photos} --frames 0.png,images/4.png --set views.scale=auto --holdout"
+    record = written(line, "1, 3.png", out=tmp_path / "command")
     assert [view["photo"] for view in record["views"]] == [f"images/{i}.png" for i in (0, 4, 1, 3)]
     chosen = {"frames": [0, "4.png"], "compare": [1, "3.png"], "overrides": ["views.scale=auto"]}
     result = qgs.reconstruct(qgs.load(checkpoint), photos, **chosen)
@@ -77,10 +77,10 @@ def test_a_call_gives_what_the_command_gives(checkpoint, photos, tmp_path, small
 def test_photos_of_the_training_are_not_called_novel(photos, tmp_path, small_pictures):
     """Of which 1 and 4 were held out."""
     file = saved(tmp_path / "own.safetensors", "qgs/photos", path=str(photos), holdout=3)
-    record = written(file, photos, "--set", "views.scale_factor=0.5", out=tmp_path / "default")
+    record = written(f"{file} {photos} --set views.scale_factor=0.5", out=tmp_path / "default")
     assert kinds(record) == {0: "input", 2: "input", 1: "novel"}
     assert record["to_photos"]["scale"] == 0.5
-    record = written(file, photos, "--frames", "0,6", "--holdout", "1,3", out=tmp_path / "named")
+    record = written(f"{file} {photos} --frames 0,6 --holdout 1,3", out=tmp_path / "named")
     assert kinds(record) == {0: "input", 6: "input", 1: "novel", 3: "seen in training"}
 
 
@@ -89,8 +89,8 @@ def test_the_data_of_a_plugin(checkpoint, tmp_path, install, small_pictures):
     tapes = tmp_path / "tapes"
     for name in "ab":
         tape_source.write_tape(tapes / f"{name}.tape")
-    words = ("--scene", "b", "--frames", "0,5", "--holdout", "1,2")
-    record = written(checkpoint, tapes, *words, out=tmp_path / "out")
+    line = f"{checkpoint} {tapes} --scene b --frames 0,5 --holdout 1,2"
+    record = written(line, out=tmp_path / "out")
     assert record["scene"] == "b"
     assert kinds(record) == {0: "input", 5: "input", 1: "novel", 2: "novel"}
 
@@ -99,7 +99,7 @@ def test_tuned_tokens_meet_the_inputs_better_and_are_told(
     checkpoint, photos, tmp_path, small_pictures
 ):
     # noise has no scale, and at some nothing is seen
-    tuning = written(checkpoint, photos, "--tune", 3, "--scale", 0.15, out=tmp_path)["tuning"]
+    tuning = written(f"{checkpoint} {photos} --tune 3 --scale 0.15", out=tmp_path)["tuning"]
     assert tuning["steps"] == 3
     assert tuning["loss_after"] < tuning["loss_before"]
     plain = qgs.reconstruct(qgs.load(checkpoint), photos, overrides=["views.scale_factor=0.15"])
@@ -127,5 +127,5 @@ SENSELESS = """
 
 def test_options_that_make_no_sense_are_refused(checkpoint, photos, tmp_path):
     for words, reason in rows(SENSELESS):
-        must_refuse(reason, written, checkpoint, photos, *words.split(), out=tmp_path / "out")
+        must_refuse(reason, written, f"{checkpoint} {photos} {words}", out=tmp_path / "out")
         assert not (tmp_path / "out").exists()

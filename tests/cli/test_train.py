@@ -27,21 +27,21 @@ def test_a_finished_run_is_left_as_it_is(training, trained):
     """By the same command, a new run in its folder and `qgs eval`."""
     _, run = trained
     before = contents(run)
-    assert training(run, "--resume").exit_code == 0
+    assert training(f"{run} --resume").exit_code == 0
     assert isinstance(training(run).exception, FileExistsError)
     assert contents(run) == before
-    done("eval", run)
+    done(f"eval {run}")
     assert all(path.read_bytes() == text for path, (text, _) in before.items())
 
 
 def test_a_signal_ends_with_its_number(training, tmp_path, monkeypatch):
     monkeypatch.setattr(TrainingProgress, "show", lambda *_: signal.raise_signal(signal.SIGTERM))
-    assert training(tmp_path / "run").exit_code == 128 + 15
+    assert training(f"{tmp_path}/run").exit_code == 128 + 15
     assert not (tmp_path / "run/evaluation").exists()
 
 
 def test_a_collapse_is_told_without_a_traceback(training, tmp_path):
-    result = training(tmp_path / "run", "--set", "model.head.opacity_bias=-20.0")
+    result = training(f"{tmp_path}/run --set model.head.opacity_bias=-20.0")
     assert result.exit_code == 1
     assert isinstance(result.exception, SystemExit)
     assert "training collapsed" in result.output
@@ -54,8 +54,8 @@ def test_what_is_missing_is_told_before_training(here):
         (("evaluation.index=null", "plugins=[rooms]", ROOMS), "runs/locus/dl3dv"),
     )
     for overrides, message in cases:
-        words = ("train", FINETUNE, "--out", "run", "--device", "cpu", *sets(*overrides))
-        must_not_find(message, done, *words)
+        line = f"train {FINETUNE} --out run --device cpu"
+        must_not_find(message, done, line, *sets(*overrides))
         assert not list(here.iterdir())
 
 

@@ -196,13 +196,13 @@ def test_other_files_are_refused_by_name(tmp_path):
 def test_convert_keeps_the_most_opaque(tmp_path):
     given = harmonic(50, 8)
     qgs.save_ply(given, tmp_path / "all.ply")
-    told = done("convert", tmp_path / "all.ply", tmp_path / "few.ply", "--count", 7).output
+    told = done(f"convert {tmp_path}/all.ply {tmp_path}/few.ply --count 7").output
     assert "7 of 50 Gaussians" in told
     few = load_ply(tmp_path / "few.ply")
     best = given.opacities[0].topk(7).indices.sort().values  # in the order of the file
     assert_close(few.means[0], given.means[0, best])
     assert torch.equal(few.sh[0], given.sh[0, best])
-    done("convert", tmp_path / "all.ply", tmp_path / "same.PLY")
+    done(f"convert {tmp_path}/all.ply {tmp_path}/same.PLY")
     assert torch.equal(load_ply(tmp_path / "same.PLY").means, given.means)
     assert given.most_opaque(99).count == 50
 
@@ -213,7 +213,7 @@ def test_other_suffixes_and_files_that_exist_are_refused(tmp_path):
         ("a.abc", ValueError, r"\.splat"),
         ("a.ply", FileExistsError, r"a\.ply"),
     ):
-        must_refuse(word, done, "convert", tmp_path / "a.ply", tmp_path / name, kind=error)
+        must_refuse(word, done, f"convert {tmp_path}/a.ply {tmp_path}/{name}", kind=error)
     assert (tmp_path / "a.ply").read_bytes() == before
 
 
@@ -235,15 +235,15 @@ def test_an_installed_distribution_adds_a_format(install, tmp_path):
 
 def test_a_format_that_cannot_be_imported_is_refused_before_the_work(install, tmp_path):
     install("qgs-xyz", "xyz", "import no_such_package", group="qgs.scene_writers")
-    missing = tmp_path / "missing.safetensors"  # not even read
-    words = ("reconstruct", missing, tmp_path, "--out", tmp_path / "a.xyz")
-    must_refuse(r"qgs-xyz 1\.2", done, *words, kind=ExtensionError)
+    # the model, which does not exist, is not even read
+    line = f"reconstruct {tmp_path}/missing.safetensors {tmp_path} --out {tmp_path}/a.xyz"
+    must_refuse(r"qgs-xyz 1\.2", done, line, kind=ExtensionError)
 
 
 def test_the_bytes_of_a_splat_file(tmp_path):
     given = cloud(300)
     qgs.save_ply(given, tmp_path / "scene.ply")
-    done("convert", tmp_path / "scene.ply", tmp_path / "scene.splat")
+    done(f"convert {tmp_path}/scene.ply {tmp_path}/scene.splat")
     read = np.frombuffer((tmp_path / "scene.splat").read_bytes(), "3f4,3f4,4u1,4u1")
     given = given[0][(given.scales.prod(-1) * given.opacities)[0].argsort(descending=True)]
     assert_array_equal(read["f0"], given.means)

@@ -105,7 +105,7 @@ def test_reports(monkeypatch) -> None:
     for installed, told in REPORTS:
         for module in ("qgs.recipe.registry", "qgs_dev.running"):
             monkeypatch.setattr(f"{module}.load_plugin", Mock(return_value=installed))
-        result = run_qgs("check-plugin", "mine", "--core")
+        result = run_qgs("check-plugin mine --core")
         head = f"plugin mine of qgs-mine 1.2, contract version {CONTRACT_VERSION}"
         lines = f"{result.output}exit code {result.exit_code}".splitlines()
         assert [*map(fnmatchcase, lines, (head + told).splitlines())] == [True] * len(lines), lines
@@ -134,7 +134,7 @@ def test_unsound_exemptions_are_refused() -> None:
 
 @pytest.mark.slow
 def test_locus_passes() -> None:
-    output = done("check-plugin", "locus").output
+    output = done("check-plugin locus").output
     assert "7 components" in output
     assert " 0 failed" in output
 

@@ -32,7 +32,7 @@ def _in_an_empty_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
-    done("new-plugin", "far-sighted")
+    done("new-plugin far-sighted")
     folder = tmp_path / "qgs-far-sighted"
     files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert files == {*WRITTEN.split()}
@@ -43,7 +43,7 @@ def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
 
 
 def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
-    run_qgs("new-plugin", "tidy")
+    run_qgs("new-plugin tidy")
     for command in (["check", "--select", "E,F,W,I,UP,B"], ["format", "--check"]):
         ruff = [sys.executable, "-m", "ruff", *command, "--no-cache", "qgs-tidy"]
         checked = subprocess.run(ruff, cwd=tmp_path, capture_output=True, text=True)
@@ -60,14 +60,14 @@ def test_names_that_are_taken_as_they_are() -> None:
 
 def test_names_that_are_refused(tmp_path: Path) -> None:
     names = ("Far Sighted", "../escape", "", "locus", "class", "torch")
-    errors = {name: run_qgs("new-plugin", "--", name).exception for name in names}
+    errors = {name: run_qgs("new-plugin --", name).exception for name in names}
     assert not [name for name, error in errors.items() if not isinstance(error, ValueError)]
     assert not list(tmp_path.iterdir())
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    assert isinstance(run_qgs("new-plugin", "wide", "--out", "mine").exception, FileExistsError)
+    assert isinstance(run_qgs("new-plugin wide --out mine").exception, FileExistsError)
     assert list(tmp_path.rglob("*")) == [tmp_path / "mine"]
 
 

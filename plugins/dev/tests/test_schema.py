@@ -75,7 +75,7 @@ recipe; seed; init_from
 def test_list_explains_options(monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     for name, *parts in rows(LISTED, "; "):
-        shown = done("list", name).output.replace("\N{BOX DRAWINGS LIGHT VERTICAL}", "|")
+        shown = done(f"list {name}").output.replace("\N{BOX DRAWINGS LIGHT VERTICAL}", "|")
         output = " ".join(shown.split())
         assert all(part in output for part in parts), output
         assert "qgs/mlp" not in output

@@ -28,7 +28,7 @@ from qgs.recipe import resolve
 
 @pytest.mark.slow
 def test_recipes_are_trained_compared_and_reported(tmp_path):
-    done("demo", "--train", *RECIPES, "--seconds", 1, "--out", tmp_path)
+    done(f"demo --seconds 1 --out {tmp_path} --train", *RECIPES)
     for name in ("tokengs", "locus"):
         for file in ("checkpoint.safetensors", "evaluation/summary.json"):
             assert (tmp_path / name / file).is_file()
@@ -65,7 +65,7 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
 ):
     photos = noisy_photos(here / "my photos", 12)
     shutil.copy(photos / "transforms.json", photos / "transforms_train.json")
-    shown = done("report", *models, "--photos", photos, "--scale", "0.5").output
+    shown = done("report --scale 0.5 --photos", photos, *models).output
     page = html.unescape(Path("report/report.html").read_text())
     notes = page.partition("<ul>")[2].partition("</ul>")[0]
     for remark in re.findall("<li>(.*)</li>", notes):
@@ -82,7 +82,7 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
     for _, name, model, place, *options in (reconstruct, view):
         assert model in models
         assert (place, options[:2]) == (str(photos), ["--scale", "0.5"])
-        known = done(name, "--help").output
+        known = done(f"{name} --help").output
         assert all(word in known for word in options if word.startswith("--"))
     assert refine[2:] == ["report/scene", str(photos)]
     done(*reconstruct[1:])
@@ -124,7 +124,7 @@ def test_a_comparison_has_more_windows_than_one_model(models, tmp_path):
 def test_two_photos_are_compared_with_themselves(models, tmp_path, small_pictures):
     photos = noisy_photos(tmp_path / "two", 2)
     out = tmp_path / "demo"
-    shown = done("demo", photos, "--model", models[0], "--out", out).output
+    shown = done(f"demo {photos} --model {models[0]} --out {out}").output
     assert "No other photo shows how good new views are" in shown
     assert (out / "report.html").exists()
 
@@ -164,7 +164,7 @@ def page(tmp_path_factory):
     steps = [{"step": n, "seconds": n / 2, "loss": 1 / n, "psnr": 10.0 + n} for n in range(1, 9)]
     (folder / RUN / "history.jsonl").write_text("\n".join(map(json.dumps, steps)))
     more = stand_in(folder / "more.safetensors", queries=12)
-    done("demo", "--model", folder / RUN, "--model", more, "--out", folder / "demo")
+    done(f"demo --model {folder}/{RUN} --model {more} --out {folder}/demo")
     return (folder / "demo/report.html").read_text()
 
 
@@ -221,7 +221,7 @@ def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path
     (result,) = opened([MODEL], room)
     (score,) = result.evaluation.scores
     (_, inputs, compared), found = next(iter(result.scales.items()))
-    done("reconstruct", MODEL, room, "--out", tmp_path / "out")
+    done(f"reconstruct {MODEL} {room} --out {tmp_path}/out")
     record = record_of(tmp_path / "out")
     assert record["to_photos"]["scale"] == pytest.approx(found.factor)
     assert record["to_photos"]["search"] == json.loads(json.dumps(asdict(found)))
@@ -242,10 +242,9 @@ def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path
 def test_a_scale_can_be_set(room, tmp_path):
     source = open_source(MODEL, photos=str(room), overrides=["views.scale=auto"])
     assert source.views.scale == "auto"
-    out = ("--out", tmp_path / "out")
-    for words in (
-        ("demo", room, "--model", MODEL, *out),
-        ("report", MODEL, "--photos", room, *out),
-        ("view", MODEL, room),
+    for line in (
+        f"demo {room} --model {MODEL} --out {tmp_path}/out",
+        f"report {MODEL} --photos {room} --out {tmp_path}/out",
+        f"view {MODEL} {room}",
     ):
-        must_refuse("--scale", done, *words, "--scale", "0")
+        must_refuse("--scale", done, line, "--scale", "0")

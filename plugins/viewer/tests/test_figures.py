@@ -12,7 +12,7 @@ from qgs_viewer.figures import DPI, WIDTH, grid, write_figure
 from qgs_viewer.queries import attention_pictures_of
 from qgs_viewer.sections import LAYERS, Detail, anchors, cross_attention, novel_views
 from small import PAIR, QUERIES, model_of, model_scenes_of
-from tables import names_in
+from tables import must_refuse, names_in
 from walk import SIDE
 
 import qgs
@@ -82,22 +82,21 @@ def test_figures_are_written_and_explained(tmp_path):
     model = tmp_path / "small.safetensors"
     rooms = ("data.image_size=[16, 16]", "data.test_scenes=2", "evaluation.scenes=2")
     qgs.save(model_of("locus", *rooms), model)
-    words = ["figures", model, "--device", "cpu", "--scene", "test/000001"]
+    line = f"figures {model} --device cpu --scene test/000001 --out {tmp_path}"
     out = tmp_path / "figures"
-    done(*words, "--out", out, "--only", "queries", "--only", "curves")
+    done(f"{line}/figures --only queries --only curves")
     assert names_in(out) == {"queries.pdf", "queries.png", "figures.md"}
     text = (out / "figures.md").read_text()
     assert "![queries](queries.png)" in text
     assert "curves is left out" in text
     assert "test/000001" in text
-    for wrong in (["--out", out], ["--scene", "other"], ["--query", QUERIES]):
-        with pytest.raises((ValueError, FileExistsError)):
-            done(*words, "--out", tmp_path / "new", *wrong)
+    for wrong in (f"--out {out}", "--scene other", f"--query {QUERIES}"):
+        must_refuse(None, done, f"{line}/new {wrong}", kind=(ValueError, FileExistsError))
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow
 def test_all_figures_of_the_models_in_the_box(tmp_path):
     out = tmp_path / "figures"
-    done("figures", "rooms/tokengs-64", "rooms/locus-64", "--out", out)
+    done(f"figures rooms/tokengs-64 rooms/locus-64 --out {out}")
     assert {file.stem for file in out.glob("*.pdf")} == {*FigureName}

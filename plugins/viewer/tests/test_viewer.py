@@ -214,35 +214,36 @@ def opened(monkeypatch):
     return found
 
 
-def view(*words):
-    return done("view", *words, "--device", "cpu").output
+def view(line):
+    return done(f"view {line} --device cpu").output
 
 
 def test_it_opens_the_browser_unless_told_not_to(ply, opened):
-    told = view(ply, "--port", 0)
+    told = view(f"{ply} --port 0")
     assert [address in told for address in opened] == [True]
-    view(ply, "--port", 0, "--no-open")
+    view(f"{ply} --port 0 --no-open")
     assert len(opened) == 1
 
 
 def test_a_page_shows_the_query_that_was_asked_for(opened, tmp_path):
     model, plain, picked, none = (tmp_path / name for name in ("m.safetensors", *"abc"))
     qgs.save(model_of("locus", "data.image_size=[16, 16]"), model)
-    view(model, "--html", plain)
-    for where in (["--html", picked], ["--port", 0]):
-        view(model, *where, "--query", 3)
+    view(f"{model} --html {plain}")
+    for where in (f"--html {picked}", "--port 0"):
+        view(f"{model} {where} --query 3")
     assert picked.read_text() != plain.read_text()
-    for where in (["--html", none], ["--port", 0]):
-        must_refuse(f"--query {QUERIES}", view, model, *where, "--query", QUERIES)
+    query = f"--query {QUERIES}"
+    for where in (f"--html {none}", "--port 0"):
+        must_refuse(query, view, f"{model} {where} {query}")
     assert not none.exists()
 
 
 def test_a_page_never_replaces_a_file(ply, opened, tmp_path):
     page = tmp_path / "page.html"
-    view(ply, "--html", page)
+    line = f"{ply} --html {page}"
+    view(line)
     page.write_text("mine")
-    with pytest.raises(FileExistsError):
-        view(ply, "--html", page)
+    must_refuse(None, view, line, kind=FileExistsError)
     assert page.read_text() == "mine"
     assert not opened
 

@@ -93,7 +93,7 @@ def test_an_evaluation_sets_the_number_of_rounds(tmp_path, kind):
         file = tmp_path / f"{made}.safetensors"
         out = tmp_path / f"{made}{asked}"
         qgs.save(built(*rooms, *kind, f"model.feedback.rounds={made}"), file)
-        done("eval", file, "--set", f"model.feedback.rounds={asked}", "--out", out)
+        done(f"eval {file} --set model.feedback.rounds={asked} --out {out}")
         return (out / "scenes.csv").read_text()
 
     assert scores(2, 1) == scores(1, 1) != scores(2, 2)

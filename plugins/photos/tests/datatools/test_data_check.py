@@ -3,11 +3,11 @@
 import re
 import shutil
 
-from commands import typed
+from commands import run_qgs
 
 
 def run(words):
-    result = typed(f"data check {words}")
+    result = run_qgs(f"data check {words}")
     return result.output, result.exit_code
 
 

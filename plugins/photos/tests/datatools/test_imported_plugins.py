@@ -3,7 +3,7 @@
 import re
 import sys
 
-from commands import typed
+from commands import run_qgs
 from qgs_photos.datatools.candidates import sources
 
 ALL = {
@@ -37,11 +37,11 @@ def test_commands_import_the_plugins_that_are_asked_for(install, here):
     imported = []
     for words in (*ALL, *SOME):
         sources.cache_clear()
-        typed(words)
+        run_qgs(words)
         if sys.modules.pop("_test_marked", None):
             imported.append(words)
     sources.cache_clear()
     assert imported == [*ALL]
     for command in ALL.values():
-        words = re.findall(r"\w+", typed(f"{command} --help").output)
+        words = re.findall(r"\w+", run_qgs(f"{command} --help").output)
         assert re.search("imports every|plugins are imported", " ".join(words))

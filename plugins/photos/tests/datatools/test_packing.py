@@ -201,7 +201,7 @@ def test_an_interrupted_packing_goes_on(six, tmp_path):
 
 
 def command(words):
-    return done("data", "pack", *words.split()).output
+    return done(f"data pack {words}").output
 
 
 def test_the_command(six, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import photo_formats
 import pytest
 import tape_source
-from commands import typed
+from commands import run_qgs
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools.candidates import sources
 from tape_source import Tape
@@ -24,13 +24,13 @@ def tapes(tmp_path, install):
 
 def test_check(tapes):
     commands = [f"data check {tapes} --quick --format {kind}" for kind in ("auto", "tapes/tape")]
-    for good in map(typed, commands):
+    for good in map(run_qgs, commands):
         assert good.exit_code == 0, good.output
         assert "2 scenes, 0 errors" in good.output
-    refused = str(typed(f"data check {tapes} --format rooms/procedural").exception)
+    refused = str(run_qgs(f"data check {tapes} --format rooms/procedural").exception)
     assert refused.startswith("there is no format 'rooms/procedural': use one of auto, nerfstudio")
     tape_source.write_tape(tapes / "b.tape", np.nan)
-    for bad in map(typed, commands):
+    for bad in map(run_qgs, commands):
         assert bad.exit_code == 1
         assert "error: b, frames 0-5 (0 to 5): the pose has NaN" in bad.output
 
@@ -38,7 +38,7 @@ def test_check(tapes):
 def test_missing_images_are_told_and_counted(tapes, monkeypatch):
     monkeypatch.setattr(Tape, "missing", ("2.png", "4.png"))
     (tapes / "index.json").write_text('{"a": {"context": [0, 6], "target": [2]}}')
-    output = typed(f"data check {tapes} --quick").output
+    output = run_qgs(f"data check {tapes} --quick").output
     assert re.search("a +tapes/tape +8 +6 +2 ", output)
     assert (
         "error: a: listed images that do not exist: 2.png, 4.png; the numbers of later frames in "
@@ -60,14 +60,14 @@ def test_a_source_that_fails_is_told_and_the_others_go_on(tapes, monkeypatch):
 
         with monkeypatch.context() as patch:
             patch.setattr(Tape, method, fails)
-            output = typed(f"data check {tapes} --quick").output
+            output = run_qgs(f"data check {tapes} --quick").output
         assert f"error: {line}" in output
         assert re.search("b +tapes/tape +6 +6 +0 ", output)
         assert "2 scenes, 1 error" in output
 
 
 def test_pack(tapes):
-    packed = typed(f"data pack {tapes} --out {tapes}/chunks --set image_size=[16,16]")
+    packed = run_qgs(f"data pack {tapes} --out {tapes}/chunks --set image_size=[16,16]")
     assert packed.exception is None, packed.output
     scenes = photo_formats.opened(tapes / "chunks", (16, 16), ChunksSource).scenes("train")
     told = [(scene.name, len(scene), scene.held_out) for scene in scenes]

@@ -46,7 +46,7 @@ def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
     before = contents(tmp_path)
     wrong = {}
     for source in given.iterdir():
-        error = run_qgs("poses", source, "--out", tmp_path / "out").exception
+        error = run_qgs(f"poses --out {tmp_path}/out", source).exception
         if type(error) is not PosesError or "\n" in str(error) or (tmp_path / "out").exists():
             wrong[source.name] = error
     assert not wrong
@@ -56,13 +56,13 @@ def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
 def test_what_cannot_be_written_is_named(walk, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     for out in (tmp_path / "file/out", "/proc/out"):
-        assert isinstance(run_qgs("poses", walk, "--out", out).exception, OSError)
+        assert isinstance(run_qgs(f"poses --out {out}", walk).exception, OSError)
 
     def full(*rest):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(making, "prepare", full)
-    assert "free space" in str(run_qgs("poses", walk, "--out", tmp_path / "out").exception)
+    assert "free space" in str(run_qgs(f"poses --out {tmp_path}/out", walk).exception)
 
 
 @pytest.mark.slow

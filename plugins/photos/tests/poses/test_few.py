@@ -96,7 +96,7 @@ def test_two_photos_without_a_pose_are_refused(found, pixels, reason):
 def test_two_photos_get_poses_and_a_blank_one_none(images, shots, tmp_path):
     blank = np.full_like(images[0], 127)
     write_photos(tmp_path / "two", [images[3], images[5], blank])
-    shown = run_qgs("poses", tmp_path / "two", "--threads", 1).output
+    shown = run_qgs(f"poses {tmp_path}/two --threads 1").output
     assert "2 of 3 photos have poses" in shown
     assert "times their longer side" in shown
     assert_close(tmp_path / "two_poses", [shots[3], shots[5]])

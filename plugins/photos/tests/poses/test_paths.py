@@ -6,7 +6,7 @@ import av
 import numpy as np
 import pytest
 import torch
-from commands import done, run_qgs, typed
+from commands import done, run_qgs
 from photo_formats import noisy_photos, row_of_frames
 from PIL import Image, ImageSequence
 from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, seen_depth, write_film
@@ -131,14 +131,14 @@ def test_the_command_films(made, tmp_path):
     save_ply(wall(3.0), tmp_path / "scene.ply")
     out = tmp_path / "a.mp4"
     film = f"{tmp_path} {made[0]} --out {out} --path walk --seconds 0.4 --rate 5 --size 32x48"
-    done("video", *film.split())
+    done(f"video {film}")
     assert len(frames(out)) == 2
     for refused, error in (
         (f"{tmp_path}", ValueError),
         ("nothing", FileNotFoundError),
         (film.replace("a.mp4", "b.mp4").replace("walk", "walks"), ValueError),
     ):
-        assert isinstance(typed(f"video {refused}").exception, error)
+        assert isinstance(run_qgs(f"video {refused}").exception, error)
 
 
 def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path):
@@ -146,7 +146,7 @@ def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path):
     phone = tmp_path / "phone.mp4"
     phone.write_bytes(b"mine")
     for film, error in (("phone.mp4", FileExistsError), ("a.gif", ValueError)):
-        result = run_qgs("video", tmp_path / "none", "--out", tmp_path / film)
+        result = run_qgs(f"video {tmp_path}/none --out {tmp_path}/{film}")
         assert type(result.exception) is error, film
     assert [*tmp_path.iterdir()] == [phone]
     assert phone.read_bytes() == b"mine"
@@ -166,8 +166,8 @@ def test_a_film_shows_what_the_reconstruction_renders_of_the_photos_world(tmp_pa
     write_json(path, listed)
     film = tmp_path / "film.mp4"
     made = tmp_path / "made"
-    done("reconstruct", checkpoint, photos, "--out", made, "--inputs", 2, "--scale", 2)
-    done("video", made, "--out", film, "--path", path)
+    done(f"reconstruct {checkpoint} {photos} --out {made} --inputs 2 --scale 2")
+    done(f"video {made} --out {film} --path {path}")
 
     scene = reconstruct(qgs.load(checkpoint), photos, inputs=2, overrides=scale_settings(2.0))
     c2w, focal = read_path(path, (480, 480))

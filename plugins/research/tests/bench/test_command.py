@@ -2,7 +2,7 @@
 
 import re
 
-from commands import typed
+from commands import run_qgs
 from qgs_research.bench import run
 from tables import read_json
 
@@ -14,7 +14,7 @@ SMALL = f"--size 16x24 --device cpu --rounds 3 --warmup 0 --set {' --set '.join(
 
 
 def bench(words):
-    return typed(f"bench {words} {SMALL}")
+    return run_qgs(f"bench {words} {SMALL}")
 
 
 def test_recipes_are_compared_with_the_first(tmp_path, monkeypatch):

@@ -180,10 +180,10 @@ def test_the_command_lists_every_tensor_and_setting(tmp_path):
     out = tmp_path / "made/c.safetensors"
     save_file(LOCUS, weights)
     option = "model.head.scale_cap=0.1"
-    told = run_qgs("import", weights, "--recipe", "auto", "--out", out, "--set", option).output
+    told = run_qgs(f"import {weights} --recipe auto --out {out} --set {option}").output
     assert "LocusGS (leo-frank/LocusGS): 109 tensors used" in told
     assert "  enc_dec_backbone.decoder_blocks.1.gs_cross_attn.tau_sample\n" in told
     assert "model.head.scale_cap: 0.1 (LocusGS: 0.075)" in told
     again = tmp_path / "again.safetensors"
-    run_qgs("import", weights, "--recipe", out.with_suffix(".yaml"), "--out", again)
+    run_qgs(f"import {weights} --recipe {out.with_suffix('.yaml')} --out {again}")
     assert qgs.load(again).recipe == qgs.load(out).recipe

@@ -85,9 +85,9 @@ def test_two_runs_compare_scene_by_scene(tmp_path):
     means = []
     for run in runs:
         folder = run / "evaluation"
-        done("eval", f"rooms/{run.name}", "--set", "evaluation.scenes=2", "--out", folder)
+        done(f"eval rooms/{run.name} --set evaluation.scenes=2 --out {folder}")
         means.append(read_json(folder / "summary.json")["model"]["psnr"])
-    assert "95 % interval" in done("compare", *runs, "--out", tmp_path).output
+    assert "95 % interval" in done(f"compare --out {tmp_path}", *runs).output
     table = read_json(tmp_path / "comparison.json")["table"]
     apart = next(row["difference"] for row in table if row["variant"] == str(runs[1]))
     assert apart["mean"] == pytest.approx(means[1] - means[0])

@@ -63,13 +63,13 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
     assert "2 seeds x 4 scenes" in (out / "table.md").read_text()
 
     study.write_text(study.read_text().replace("seeds: [0, 1]", "seeds: [0, 1, 2]"))
-    told = done("study", study, "--out", out, "--only", 4, "--device", "cpu").output
+    told = done(f"study {study} --out {out} --only 4 --device cpu").output
     assert "6 runs, 2 missing" in told
     assert begun(out) == {**runs, "locus/seed-2": 1}
 
     changed = study.read_text().replace("qgs/content}", "locus/ray_biased, bandwidth: fixed}")
     study.write_text(changed)
-    must_refuse("`flat`", done, "study", study, "--out", out, "--workers", 0)
+    must_refuse("`flat`", done, f"study {study} --out {out} --workers 0")
 
 
 def trained(plan, workers):
@@ -101,7 +101,7 @@ def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted
     assert not first.log.exists()
     assert second.log.read_text() == "threads 1 ['cpu', '', 'more']\n"
     assert Results(plan).failed == [first]
-    done("slurm", "study", study, "--out", plan.folder)
+    done(f"slurm study {study} --out {plan.folder}")
     assert "#SBATCH --array=1,2,3\n" in (plan.folder / "slurm.sh").read_text()
 
 

@@ -12,23 +12,23 @@ RECIPE = "tiny/locus.yaml"
 
 
 def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(here):
-    words = ("slurm", "train", RECIPE, *sets("training.workers=3", "training.batch_size=8"))
-    done(*words, "--gpus", 2, "--out", "my runs/a", "--threads", 2)
+    line = f"slurm train {RECIPE}"
+    more = sets("training.workers=3", "training.batch_size=8")
+    done(line, *more, "--gpus", 2, "--out", "my runs/a", "--threads", 2)
     script = (here / "my runs/a.slurm.sh").read_text()
     assert "--cpus-per-task=10\n#SBATCH --gpus-per-node=2\n" in script
     assert f"cd {here} || exit\n" in script
     assert f"--output='{here}/my runs/a.slurm-%j.log'\n" in script
     assert "training.batch_size=8 --out 'my runs/a' --threads 2 --resume & job=$!\n" in script
-    must_refuse(r"training\.batch_size", done, *words, "--out", "b", "--gpus", 3)
+    must_refuse(r"training\.batch_size", done, f"{line} --out b --gpus 3", *more)
     must_not_find(
         "nowhere",
         done,
-        *words,
-        "--out",
-        "b",
+        f"{line} --out b",
+        *more,
         *sets("data={type: qgs/photos, path: nowhere}"),
     )
-    assert run_qgs(*words, "--out", "b", "--gpu", 2).exit_code == 2
+    assert run_qgs(f"{line} --out b --gpu 2", *more).exit_code == 2
     assert names_in(here) == {"my runs"}
 
 
@@ -48,7 +48,7 @@ def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
         "training={seconds: null, steps: 300, save_every: 0, batch_size: 2}",
         "optimizer.warmup=1",
     )
-    done("slurm", "train", RECIPE, "--out", out, "--gpus", 2, "--device", "cpu", *words)
+    done(f"slurm train {RECIPE} --out {out} --gpus 2 --device cpu", *words)
     stub = tmp_path / "bin/scontrol"
     stub.parent.mkdir()
     stub.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')

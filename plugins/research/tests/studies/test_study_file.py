@@ -172,7 +172,7 @@ def test_hypotheses_are_sums_that_weigh_alike():
 
 def test_the_studies_that_are_shown_can_be_copied(tmp_path):
     """As they are, but for the recipe that docs/studies.md calls the reader's own."""
-    lines = [line.rstrip() for line in done("study", "--help").output.splitlines()]
+    lines = [line.rstrip() for line in done("study --help").output.splitlines()]
     example = re.search(r"^ {5}study: 1\n( {5}.*\n)+", "\n".join(lines), re.MULTILINE)
     shown = {"help": [textwrap.dedent(example[0])]}
     (tmp_path / "mine.yaml").write_text("recipe: 1\nextends: tiny/locus.yaml\nmodel: {width: 96}\n")
