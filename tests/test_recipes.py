@@ -11,19 +11,17 @@ from pathlib import Path
 import jsonschema
 import pytest
 import yaml
+from fuzzing.cases import EVERY, RECIPES
 from guide_pages import text_of
 from published.files import read_golden
 from published.splats import model_of
 from qgs_research.studies.plan import composed, differences, planned
 from qgs_research.studies.study import read_study
-from size import ROOT
 from tables import read_json
 
 from qgs.recipe import resolve
 
-RECIPES = ROOT / "recipes"
 IS_VALID = jsonschema.Draft202012Validator(read_json(RECIPES / "recipe.schema.json")).is_valid
-EVERY = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
 STUDIES = [file for file in EVERY if file.startswith("studies/")]
 FILES = [file for file in EVERY if file not in STUDIES]
 OVERLAYS = (
@@ -124,7 +122,7 @@ def as_published(file, wanted):
     count = parameters(file, *[f"model.queries.count={N}"] * few)
     kept = {f"has {wanted} parameters, not {count:,}": f"{count:,}" == wanted}
     if golden := file.startswith("ablations/") and ABLATIONS.get(Path(file).stem):
-        released = read_golden(ROOT / f"tests/golden/locus_{golden}_a.safetensors")
+        released = read_golden(RECIPES.parent / f"tests/golden/locus_{golden}_a.safetensors")
         theirs = structure(model_of(released).recipe["model"])
         kept["is the released variant"] = structure(recipe(file).tree["model"]) == theirs
     return kept

@@ -18,6 +18,8 @@ import torch
 import yaml
 
 RECIPES = Path(__file__).parents[2] / "recipes"
+EVERY = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
+"""Shipped recipes, by their paths in `RECIPES`."""
 SECONDS = 60
 BYTES = 2 * 10**9
 LONGEST_MESSAGE = 100_000

@@ -12,7 +12,7 @@ from pathlib import Path
 from random import choice, randrange
 from typing import Any
 
-from fuzzing.cases import RECIPES, TABLES, FaultError, Use, refused
+from fuzzing.cases import EVERY, RECIPES, TABLES, FaultError, Use, refused
 from qgs.contracts import MissingExtraError
 from qgs.recipe import PluginError, RecipeError, resolve
 from qgs.recipe.recipe import annotated, flat
@@ -21,8 +21,7 @@ from qgs.recipe.slots import SLOTS
 
 PARTS = ("finetune/dl3dv", "rooms/budget", "studies/")
 """Prefixes of recipe files that are not complete recipes."""
-FOUND = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
-OPTIONS = {name: flat(resolve(RECIPES / name).tree) for name in FOUND if not name.startswith(PARTS)}
+OPTIONS = {name: flat(resolve(RECIPES / name).tree) for name in EVERY if not name.startswith(PARTS)}
 REGISTRY = load_usable_plugins()[0]
 TYPES = sorted(kind for slot in SLOTS for kind in REGISTRY.components(slot))
 YAML = TABLES["yaml"].splitlines()
