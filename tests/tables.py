@@ -11,6 +11,7 @@ from rich.console import Console
 from torch.testing import assert_close
 
 assert_equal = partial(assert_close, rtol=0, atol=0)
+"""To the bit, or within `atol`, however large the numbers are."""
 assert_near = partial(assert_allclose, rtol=1e-6)
 """Of a tensor and numbers."""
 
