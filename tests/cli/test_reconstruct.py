@@ -1,5 +1,7 @@
 """`qgs reconstruct` as a user types it: files, photos that are used, what is refused."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import tape_source
@@ -15,30 +17,30 @@ import qgs
 from qgs.reconstruction.scenes import frame_list
 
 
-def written(line, *words, out):
+def written(out, line, *words):
     """The record of a run into `out`."""
     done(f"reconstruct --out {out} {line}", *words)
-    return record_of(out)
+    return record_of(Path(out))
 
 
-def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, tmp_path):
-    notes = tmp_path / "notes.ply"
-    old = tmp_path / "views/00099_novel.png"
+def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, here):
+    notes = here / "notes.ply"
+    old = here / "views/00099_novel.png"
     notes.write_text("mine")
     put(old, b"")
     for out, flags, word in (
         (notes, "", "notes"),
-        (tmp_path, "", "--overwrite"),
-        (tmp_path, "--overwrite", "views"),
+        (".", "", "--overwrite"),
+        (".", "--overwrite", "views"),
     ):
         line = f"{checkpoint} {photos} {flags}"
-        must_refuse(word, written, line, out=out, kind=FileExistsError)
-        assert {*tmp_path.rglob("*")} == {notes, old.parent, old}
-    (tmp_path / "gaussians.ply").touch()  # as an earlier result has it
-    record = written(f"{line} --set views.scale=auto", out=tmp_path)
+        must_refuse(word, written, out, line, kind=FileExistsError)
+        assert {*here.rglob("*")} == {notes, old.parent, old}
+    Path("gaussians.ply").touch()  # as an earlier result has it
+    record = written(".", f"{checkpoint} {photos} --overwrite --set views.scale=auto")
     assert notes.read_text() == "mine"
     assert not old.exists()
-    assert PlyData.read(tmp_path / "gaussians.ply")["vertex"].count == 32
+    assert PlyData.read("gaussians.ply")["vertex"].count == 32
     assert kinds(record) == {2: "input", 4: "input", 3: "novel"}
     chosen = "inputs images/2.png, images/4.png, compared with images/3.png; 1 of 7 photos held out"
     assert record["remarks"][-1].startswith(chosen)
@@ -49,62 +51,58 @@ def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, 
         centre = np.array(view["c2w"])[:3, 3] / back["scale"]
         world = back["reference_c2w"] @ np.array([*centre, 1])
         np.testing.assert_allclose(world, [0.1 * view["frame"], 0, 0, 1], atol=1e-6)
-    assert Image.open(tmp_path / "views/00003_novel.png").size == (36, 16)
-    assert Image.open(tmp_path / "depth/00004_input.png").size == (16, 16)
-    assert Image.open(tmp_path / "overview.png").size[0] > 500
-    assert Image.open(tmp_path / "orbit.gif").n_frames == len(record["orbit"])
+    assert Image.open("views/00003_novel.png").size == (36, 16)
+    assert Image.open("depth/00004_input.png").size == (16, 16)
+    assert Image.open("overview.png").size[0] > 500
+    assert Image.open("orbit.gif").n_frames == len(record["orbit"])
 
 
-def test_photos_held_out_are_compared_with(checkpoint, photos, tmp_path, small_pictures):
+def test_photos_held_out_are_compared_with(checkpoint, photos, here, small_pictures):
     for options, compared in (HOLDOUTS | {"--frames 2,4": {3}}).items():
-        record = written(f"{checkpoint} {photos} {options} --overwrite", out=tmp_path)
+        record = written(here, f"{checkpoint} {photos} {options} --overwrite")
         assert {f for f, kind in kinds(record).items() if kind == "novel"} == compared, options
 
 
-def test_a_call_gives_what_the_command_gives(checkpoint, photos, tmp_path, small_pictures):
+def test_a_call_gives_what_the_command_gives(checkpoint, photos, here, small_pictures):
     line = f"{checkpoint} {photos} --frames 0.png,images/4.png --set views.scale=auto --holdout"
-    record = written(line, "1, 3.png", out=tmp_path / "command")
+    record = written("command", line, "1, 3.png")
     assert [view["photo"] for view in record["views"]] == [f"images/{i}.png" for i in (0, 4, 1, 3)]
     chosen = {"frames": [0, "4.png"], "compare": [1, "3.png"], "overrides": ["views.scale=auto"]}
     result = qgs.reconstruct(qgs.load(checkpoint), photos, **chosen)
-    for file in result.save(tmp_path / "call"):
-        by_command = tmp_path / "command" / file.name
+    for file in result.save("call"):
+        by_command = Path("command", file.name)
         assert file.is_dir() or file.read_bytes() == by_command.read_bytes(), file
-    own = qgs.load_ply(tmp_path / "call/gaussians.ply")
+    own = qgs.load_ply("call/gaussians.ply")
     torch.testing.assert_close(own.means, result.gaussians.means)  # in the model's world
 
 
-def test_photos_of_the_training_are_not_called_novel(photos, tmp_path, small_pictures):
+def test_photos_of_the_training_are_not_called_novel(photos, here, small_pictures):
     """Of which 1 and 4 were held out."""
-    file = saved(tmp_path / "own.safetensors", "qgs/photos", path=str(photos), holdout=3)
-    record = written(f"{file} {photos} --set views.scale_factor=0.5", out=tmp_path / "default")
+    file = saved("own.safetensors", "qgs/photos", path=str(photos), holdout=3)
+    record = written("default", f"{file} {photos} --set views.scale_factor=0.5")
     assert kinds(record) == {0: "input", 2: "input", 1: "novel"}
     assert record["to_photos"]["scale"] == 0.5
-    record = written(f"{file} {photos} --frames 0,6 --holdout 1,3", out=tmp_path / "named")
+    record = written("named", f"{file} {photos} --frames 0,6 --holdout 1,3")
     assert kinds(record) == {0: "input", 6: "input", 1: "novel", 3: "seen in training"}
 
 
-def test_the_data_of_a_plugin(checkpoint, tmp_path, install, small_pictures):
+def test_the_data_of_a_plugin(checkpoint, here, install, small_pictures):
     install(*tape_source.INSTALLED)
-    tapes = tmp_path / "tapes"
     for name in "ab":
-        tape_source.write_tape(tapes / f"{name}.tape")
-    line = f"{checkpoint} {tapes} --scene b --frames 0,5 --holdout 1,2"
-    record = written(line, out=tmp_path / "out")
+        tape_source.write_tape(here / f"tapes/{name}.tape")
+    record = written("out", f"{checkpoint} tapes --scene b --frames 0,5 --holdout 1,2")
     assert record["scene"] == "b"
     assert kinds(record) == {0: "input", 5: "input", 1: "novel", 2: "novel"}
 
 
-def test_tuned_tokens_meet_the_inputs_better_and_are_told(
-    checkpoint, photos, tmp_path, small_pictures
-):
+def test_tuned_tokens_meet_the_inputs_better_and_are_told(checkpoint, photos, here, small_pictures):
     # noise has no scale, and at some nothing is seen
-    tuning = written(f"{checkpoint} {photos} --tune 3 --scale 0.15", out=tmp_path)["tuning"]
+    tuning = written("out", f"{checkpoint} {photos} --tune 3 --scale 0.15")["tuning"]
     assert tuning["steps"] == 3
     assert tuning["loss_after"] < tuning["loss_before"]
     plain = qgs.reconstruct(qgs.load(checkpoint), photos, overrides=["views.scale_factor=0.15"])
     assert plain.tuning is None
-    assert not torch.allclose(qgs.load_ply(tmp_path / "gaussians.ply").means, plain.gaussians.means)
+    assert not torch.allclose(qgs.load_ply("out/gaussians.ply").means, plain.gaussians.means)
 
 
 def test_photos_that_are_not_there_are_refused(photos):
@@ -125,7 +123,7 @@ SENSELESS = """
 """
 
 
-def test_options_that_make_no_sense_are_refused(checkpoint, photos, tmp_path):
+def test_options_that_make_no_sense_are_refused(checkpoint, photos, here):
     for words, reason in rows(SENSELESS):
-        must_refuse(reason, written, f"{checkpoint} {photos} {words}", out=tmp_path / "out")
-        assert not (tmp_path / "out").exists()
+        must_refuse(reason, written, "out", f"{checkpoint} {photos} {words}")
+    assert not [*here.iterdir()]

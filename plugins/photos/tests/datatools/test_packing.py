@@ -2,6 +2,7 @@
 
 import io
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import photo_formats
@@ -82,23 +83,23 @@ def kinds(tmp_path_factory):
 
 
 @pytest.fixture
-def six(tmp_path):
+def six(here):
     """A source of scenes s0, s1 ... of two photos."""
     for number in range(6):
-        photos(tmp_path / f"scenes/s{number}", frames=2)
-    return source(tmp_path / "scenes")
+        photos(here / f"scenes/s{number}", frames=2)
+    return source("scenes")
 
 
-def test_chunks_read_as_their_source_does(kinds, tmp_path):
+def test_chunks_read_as_their_source_does(kinds, here):
     before = source(kinds, background=(0.2, 0.5, 0.9))
-    result = pack(before, tmp_path)
+    result = pack(before, here)
     count = len(KEPT) + len(CHANGED)
     assert result.scenes == {"train": count, "test": 0}
     assert (result.frames, result.kept) == (4 * count, 4 * len(KEPT))
     for split in ("train", "test"):  # the same scenes, for their held-out frames
-        same(before, packed(tmp_path), split=split)
+        same(before, packed(here), split=split)
 
-    entries = torch.load(tmp_path / "train/000000.torch", weights_only=True)
+    entries = torch.load("train/000000.torch", weights_only=True)
     entries = {entry["key"]: entry for entry in entries}
     for kind in KEPT:
         file = kinds / f"{kind}/images/2.png"
@@ -111,13 +112,13 @@ def test_chunks_read_as_their_source_does(kinds, tmp_path):
     assert_close(cameras[3, 6:].reshape(3, 4) @ c2w, torch.eye(4)[:3])
 
 
-def test_copies_of_copies_read_alike_at_urls_resized_and_as_jpeg(kinds, tmp_path):
+def test_copies_of_copies_read_alike_at_urls_resized_and_as_jpeg(kinds, here):
     before = source(kinds)
     for url, encoding, tolerance in (
-        (f"memory://packed{tmp_path}", None, 0),
-        (f"file://{tmp_path}/same", None, 0),
-        (f"{tmp_path}/png", packing.Encoding(resized=True), 0),
-        (f"{tmp_path}/jpeg", packing.Encoding(resized=True, jpeg=90), 0.5),
+        (f"memory://packed{here}", None, 0),
+        (f"file://{here}/same", None, 0),
+        ("png", packing.Encoding(resized=True), 0),
+        ("jpeg", packing.Encoding(resized=True, jpeg=90), 0.5),
     ):
         pack(before, url, encoding)
         before = packed(UPath(url))
@@ -127,13 +128,13 @@ def test_copies_of_copies_read_alike_at_urls_resized_and_as_jpeg(kinds, tmp_path
         assert (image.format, image.size) == ("JPEG", (32, 24))
 
 
-def test_chunks_are_bounded_in_size_and_order_is_kept(six, tmp_path):
-    one_scene = 2 * (tmp_path / "scenes/s0/images/0.png").stat().st_size
-    pack(six, tmp_path / "chunks", chunk_bytes=int(2.5 * one_scene))
-    after = packed(tmp_path / "chunks")
+def test_chunks_are_bounded_in_size_and_order_is_kept(six):
+    one_scene = 2 * Path("scenes/s0/images/0.png").stat().st_size
+    pack(six, "chunks", chunk_bytes=int(2.5 * one_scene))
+    after = packed("chunks")
     assert list(after.names("train")) == [f"s{i}" for i in range(6)]
     assert list(map(list, after.groups("train"))) == [[0, 1], [2, 3], [4, 5]]
-    files = (tmp_path / "chunks/train").glob("*.torch")
+    files = Path("chunks/train").glob("*.torch")
     assert all(file.stat().st_size < 2.5 * one_scene + 20_000 for file in files)
 
 
@@ -144,16 +145,16 @@ def test_named_scenes_are_for_testing(six):
     must_refuse(absent, packing.chosen_splits, six, ["s1", "gone"])
 
 
-def test_what_is_there_is_never_overwritten(six, tmp_path):
-    put(tmp_path / "notes/a.txt", b"mine")
-    pack(six, tmp_path / "chunks")
+def test_what_is_there_is_never_overwritten(six):
+    put(Path("notes/a.txt"), b"mine")
+    pack(six, "chunks")
     for folder, held in (("notes", r"not empty \(a\.txt\)"), ("chunks", "never overwrites")):
-        must_refuse(held, pack, six, tmp_path / folder, kind=FileExistsError)
+        must_refuse(held, pack, six, folder, kind=FileExistsError)
 
 
-def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path):
-    out = tmp_path / "chunks"
-    image = tmp_path / "scenes/s3/images/1.png"
+def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six):
+    out = Path("chunks")
+    image = Path("scenes/s3/images/1.png")
     whole = image.read_bytes()
     image.write_bytes(whole[:200])
     must_refuse(
@@ -162,26 +163,26 @@ def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path
     assert not list(out.rglob("index.json"))
     must_refuse(r"other settings .*'chunk_bytes': 1", pack, six, out, chunk_bytes=2)
 
-    result = pack(six, tmp_path / "others", leave_out_broken=True)
+    result = pack(six, "others", leave_out_broken=True)
     assert result.scenes["train"] == 5
     assert "images/1.png" in result.left_out["s3"]
     must_refuse(
         "no scene to pack: s3: ",
         pack,
-        source(tmp_path / "scenes/s3"),
-        tmp_path / "none",
+        source("scenes/s3"),
+        "none",
         leave_out_broken=True,
     )
 
     image.write_bytes(whole)
-    six = source(tmp_path / "scenes")
+    six = source("scenes")
     result = pack(six, out, chunk_bytes=1)
     assert (result.scenes["train"], result.resumed, result.frames) == (6, 2, 8)
     same(six, packed(out))
 
 
-def test_an_interrupted_packing_goes_on(six, tmp_path):
-    out = tmp_path / "chunks"
+def test_an_interrupted_packing_goes_on(six):
+    out = Path("chunks")
     for last in range(1, 4):
 
         def interrupted(scene, last=last):
@@ -204,26 +205,24 @@ def command(words):
     return done(f"data pack {words}").output
 
 
-def test_the_command(six, tmp_path):
-    out = tmp_path / "out"
-    small = tmp_path / "small"
-    told = command(f"{tmp_path}/scenes --out {out} --test-every 3 --set holdout=0")
+def test_the_command(six):
+    told = command("scenes --out out --test-every 3 --set holdout=0")
     assert "scenes: 4 train, 2 test; images of this run: 12, of which 12 copied" in told
-    assert packed(out).scenes("train")[0].held_out == ()
-    assert list(packed(out).names("test")) == ["s2", "s5"]
-    told = command(f"{out} --out {small} --image-size 8 12 --jpeg 80")
+    assert packed("out").scenes("train")[0].held_out == ()
+    assert list(packed("out").names("test")) == ["s2", "s5"]
+    told = command("out --out small --image-size 8 12 --jpeg 80")
     assert "2 test; images of this run: 12, of which 0 copied unchanged and 12 enc" in told
-    assert packed(small, size=(8, 12)).scenes("test")[0].stored_size(0) == (8, 12)
+    assert packed("small", size=(8, 12)).scenes("test")[0].stored_size(0) == (8, 12)
 
 
-def test_the_command_packs_the_data_of_a_recipe(tmp_path):
-    recipe = tmp_path / "recipe.yaml"
+def test_the_command_packs_the_data_of_a_recipe(here):
+    recipe = here / "recipe.yaml"
     recipe.write_text(
         "recipe: 1\nplugins: [rooms]\n"
         "data: {type: rooms/procedural, scenes: 2, test_scenes: 1, views_per_scene: 2, "
         "image_size: [16, 16]}\n"
     )
-    command(f"{recipe} --out {tmp_path}/chunks")
-    after = packed(tmp_path / "chunks", size=(16, 16))
+    command(f"{recipe} --out chunks")
+    after = packed("chunks", size=(16, 16))
     for split in ("train", "test"):
         same(resolve(recipe).build_data(), after, 1e-6, split)
