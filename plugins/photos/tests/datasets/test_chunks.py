@@ -1,6 +1,7 @@
 import math
 import zipfile
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import photo_formats
@@ -13,6 +14,9 @@ from qgs_photos.datasets.chunks import ChunksSource
 from small_parts import Code
 from tables import assert_equal, assert_near, must_not_find, must_refuse, write_json
 from upath import UPath
+
+INDEX = Path("train/index.json")
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def encoded(color, size=(64, 36)):
@@ -32,27 +36,27 @@ def record(key, frames=4, **extra):
     return entry(key, (0.5, 0.9, 0.45, 0.55), map(pose, range(frames)), images) | extra
 
 
-def write(folder, **chunks):
+def write(folder=".", **chunks):
     """Chunks, by their names without the suffix."""
     for name, records in chunks.items():
-        save(folder / f"{name}.torch", records)
+        save(Path(folder, f"{name}.torch"), records)
 
 
-def data_set(path):
+@pytest.fixture
+def data_set(here):
     """With an index of the scenes for training."""
-    write(path / "train", a=[record("s0"), record("s1", 7)], b=[record("s2")])
-    write(path / "test", a=[record("t0")])
+    write("train", a=[record("s0"), record("s1", 7)], b=[record("s2")])
+    write("test", a=[record("t0")])
     index = {"s0": "a.torch", "s1": "a.torch", "s2": "b.torch"}
-    write_json(path / "train/index.json", index)
+    write_json(INDEX, index)
 
 
-opened = partial(photo_formats.opened, size=(16, 16), source=ChunksSource)
-first = partial(photo_formats.scene, size=(16, 16), source=ChunksSource)
+opened = partial(photo_formats.opened, path=".", size=(16, 16), source=ChunksSource)
+first = partial(photo_formats.scene, path=".", size=(16, 16), source=ChunksSource)
 
 
-def test_frames_and_cameras(tmp_path):
-    data_set(tmp_path)
-    source = opened(tmp_path)
+def test_frames_and_cameras(data_set):
+    source = opened()
     assert source.names("train") == ["s0", "s1", "s2"]
     assert source.names("test") == ["t0"]
     scene = source.scenes("train")[1]
@@ -70,57 +74,53 @@ def test_frames_and_cameras(tmp_path):
     assert scene.masks([0]) is None
 
 
-def test_listing_opens_no_chunk(tmp_path):
-    data_set(tmp_path)
-    (tmp_path / "train/b.torch").write_bytes(b"nothing")
-    source = opened(tmp_path)
+def test_listing_opens_no_chunk(data_set):
+    Path("train/b.torch").write_bytes(b"nothing")
+    source = opened()
     assert len(source.scenes("train")) == 3
     scene = source.scenes("train")[2]
     must_refuse(r"b\.torch cannot be read as a torch file", getattr, scene, "cameras")
 
 
-def test_held_out_frames_serve_where_there_are_no_test_chunks(tmp_path):
-    write(tmp_path / "train", a=[record("s0")])
-    assert opened(tmp_path).names("test") == []
-    assert opened(tmp_path, holdout=3).scenes("test")[0].held_out == (1,)
-    write(tmp_path / "test", a=[record("t0")])
-    assert opened(tmp_path, holdout=3).names("test") == ["t0"]
+def test_held_out_frames_serve_where_there_are_no_test_chunks():
+    write("train", a=[record("s0")])
+    assert opened().names("test") == []
+    assert opened(holdout=3).scenes("test")[0].held_out == (1,)
+    write("test", a=[record("t0")])
+    assert opened(holdout=3).names("test") == ["t0"]
 
 
-def test_without_an_index_and_split_folders_the_chunks_are_read(tmp_path, caplog):
-    write(tmp_path, a=[record("s0")], b=[record("s1")])
-    assert opened(tmp_path).names("train") == ["s0", "s1"]
-    assert opened(tmp_path, max_scenes=1).names("train") == ["s0"]
+def test_without_an_index_and_split_folders_the_chunks_are_read(caplog):
+    write(a=[record("s0")], b=[record("s1")])
+    assert opened().names("train") == ["s0", "s1"]
+    assert opened(max_scenes=1).names("train") == ["s0"]
     assert "has no index.json" in caplog.text
-    write(tmp_path, c=[record("s1")])
-    must_refuse(r"'s1' is in b\.torch and in c\.torch", opened, tmp_path)
+    write(c=[record("s1")])
+    must_refuse(r"'s1' is in b\.torch and in c\.torch", opened)
 
 
-def test_missing_chunks_and_short_scenes_are_counted_and_named(tmp_path, caplog):
-    data_set(tmp_path)
-    (tmp_path / "train/b.torch").unlink()
-    source = opened(tmp_path, min_frames=5)
+def test_missing_chunks_and_short_scenes_are_counted_and_named(data_set, caplog):
+    Path("train/b.torch").unlink()
+    source = opened(min_frames=5)
     assert "1 of 3 scenes" in caplog.text
     assert "s2 (b.torch)" in caplog.text
     assert source.names("train") == ["s1"]
     assert "fewer than 5 frames (min_frames) and are left out: s0 (4)" in caplog.text
-    (tmp_path / "train/a.torch").unlink()
-    must_not_find("none of their chunks exists", opened, tmp_path)
+    Path("train/a.torch").unlink()
+    must_not_find("none of their chunks exists", opened)
 
 
-def test_legacy_files_are_read_whole(tmp_path):
-    data_set(tmp_path)
-    torch.save([record("s2")], tmp_path / "train/b.torch", _use_new_zipfile_serialization=False)
-    assert not zipfile.is_zipfile(tmp_path / "train/b.torch")
-    assert opened(tmp_path).scenes("train")[2].images([2])[0, 0, 0, 0] * 255 == pytest.approx(20)
+def test_legacy_files_are_read_whole(data_set):
+    torch.save([record("s2")], "train/b.torch", _use_new_zipfile_serialization=False)
+    assert not zipfile.is_zipfile("train/b.torch")
+    assert opened().scenes("train")[2].images([2])[0, 0, 0, 0] * 255 == pytest.approx(20)
 
 
-def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
-    data_set(tmp_path)
-    photo_formats.assert_travels(opened(tmp_path))
+def test_scenes_travel_to_other_processes_without_open_files(data_set):
+    photo_formats.assert_travels(opened())
 
 
-def test_masks_names_sizes_and_backgrounds(tmp_path):
+def test_masks_names_sizes_and_backgrounds():
     mask = np.repeat([[0], [255]], [18, 18], 0).repeat(64, 1).astype(np.uint8)
     extra = {
         "masks": [as_tensor(photo_formats.encoded(mask)), torch.empty(0).byte()],
@@ -128,8 +128,8 @@ def test_masks_names_sizes_and_backgrounds(tmp_path):
         "sizes": torch.tensor([[36, 64], [36, 36]]),
         "names": ["a/0.jpg", "b.jpg"],
     }
-    write(tmp_path, a=[record("s0", 2, **extra)])
-    scene = first(tmp_path, background=(0.2, 0.4, 0.6))
+    write(a=[record("s0", 2, **extra)])
+    scene = first(background=(0.2, 0.4, 0.6))
     masks = scene.masks([0, 1])
     assert masks[0, 0, [0, 15], 3].tolist() == [0, 1]
     assert_equal(masks[1], torch.ones(1, 16, 16))
@@ -165,13 +165,13 @@ tests/data/test_photos.py has the other poses that the same function refuses.
 """
 
 
-def all_images(path):
-    scene = first(path)
+def all_images():
+    scene = first()
     return scene.images(range(len(scene.cameras.c2w)))
 
 
-def test_broken_chunks_are_told(tmp_path):
-    (tmp_path / "index.json").write_text('{"s0": "a.torch"}')
+def test_broken_chunks_are_told():
+    Path("index.json").write_text('{"s0": "a.torch"}')
     cases = [
         ({"key": "s0"}, "dict"),
         ([1], "'key'"),
@@ -180,14 +180,14 @@ def test_broken_chunks_are_told(tmp_path):
     ]
     cases += [([record("s0", **extra)], f"scene 's0'{told}") for extra, told in BROKEN]
     for records, message in cases:
-        write(tmp_path, a=records)
-        must_refuse(rf"a\.torch.*{message}", all_images, tmp_path)
+        write(a=records)
+        must_refuse(rf"a\.torch.*{message}", all_images)
 
 
 HUGE = torch.zeros(1, dtype=torch.uint8).expand(10**12)
 
 
-def test_a_small_file_does_not_fill_the_memory(tmp_path):
+def test_a_small_file_does_not_fill_the_memory():
     for name, value in (
         ("images", [HUGE]),
         ("masks", [HUGE] * 4),
@@ -197,35 +197,33 @@ def test_a_small_file_does_not_fill_the_memory(tmp_path):
         ("cameras", torch.zeros(4, 18).to_sparse()),
         ("cameras", torch.zeros(4, 18, device="meta")),
     ):
-        write(tmp_path, a=[record("s0", **{name: value})])
-        assert (tmp_path / "a.torch").stat().st_size < 20_000
+        write(a=[record("s0", **{name: value})])
+        assert Path("a.torch").stat().st_size < 20_000
         reason = rf"\A.*a\.torch: scene 's0': '{name}' holds a tensor.*\Z"
-        must_refuse(reason, all_images, tmp_path)
+        must_refuse(reason, all_images)
 
 
-def test_an_index_does_not_lead_outside(tmp_path):
-    data_set(tmp_path)
-    outside = ("../test/a.torch", str(tmp_path / "test/a.torch"), "c:\\a.torch", "a/../../b", "")
+def test_an_index_does_not_lead_outside(data_set):
+    outside = ("../test/a.torch", f"{Path.cwd()}/test/a.torch", "c:\\a.torch", "a/../../b", "")
     for name in (*outside, "\\a", "a\\..\\..\\b", "C:a"):
-        write_json(tmp_path / "train/index.json", {"s0": name})
-        must_refuse("outside the folder", opened, tmp_path)
-    (tmp_path / "train/index.json").write_text("[1]")
-    must_refuse("must map each scene's key", opened, tmp_path)
+        write_json(INDEX, {"s0": name})
+        must_refuse("outside the folder", opened)
+    INDEX.write_text("[1]")
+    must_refuse("must map each scene's key", opened)
 
 
-def test_folders_that_are_not_there(tmp_path):
-    absent = tmp_path / "nothing"
+def test_folders_that_are_not_there():
     empty = "holds no chunks.*qgs data pack"
-    must_not_find("does not exist", opened, absent)
-    must_not_find(empty, opened, tmp_path)
-    must_refuse("cannot be opened as a path or URL", opened, "nosuch://bucket")
+    must_not_find("does not exist", opened, path="nothing")
+    must_not_find(empty, opened)
+    must_refuse("cannot be opened as a path or URL", opened, path="nosuch://bucket")
 
 
-def test_code_in_a_chunk_is_not_run_nor_advised(tmp_path):
-    file = tmp_path / "0.torch"
+def test_code_in_a_chunk_is_not_run_nor_advised():
+    file = Path("0.torch")
     torch.save([Code()], file)
     for content in (file.read_bytes(), file.read_bytes()[:300], b""):
         file.write_bytes(content)
         reason = r"0\.torch cannot be read as a torch file"
         assert "trust" not in str(must_refuse(reason, load_chunk, UPath(file)))
-    must_not_find(r"1\.torch", load_chunk, UPath(tmp_path / "1.torch"))
+    must_not_find(r"1\.torch", load_chunk, UPath("1.torch"))

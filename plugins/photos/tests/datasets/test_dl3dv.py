@@ -2,6 +2,7 @@ import json
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import photo_formats
 import pytest
@@ -11,6 +12,8 @@ from PIL import Image
 from qgs_photos.datasets.dl3dv import Dl3dvSource, read_scene_list
 from tables import assert_equal, assert_near, must_not_find, must_refuse, rows
 from upath import UPath
+
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def photo(number, size=(32, 18)):
@@ -30,6 +33,7 @@ def scene_files(inside="", images="images_4", **top):
 
 def write(path, files):
     """An archive or a folder, by the suffix of `path`."""
+    path = UPath(path)
     if path.suffix != ".zip":
         for name, data in files.items():
             put(path / name, data)
@@ -40,8 +44,8 @@ def write(path, files):
             zipped.writestr(name, data)
 
 
-opened = partial(photo_formats.opened, size=(9, 16), source=Dl3dvSource)
-scene = partial(photo_formats.scene, size=(9, 16), source=Dl3dvSource)
+opened = partial(photo_formats.opened, path=".", size=(9, 16), source=Dl3dvSource)
+scene = partial(photo_formats.scene, path=".", size=(9, 16), source=Dl3dvSource)
 
 
 PLACES = """
@@ -65,7 +69,7 @@ def test_folders_and_archives_read_alike(tmp_path):
 
 
 def is_read_as_written(root):
-    (scene,) = opened(root).scenes("train")
+    (scene,) = opened(path=root).scenes("train")
     assert scene.name == "abc"
     assert len(scene) == 4
     opengl = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
@@ -76,62 +80,61 @@ def is_read_as_written(root):
     assert scene.images([3, 1])[:, 0, 4, 4].mul(255).round().tolist() == [30, 10]
 
 
-def test_reduced_photos_are_chosen(tmp_path):
+def test_reduced_photos_are_chosen():
     files = {**scene_files(images="images_8"), **scene_files()}
-    write(tmp_path / "abc", {**files, "images_8/0.png": photo(9, (16, 9))})
+    write("abc", {**files, "images_8/0.png": photo(9, (16, 9))})
     for options, red in (({"images": "images_8"}, 90), ({}, 0)):
-        assert scene(tmp_path, **options).images([0])[0, 0, 0, 0] * 255 == pytest.approx(red)
-    must_not_find("images_2", scene, tmp_path, images="images_2")
+        assert scene(**options).images([0])[0, 0, 0, 0] * 255 == pytest.approx(red)
+    must_not_find("images_2", scene, images="images_2")
 
 
-def length(path):
-    return len(scene(path).cameras.c2w)
+def length():
+    return len(scene().cameras.c2w)
 
 
-def test_incomplete_and_broken_archives_are_told(tmp_path):
+def test_incomplete_and_broken_archives_are_told():
     for files, file in (
         ({"abc/images_4/0.png": b""}, r"abc\.zip"),
         ({"abc/transforms.json": b"{"}, r"abc/transforms\.json::.*abc\.zip"),
         ({"abc/transforms.json": listing()}, "`images`"),
     ):
-        write(tmp_path / "abc.zip", files)
-        must_refuse(file, length, tmp_path, kind=(ValueError, OSError))
-    (tmp_path / "abc.zip").write_bytes(b"PK nothing")
-    opened(tmp_path)  # listed without being opened
-    must_refuse(r"abc\.zip", length, tmp_path)
+        write("abc.zip", files)
+        must_refuse(file, length, kind=(ValueError, OSError))
+    Path("abc.zip").write_bytes(b"PK nothing")
+    opened()  # listed without being opened
+    must_refuse(r"abc\.zip", length)
 
 
-def test_a_damaged_photo_names_archive_and_file(tmp_path):
-    archive = tmp_path / "abc.zip"
+def test_a_damaged_photo_names_archive_and_file():
+    archive = Path("abc.zip")
     write(archive, scene_files("abc/"))
     data = bytearray(archive.read_bytes())
     data[data.index(photo(1)) + 60] ^= 255
     archive.write_bytes(data)
-    must_refuse(r"abc/images_4/1\.png::.*abc\.zip", scene(tmp_path).images, [1])
+    must_refuse(r"abc/images_4/1\.png::.*abc\.zip", scene().images, [1])
 
 
-def several(path):
+def several():
     for i in range(4):
-        write(path / f"1K/s{i}.zip", scene_files(f"s{i}/"))
+        write(f"1K/s{i}.zip", scene_files(f"s{i}/"))
 
 
-def test_test_scenes(tmp_path, caplog):
-    several(tmp_path)
-    assert opened(tmp_path).names("train") == ["s0", "s1", "s2", "s3"]
-    assert opened(tmp_path).names("test") == []
-    index = tmp_path / "index.json"
-    index.write_text('{"s2": null, "gone": null, "s0": null}')
-    source = opened(tmp_path, test_scenes=str(index))
+def test_test_scenes(caplog):
+    several()
+    assert opened().names("train") == ["s0", "s1", "s2", "s3"]
+    assert opened().names("test") == []
+    Path("index.json").write_text('{"s2": null, "gone": null, "s0": null}')
+    source = opened(test_scenes="index.json")
     assert source.names("train") == ["s1", "s3"]
     assert source.names("test") == ["s2", "s0"]
     assert "1 of 3 test scenes" in caplog.text
-    held_out = opened(tmp_path, holdout=3, max_scenes=2).scenes("test")
+    held_out = opened(holdout=3, max_scenes=2).scenes("test")
     assert [scene.held_out for scene in held_out] == [(1,), (1,)]
 
 
-def test_lists_of_scenes(tmp_path):
-    text = UPath(tmp_path / "list.txt")
-    listed = UPath(tmp_path / "list.json")
+def test_lists_of_scenes():
+    text = UPath("list.txt")
+    listed = UPath("list.json")
     text.write_text("# benchmark\ns1\n\ns2  # hard\ns1\n")
     listed.write_text('["s3"]')
     assert read_scene_list(text) == ["s1", "s2"]
@@ -144,22 +147,22 @@ def test_lists_of_scenes(tmp_path):
     must_not_find(gone.name, read_scene_list, gone)
 
 
-def test_a_scene_that_is_there_twice_is_told(tmp_path, caplog):
-    several(tmp_path)
-    write(tmp_path / "1K/s0", scene_files())
-    assert len(opened(tmp_path).scenes("train")) == 4
+def test_a_scene_that_is_there_twice_is_told(caplog):
+    several()
+    write("1K/s0", scene_files())
+    assert len(opened().scenes("train")) == 4
     assert "1 scenes of" in caplog.text
 
 
-def test_folders_that_are_not_there(tmp_path):
-    must_not_find("nothing", opened, tmp_path / "nothing")
-    (tmp_path / "a.txt").write_text("")
-    must_not_find(r"a\.txt", opened, tmp_path)
+def test_folders_that_are_not_there():
+    must_not_find("nothing", opened, path="nothing")
+    Path("a.txt").touch()
+    must_not_find(r"a\.txt", opened)
 
 
-def test_other_processes_and_threads_read_one_archive(tmp_path):
-    several(tmp_path)
-    source = opened(tmp_path)
+def test_other_processes_and_threads_read_one_archive():
+    several()
+    source = opened()
     assert_travels(source)
     scenes = source.scenes("train")
     with ThreadPoolExecutor(4) as threads:
