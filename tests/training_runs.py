@@ -37,7 +37,10 @@ def tiny(name, *overrides):
     return resolve(f"tiny/{name}.yaml", [*SMALL.split(), *overrides])
 
 
-run = partial(train, console=QUIET, device="cpu")
+def run(recipe, folder="run", device="cpu", **options):
+    return train(recipe, folder, console=QUIET, device=device, **options)
+
+
 resume = partial(run, resume=True)
 
 
@@ -48,7 +51,7 @@ def trained_run(tmp_path_factory):
     return run(tiny("locus", *TRAINED), tmp_path_factory.mktemp("trained") / "run")
 
 
-def run_calling(after_step, recipe, folder, resume=False):
+def run_calling(after_step, recipe, folder="run", resume=False):
     """A run that calls `after_step(trainer, stop)` after each step."""
     stop = []
 
@@ -60,12 +63,12 @@ def run_calling(after_step, recipe, folder, resume=False):
         return trainer.run(Calling(QUIET), stop)
 
 
-def parts_of(folder):
+def parts_of(folder="run"):
     """What the saved state of a run holds, by part."""
     return read_state(RunFolder(folder).state)[1]
 
 
-def saved_step(folder):
+def saved_step(folder="run"):
     return parts_of(folder)["counters"]["step"]
 
 
@@ -99,7 +102,7 @@ def first_batch(recipe):
     return batches(stream_of(recipe), 1, 2)[0]
 
 
-def losses(run):
+def losses(run="run"):
     return column(RunFolder(run).history(), "loss")
 
 

@@ -125,12 +125,12 @@ def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch):
     assert trained_domain(stream_of(recipe()), 0).samples == 0
 
 
-def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(tmp_path):
+def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(here):
     two = recipe("training.steps=2")
     expected = trained_domain(stream_of(two), 2).ranges
-    file = run(recipe("training.steps=1"), tmp_path).folder.checkpoint
+    file = run(recipe("training.steps=1")).folder.checkpoint
     assert CheckpointFile(file).domain.ranges == expected
     file.write_bytes(file.read_bytes()[:1000])
-    resume(two, tmp_path)
+    resume(two)
     found = CheckpointFile(file).domain
     assert (found.ranges, found.samples) == (expected, stream.MEASURED)

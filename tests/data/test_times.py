@@ -99,7 +99,7 @@ DYNAMIC = (
 )
 
 
-def test_a_dynamic_model_trains_on_photos_with_times(tmp_path):
-    folder = dnerf(tmp_path, *(i / 7 for i in range(8)), 0.3)
+def test_a_dynamic_model_trains_on_photos_with_times(here):
+    folder = dnerf(here, *(i / 7 for i in range(8)), 0.3)
     data = f"data={{type: qgs/photos, path: '{folder}', image_size: [16, 16]}}"
-    assert run(resolve("tiny/tokengs.yaml", [*DYNAMIC, data]), tmp_path / "run").steps == 2
+    assert run(resolve("tiny/tokengs.yaml", [*DYNAMIC, data])).steps == 2

@@ -150,7 +150,7 @@ def test_depths_are_scaled_and_mirrored_and_unknown_in_noisy_views_and_without_m
     assert not stack_views([inputs(), bare]).depths[1].any()
 
 
-def test_a_training_has_the_loss_on_depth(tmp_path):
-    history = run(ROOMS, tmp_path).folder.history()
+def test_a_training_has_the_loss_on_depth(here):
+    history = run(ROOMS).folder.history()
     assert history
     assert all(0 < record["depth_surface"] < 10 for record in history), history

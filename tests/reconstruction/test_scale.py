@@ -76,5 +76,5 @@ def test_depth_maps_keep_a_search_on_inputs_alone_near_their_depth(monkeypatch):
     assert 0.3 * 0.4 / 2 < min(factors) <= max(factors) < 2 / 2 * 1.7
 
 
-def test_training_and_evaluation_refuse_a_search(tmp_path):
-    must_refuse(r"views\.scale: search", run, tiny("tokengs", "views.scale=search"), tmp_path)
+def test_training_and_evaluation_refuse_a_search(here):
+    must_refuse(r"views\.scale: search", run, tiny("tokengs", "views.scale=search"))

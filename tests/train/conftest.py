@@ -9,6 +9,11 @@ from training_runs import trained_run
 __all__ = ["trained_run"]
 
 
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(here):
+    """Runs are trained into `run` there, unless a test says otherwise."""
+
+
 @pytest.fixture
 def copied(trained_run, tmp_path):
     """A copy of the folder of `trained_run`."""

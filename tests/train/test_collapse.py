@@ -70,7 +70,7 @@ def test_good_weights_are_the_older_of_two_copies_made_before_the_images_got_wor
     assert (weights["weight"] == 50).all()
 
 
-def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights(tmp_path):
+def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights():
     recipe = tiny("tokengs", "training.steps=40", "training.collapse_window=10")
     after = {}
 
@@ -82,25 +82,25 @@ def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights(tm
         if step == 8:
             stop.append(signal.SIGTERM)
 
-    checkpoint = run_calling(die, recipe, tmp_path).folder.checkpoint
+    checkpoint = run_calling(die, recipe).folder.checkpoint
     assert CheckpointFile(checkpoint).step == 8  # in doubt: saved as it is
-    must_refuse("at step 15: for the last 10 steps", resume, recipe, tmp_path, kind=CollapseError)
+    must_refuse("at step 15: for the last 10 steps", resume, recipe, kind=CollapseError)
     assert CheckpointFile(checkpoint).step == 2
     assert_equal(qgs.load(checkpoint).state_dict(), after[2])
 
 
-def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(tmp_path):
+def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end():
     options = ("training.collapse_window=10", "training.save_every=1")
     for steps, dead in ((400, 10), (3, 3)):
         recipe = tiny("tokengs", INVISIBLE, f"training.steps={steps}", *options)
-        folder = RunFolder(tmp_path / str(steps))
+        folder = RunFolder(str(steps))
         words = f"for the last {dead} steps the renderings are empty"
         must_refuse(words, run, recipe, folder.path, kind=CollapseError)
         assert len(folder.history()) == min(steps, 10)
         assert CheckpointFile(folder.checkpoint).step == 0
 
 
-def test_weights_that_are_not_finite_end_a_run_and_are_never_saved(tmp_path):
+def test_weights_that_are_not_finite_end_a_run_and_are_never_saved():
     """Those of step 1 give NaN in step 2; those of the last step are seen before they are saved."""
 
     def break_weights(trainer, stop):
@@ -109,17 +109,17 @@ def test_weights_that_are_not_finite_end_a_run_and_are_never_saved(tmp_path):
     features = r"queries\.features"
     for steps, words in ((2, f"step 1: .*{features}"), (1, f"weights are not finite: {features}")):
         recipe = tiny("tokengs", f"training.steps={steps}", "optimizer.warmup=0")
-        folder = tmp_path / str(steps)
+        folder = str(steps)
         must_refuse(words, run_calling, break_weights, recipe, folder, kind=CollapseError)
         kept = qgs.load(RunFolder(folder).checkpoint).state_dict()
         assert all(tensor.isfinite().all() for tensor in kept.values())
 
 
-def test_one_dead_step_at_the_end_fails_no_run(tmp_path):
+def test_one_dead_step_at_the_end_fails_no_run():
     def die_at_the_end(trainer, stop):
         if trainer.counters.step == 3:
             signs = trainer.guard.signs
             signs.observe = lambda numbers: SignsOfLife.observe(signs, DEAD)
 
-    result = run_calling(die_at_the_end, tiny("tokengs"), tmp_path)
+    result = run_calling(die_at_the_end, tiny("tokengs"))
     assert CheckpointFile(result.folder.checkpoint).step == 3

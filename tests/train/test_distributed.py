@@ -1,6 +1,7 @@
 """Two processes on one machine train the model that one would train; which device `auto` takes."""
 
 import signal
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -28,16 +29,14 @@ def train_in_two_processes(*arguments):
     assert second == (False, 3, total)
 
 
-def test_two_processes_continue_what_one_began(tmp_path):
+def test_two_processes_continue_what_one_began():
     recipe = tiny("locus", "training.ema=0.9", PARTS)
-    two = tmp_path / "two"
-    alone = tmp_path / "alone"
-    run(recipe, alone)
-    assert run_calling(lambda _, stop: stop.append(signal.SIGINT), recipe, two).steps == 1
-    train_in_two_processes(recipe, two)
-    assert losses(two) == pytest.approx(losses(alone), abs=1e-5)
-    ours = parts_of(two)
-    theirs = parts_of(alone)
+    run(recipe, "alone")
+    assert run_calling(lambda _, stop: stop.append(signal.SIGINT), recipe).steps == 1
+    train_in_two_processes(recipe, "run")
+    assert losses() == pytest.approx(losses("alone"), abs=1e-5)
+    ours = parts_of()
+    theirs = parts_of("alone")
     for name in ("weights", "moments", "ema", "good"):
         torch.testing.assert_close(ours[name], theirs[name], rtol=1e-3, atol=1e-4)
 
@@ -50,36 +49,33 @@ def test_two_processes_continue_what_one_began(tmp_path):
     ],
 )
 @pytest.mark.slow
-def test_two_processes_have_the_loss_curve_of_one(tmp_path, name, options):
-    run(tiny(name, *options), tmp_path / "alone")
-    train_in_two_processes(tiny(name, *options, "training.render_views=1"), tmp_path / "two")
-    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
+def test_two_processes_have_the_loss_curve_of_one(name, options):
+    run(tiny(name, *options), "alone")
+    train_in_two_processes(tiny(name, *options, "training.render_views=1"), "run")
+    assert losses() == pytest.approx(losses("alone"), abs=1e-5)
 
 
-def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
+def test_all_processes_leave_out_a_step_that_one_found_bad(here):
     options = ("on_nonfinite=skip", "render_views=1", "ema=0.9", "evaluate_every=2")
     recipe = tiny("locus", *(f"training.{option}" for option in options))
-    train_in_two_processes(recipe, tmp_path, {3}, True)
-    records = read_jsonl(tmp_path / "history.jsonl")
+    train_in_two_processes(recipe, here, {3}, True)
+    records = read_jsonl(here / "history.jsonl")
     assert ["loss" in record for record in records] == [True, False, True]
-    assert column(read_jsonl(tmp_path / "evaluations.jsonl"), "step") == [2, 2, 3, 3]
+    assert column(read_jsonl(here / "evaluations.jsonl"), "step") == [2, 2, 3, 3]
 
 
 @pytest.mark.parametrize(("bad", "steps"), [(1, 0), (3, 1)], ids=["first", "later"])
 @pytest.mark.slow
-def test_two_processes_stop_together_at_a_sample_that_one_cannot_make_or_leave_it_out(
-    tmp_path, bad, steps
-):
+def test_two_processes_stop_together_at_a_sample_that_one_cannot_make_or_leave_it_out(bad, steps):
     """Samples with odd numbers are those of the second process."""
-    folder = tmp_path / "run"
-    errors = told_by_two(tiny("locus"), folder, {bad})
+    errors = told_by_two(tiny("locus"), "run", {bad})
     reason = f"scene 'x', frame {bad} (a.png): cannot be read"
     for error, cause in zip(errors, (ELSEWHERE, reason), strict=True):
         assert error.startswith(f"{cause}; ")
         assert (f"saved at step {steps}; continue with --resume" in error) == bool(steps)
-    assert folder.exists() == bool(steps)
-    told_by_two(tiny("locus", "training.on_bad_sample=skip"), folder, {bad})
-    assert len(losses(folder)) == 3
+    assert Path("run").exists() == bool(steps)
+    told_by_two(tiny("locus", "training.on_bad_sample=skip"), "run", {bad})
+    assert len(losses()) == 3
 
 
 DEVICES = """

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import signal
+from pathlib import Path
 from unittest.mock import DEFAULT, Mock
 
 import pytest
@@ -34,7 +35,7 @@ LONGER = tiny("locus", *TRAINED, "training.steps=4")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_and_ends(tmp_path, monkeypatch, number):
+def test_a_signal_saves_and_ends(monkeypatch, number):
     before = signal.getsignal(number)
 
     def ask_twice(*_):
@@ -42,14 +43,14 @@ def test_a_signal_saves_and_ends(tmp_path, monkeypatch, number):
         signal.raise_signal(number)  # the second one changes nothing
 
     monkeypatch.setattr(TrainingProgress, "show", ask_twice)
-    result = run(tiny("tokengs", "training.steps=200"), tmp_path)
+    result = run(tiny("tokengs", "training.steps=200"))
     assert result.stopped_by == number.name
     assert result.steps == len(result.folder.history()) == 1
     assert CheckpointFile(result.folder.checkpoint).step == 1
     assert signal.getsignal(number) is before
 
 
-def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, tmp_path, monkeypatch):
+def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, monkeypatch):
     def broken(sample, number, attempt):
         if number == 4:
             raise OSError("the disk is gone")
@@ -57,60 +58,60 @@ def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, tmp_path, monkey
     with monkeypatch.context() as patch:
         change_samples(patch, broken)
         recipe = tiny("locus", *TRAINED, "training.evaluate_every=0")
-        error = must_refuse("the disk is gone", run, recipe, tmp_path, kind=OSError)
+        error = must_refuse("the disk is gone", run, recipe, kind=OSError)
     assert error.__notes__ == ["The run is saved at step 2; continue with --resume"]
-    assert resume(tiny("locus", *TRAINED), tmp_path).resumed_at == 2
+    assert resume(tiny("locus", *TRAINED)).resumed_at == 2
     whole = trained_run.folder.path
-    assert_equal_runs(tmp_path, whole)
-    first, second = (read_jsonl(folder / "evaluations.jsonl") for folder in (tmp_path, whole))
+    assert_equal_runs("run", whole)
+    first, second = (read_jsonl(folder / "evaluations.jsonl") for folder in (Path("run"), whole))
     assert first == second[2:]  # of step 3
 
 
 @pytest.mark.slow
-def test_a_killed_worker_leaves_a_run_that_goes_on(tmp_path):
+def test_a_killed_worker_leaves_a_run_that_goes_on():
     recipe = tiny("tokengs", "training.steps=100", "training.workers=1", "training.save_every=0")
 
     def kill(trainer, stop):
         for child in multiprocessing.active_children():
             child.kill()
 
-    must_refuse(r"lower training\.workers", run_calling, kill, recipe, tmp_path, kind=WorkerError)
-    assert saved_step(tmp_path) == len(losses(tmp_path)) >= 1
+    must_refuse(r"lower training\.workers", run_calling, kill, recipe, kind=WorkerError)
+    assert saved_step() == len(losses()) >= 1
 
 
-def test_a_step_without_memory_says_what_takes_less_and_the_run_is_saved(tmp_path, monkeypatch):
+def test_a_step_without_memory_says_what_takes_less_and_the_run_is_saved(monkeypatch):
     error = RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
     second_fails = Mock(wraps=training.compute_gradients, side_effect=[DEFAULT, error])
     monkeypatch.setattr(training, "compute_gradients", second_fails)
-    must_refuse(r"step 2.*batch_size", run, tiny("tokengs"), tmp_path, kind=OutOfMemoryError)
-    assert saved_step(tmp_path) == 1
+    must_refuse(r"step 2.*batch_size", run, tiny("tokengs"), kind=OutOfMemoryError)
+    assert saved_step() == 1
 
 
-def test_bad_samples_are_skipped_and_named_if_asked_for(tmp_path, monkeypatch, caplog):
+def test_bad_samples_are_skipped_and_named_if_asked_for(monkeypatch, caplog):
     bad = {1, 3}
     spoil(monkeypatch, bad)
-    must_refuse("frame 1", run, tiny("tokengs"), tmp_path / "stops", kind=SampleError)
+    must_refuse("frame 1", run, tiny("tokengs"), "stops", kind=SampleError)
     skipping = tiny("tokengs", "training.on_bad_sample=skip")
-    assert run(skipping, tmp_path / "skips").steps == 3
+    assert run(skipping, "skips").steps == 3
     assert caplog.text.count("a training sample is left out: scene 'x', frame ") == 2
     bad.update(range(100))
-    must_refuse(str(MAX_REPLACED + 1), run, skipping, tmp_path / "ends", kind=SampleError)
+    must_refuse(str(MAX_REPLACED + 1), run, skipping, "ends", kind=SampleError)
 
 
-def test_an_evaluation_that_fails_is_told_and_ends_nothing(tmp_path, monkeypatch, caplog):
+def test_an_evaluation_that_fails_is_told_and_ends_nothing(monkeypatch, caplog):
     saved = []
 
     def failing(*_, **options):
-        saved.append(saved_step(tmp_path))
+        saved.append(saved_step())
         raise ValueError("no scene could be judged")
 
     monkeypatch.setattr(periodic, "evaluate", failing)
-    run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
+    run(tiny("tokengs", "training.evaluate_every=1"))
     assert saved == [1, 2, 3]  # saved before it is judged
     assert "the evaluation at step 2 failed: no scene could be judged" in caplog.text
 
 
-def test_a_stop_is_heard_between_two_scenes(tmp_path, monkeypatch):
+def test_a_stop_is_heard_between_two_scenes(monkeypatch):
     judge = periodic.evaluate
 
     def asked(*given, observe, **options):
@@ -122,9 +123,9 @@ def test_a_stop_is_heard_between_two_scenes(tmp_path, monkeypatch):
         return judge(*given, observe=seen, **options)
 
     monkeypatch.setattr(periodic, "evaluate", asked)
-    result = run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
+    result = run(tiny("tokengs", "training.evaluate_every=1"))
     assert (result.steps, result.stopped_by) == (1, "SIGTERM")
-    assert not (tmp_path / "evaluations.jsonl").exists()
+    assert not Path("run/evaluations.jsonl").exists()
 
 
 def test_a_full_disk_is_told_with_what_to_do(copied, monkeypatch):
@@ -166,17 +167,16 @@ def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
         assert before == contents(copied)
 
 
-def test_a_folder_in_use_is_refused_untouched(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    must_refuse("never overwrites", run, tiny("tokengs"), tmp_path, kind=FileExistsError)
-    must_refuse("is a file", run, tiny("tokengs"), tmp_path / "notes.txt", kind=FileExistsError)
-    assert names_in(tmp_path) == {"notes.txt"}
+def test_a_folder_in_use_is_refused_untouched(here):
+    (here / "notes.txt").write_text("mine")
+    must_refuse("never overwrites", run, tiny("tokengs"), here, kind=FileExistsError)
+    must_refuse("is a file", run, tiny("tokengs"), "notes.txt", kind=FileExistsError)
+    assert names_in(here) == {"notes.txt"}
 
 
-def test_a_start_that_fails_leaves_no_folder(tmp_path):
-    out = tmp_path / "run"
-    nowhere = f"data={{type: qgs/photos, path: {tmp_path / 'nowhere'}, image_size: [32, 32]}}"
-    must_not_find("nowhere", run, tiny("tokengs", nowhere), out)
-    must_refuse(r"optimizer\.warmup", run, tiny("tokengs", "optimizer.warmup=3"), out)
-    must_refuse(r"views\.gap", run, tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out)
-    assert not out.exists()
+def test_a_start_that_fails_leaves_no_folder(here):
+    nowhere = "data={type: qgs/photos, path: nowhere, image_size: [32, 32]}"
+    must_not_find("nowhere", run, tiny("tokengs", nowhere))
+    must_refuse(r"optimizer\.warmup", run, tiny("tokengs", "optimizer.warmup=3"))
+    must_refuse(r"views\.gap", run, tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"))
+    assert not [*here.iterdir()]

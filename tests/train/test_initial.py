@@ -23,11 +23,11 @@ def started(recipe):
 
 
 @pytest.fixture
-def learned(tmp_path):
+def learned():
     """`learned("locus", "a.b=c")`: that tiny model, from a checkpoint of another seed."""
 
     def make(name, *options):
-        path = tmp_path / f"{name}.safetensors"
+        path = f"{name}.safetensors"
         save(tiny(name, "seed=7").build_model(), path)
         return tiny(name, f"init_from={path}", *options)
 
@@ -86,12 +86,12 @@ def test_larger_patches_give_the_tokens_of_coarser_images(learned):
     assert "encoder.ray_embedding.proj.weight: (32, 6, 8, 8) -> (32, 6, 16, 16)" in told
 
 
-def test_training_starts_from_a_run(trained_run, tmp_path):
+def test_training_starts_from_a_run(trained_run):
     start = f"init_from={trained_run.folder.path}"
     still = ("optimizer.learning_rate=1e-9", "optimizer.weight_decay=0.0")
     console = text_console()
     grown = tiny("locus", "model.queries.count=32", start, *still)
-    result = train(grown, tmp_path, device="cpu", console=console)
+    result = train(grown, "run", device="cpu", console=console)
     before, after = (r.model.queries.center for r in (trained_run, result))
     assert_equal(after[:COUNT], before, atol=1e-6)
     assert "queries.center: (24, 3) -> (32, 3)" in console.file.getvalue()

@@ -106,16 +106,16 @@ def test_a_pattern_names_a_part_and_all_below_it():
             assert found == wanted != set(), pattern
 
 
-def test_a_pattern_that_matches_nothing_ends_the_start(tmp_path):
+def test_a_pattern_that_matches_nothing_ends_the_start(here):
     pattern = "decoder.1.self_atention"
     recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
-    problem = refused(recipe, tmp_path / "run", by=run)
+    problem = refused(recipe, by=run)
     assert (problem.file[:5], problem.option) == ("--set", f"optimizer.parts.{pattern}")
     assert "`decoder.1.self_attention`" in problem.fix
-    assert not (tmp_path / "run").exists()
+    assert not [*here.iterdir()]
 
 
-def test_a_factor_scales_the_step_and_frozen_parts_stay_and_are_not_remembered(tmp_path):
+def test_a_factor_scales_the_step_and_frozen_parts_stay_and_are_not_remembered():
     """The first step of AdamW without decay is the learning rate, whatever the gradient.
 
     The last pattern that matches counts.
@@ -124,8 +124,8 @@ def test_a_factor_scales_the_step_and_frozen_parts_stay_and_are_not_remembered(t
     parts = '{"*": 0.5, encoder: 0, "decoder.*.feed_forward": 0, head: 1, head.linear.bias: 2}'
     recipe = tiny("tokengs", "training.steps=1", f"optimizer={{{options}, parts: {parts}}}")
     before = recipe.build_model().state_dict()
-    result = run(recipe, tmp_path)
-    moments = {name for name, values in parts_of(tmp_path)["moments"].items() if values}
+    result = run(recipe)
+    moments = {name for name, values in parts_of()["moments"].items() if values}
     factors = {"queries.features": 0.5, "head.linear.weight": 1, "head.linear.bias": 2}
     for name, parameter in result.model.named_parameters():
         step = float((parameter.detach() - before[name]).abs().max())
@@ -151,7 +151,7 @@ plugin = Plugin("plain", 1, (Plain,))
 """
 
 
-def test_a_plugin_adds_an_optimiser_by_one_class(tmp_path, install):
+def test_a_plugin_adds_an_optimiser_by_one_class(install):
     """With moments of several shapes; some parameters get no gradient, and have none."""
     install("plain", "plain", PLAIN)
     recipe = tiny(
@@ -161,14 +161,12 @@ def test_a_plugin_adds_an_optimiser_by_one_class(tmp_path, install):
         "plugins=[rooms, locus, plain]",
         "optimizer={type: plain/plain, learning_rate: 0.02, parts: {encoder: 0, head: 0.5}}",
     )
-    through = tmp_path / "through"
-    halves = tmp_path / "halves"
-    history = run(recipe, through).folder.history()
+    history = run(recipe).folder.history()
     assert column(history, "lr") == [0.02] * 3
-    run(resolve(recipe.tree, ["training.steps=2"]), halves)
-    assert resume(recipe, halves).resumed_at == 2
-    assert_equal_runs(through, halves)
-    moments = parts_of(through)["moments"]
+    run(resolve(recipe.tree, ["training.steps=2"]), "halves")
+    assert resume(recipe, "halves").resumed_at == 2
+    assert_equal_runs("run", "halves")
+    moments = parts_of()["moments"]
     assert set().union(*moments.values()) == {"step", "row_var", "col_var", "variance"}
     assert not [name for name, values in moments.items() if "raw_radius" in name and values]
 

@@ -52,11 +52,11 @@ def change_counters(folder, **values):
     write_state(folder / "state.safetensors", recipe.tree, states)
 
 
-def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
+def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped():
     options = (*TWO, *SCHEDULED.strip().splitlines())
     recipe = tiny("locus", *options, "training.steps=4")
-    whole, parts, again = (tmp_path / name for name in ("whole", "parts", "again.safetensors"))
-    resume(recipe, whole)
+    again = "again.safetensors"
+    resume(recipe, "whole")
     seen = []
 
     def note(trainer, stop):
@@ -65,19 +65,19 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
         if trainer.counters.step == 2:
             stop.append(signal.SIGTERM)
 
-    stopped = run_calling(note, recipe, parts)
+    stopped = run_calling(note, recipe)
     assert (stopped.steps, stopped.stopped_by) == (2, "SIGTERM")
     qgs.save(qgs.load(stopped.folder.checkpoint), again)
     assert CheckpointFile(again).step == 2
     assert qgs.load(again).renderer.config.dilation == 2
     for other in ("objective.depth_weight=0.5", "losses.photometric.ssim_weight.values=[0.4, 0.1]"):
         changed = tiny("locus", *options, other)
-        must_refuse(other.split("=")[0], resume, changed, parts, kind=OtherRunError)
-    assert run_calling(note, recipe, parts, resume=True).resumed_at == 2
-    assert_equal_runs(whole, parts)
+        must_refuse(other.split("=")[0], resume, changed, kind=OtherRunError)
+    assert run_calling(note, recipe, resume=True).resumed_at == 2
+    assert_equal_runs("whole", "run")
     # After a step there stand the numbers of the next one.
     assert seen == [(2, pytest.approx(0.3)), (2, 0.2), (1, pytest.approx(0.1)), (1, 0)]
-    history = RunFolder(whole).history()
+    history = RunFolder("whole").history()
     rates = [5e-4 * (1 + math.cos(math.pi * step / 4)) for step in range(4)]
     assert column(history, "lr") == pytest.approx(rates)
     assert history[3]["ssim"] == pytest.approx(history[0]["ssim"] / 4, rel=0.2)  # 0.1 is left
@@ -88,14 +88,14 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
         assert sum(record[term] for term in terms.split()) == pytest.approx(record["loss"])
 
 
-def test_a_kill_between_the_first_two_files_loses_nothing(tmp_path, monkeypatch):
+def test_a_kill_between_the_first_two_files_loses_nothing(monkeypatch):
     recipe = tiny("tokengs", "training.steps=1", "optimizer.warmup=0")
     with monkeypatch.context() as patch:
         patch.setattr("qgs.train.folder.save", Mock(side_effect=Killed))
         with pytest.raises(Killed):
-            run(recipe, tmp_path)
-    assert resume(recipe, tmp_path).resumed_at == 1
-    assert CheckpointFile(tmp_path / "checkpoint.safetensors").step == 1
+            run(recipe)
+    assert resume(recipe).resumed_at == 1
+    assert CheckpointFile("run/checkpoint.safetensors").step == 1
 
 
 def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog):

@@ -4,6 +4,7 @@ import json
 import sys
 import time
 from importlib.machinery import ModuleSpec
+from pathlib import Path
 from unittest.mock import MagicMock
 
 import pytest
@@ -47,32 +48,27 @@ plugin = Failing
 """
 
 
-def test_distributions_offer_trackers_and_one_that_fails_is_left_out(tmp_path, install, caplog):
+def test_distributions_offer_trackers_and_one_that_fails_is_left_out(install, caplog):
     group = {"group": "qgs.trackers"}
     install("qgs-lines", "lines", FILE_TRACKER, **group)
     for name in ("opens", "logs"):
         install(f"qgs-{name}", name, f"FAILS = {name!r}\n{FAILING_TRACKER}", **group)
-    result = run(tiny("tokengs", "training.trackers=[opens, logs, lines]"), tmp_path)
-    first, *lines = map(json.loads, (tmp_path / "lines.jsonl").open())
+    result = run(tiny("tokengs", "training.trackers=[opens, logs, lines]"))
+    first, *lines = map(json.loads, Path("run/lines.jsonl").read_text().splitlines())
     assert first == [0, {"width": 32}]
     assert lines == [[record["step"], record] for record in result.folder.history()]
     opens, logs = (record.message for record in caplog.records)
     assert " opens " in opens
     assert " logs " in logs
-    assert (tmp_path / "closed").read_text() == "logs"
+    assert Path("run/closed").read_text() == "logs"
 
 
-def test_a_missing_tracker_is_told_before_anything_is_made(tmp_path, monkeypatch):
+def test_a_missing_tracker_is_told_before_anything_is_made(here, monkeypatch):
     must_refuse("tensorboard, wandb", Trackers, ("linez",))
     monkeypatch.setattr("qgs.train.tracking.find_spec", lambda name: None)
-    must_refuse(
-        "pip install tensorboard",
-        run,
-        tiny("tokengs", "training.trackers=[tensorboard]"),
-        tmp_path / "run",
-        kind=MissingExtraError,
-    )
-    assert not (tmp_path / "run").exists()
+    recipe = tiny("tokengs", "training.trackers=[tensorboard]")
+    must_refuse("pip install tensorboard", run, recipe, kind=MissingExtraError)
+    assert not [*here.iterdir()]
 
 
 def test_tensorboard_gets_what_the_history_gets_and_drops_what_was_lost(copied):

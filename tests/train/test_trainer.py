@@ -1,5 +1,6 @@
 """Whole runs of tiny models on procedural rooms, and what they leave."""
 
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -27,7 +28,7 @@ from qgs.recipe import Recipe, resolve
 from qgs.train.guard import NonFiniteError
 
 
-def test_training_lowers_the_loss(tmp_path):
+def test_training_lowers_the_loss():
     recipe = tiny(
         "locus",
         "training.steps=20",
@@ -37,8 +38,8 @@ def test_training_lowers_the_loss(tmp_path):
         "optimizer.learning_rate=4e-3",
         "training.collapse_window=10",
     )
-    run(recipe, tmp_path, device="auto")
-    falling = losses(tmp_path)
+    run(recipe, device="auto")
+    falling = losses()
     assert sum(falling[-5:]) < 0.95 * sum(falling[:5])
 
 
@@ -53,16 +54,16 @@ def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
     assert_equal(qgs.load(folder.checkpoint).state_dict(), trained_run.model.state_dict())
 
 
-def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path):
-    plain = run(tiny("locus"), tmp_path)
+def test_averages_and_evaluations_leave_the_training_alone(trained_run):
+    plain = run(tiny("locus"))
     folder = trained_run.folder
-    parts = parts_of(tmp_path)
+    parts = parts_of()
     watched = parts_of(folder.path)
     for name in ("weights", "moments", "random"):
         assert_equal(parts[name], watched[name])
-    assert losses(tmp_path) == losses(folder.path)
+    assert losses() == losses(folder.path)
     files = {"recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"}
-    assert names_in(tmp_path) == files
+    assert names_in(Path("run")) == files
     start, average, last = (
         model.queries.features
         for model in (tiny("locus").build_model(), qgs.load(folder.checkpoint_ema), plain.model)
@@ -92,14 +93,14 @@ def test_scenes_that_do_not_split_evenly_are_refused():
         must_refuse(r"training\.batch_size: 16", config.scenes_per_batch, processes)
 
 
-def test_bf16_trains_with_finite_numbers(tmp_path):
-    model = run(tiny("locus", "training.precision=bf16"), tmp_path).model
+def test_bf16_trains_with_finite_numbers():
+    model = run(tiny("locus", "training.precision=bf16")).model
     assert all(p.dtype == torch.float32 and p.isfinite().all() for p in model.parameters())
 
 
-def test_a_time_budget_ends_the_run(tmp_path):
+def test_a_time_budget_ends_the_run():
     recipe = tiny("tokengs", "training.steps=200", "training.seconds=0.1")
-    result = run(recipe, tmp_path)
+    result = run(recipe)
     assert 0.1 <= result.seconds < 10.0
     history = result.folder.history()
     assert 1 < result.steps == len(history) < 200
@@ -110,13 +111,12 @@ def test_a_time_budget_ends_the_run(tmp_path):
         assert record["lr"] == pytest.approx(schedule.learning_rate(step, clock[step]))
 
 
-def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
+def test_bad_steps_are_skipped_on_demand(monkeypatch, caplog):
     """By a run from its start, and by one that a bad step ended."""
     spoil(monkeypatch, {2, 6}, nan=True)
     options = ("training.steps=4", "training.ema=0.9")
     skipping = tiny("locus", *options, "training.on_nonfinite=skip")
-    through = tmp_path / "through"
-    stopped = tmp_path / "stopped"
+    through = Path("through")
     run(skipping, through)
     told = [r.message.split(" is ")[0] for r in caplog.records if "is skipped" in r.message]
     assert told == ["step 2", "step 4"]
@@ -128,31 +128,29 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     recipe = tiny("locus", *options)
     for begin in (run, resume):
         place = r"targets\.images \(1 of"
-        told = str(must_refuse(place, begin, recipe, stopped, kind=NonFiniteError))
+        told = str(must_refuse(place, begin, recipe, kind=NonFiniteError))
         assert "step 2 has NaN or infinity" in told
         assert "mse is nan" in told
-    assert len(losses(stopped)) == 1
-    assert resume(skipping, stopped).resumed_at == 1
-    ours = parts_of(stopped)
+    assert len(losses()) == 1
+    assert resume(skipping).resumed_at == 1
+    ours = parts_of()
     theirs = parts_of(through)
     for name in ("weights", "ema"):
         assert_equal(ours[name], theirs[name])
         assert all(tensor.isfinite().all() for tensor in ours[name].values())
 
 
-def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
+def test_a_bad_gradient_ends_the_run_too(monkeypatch):
     model = tiny("tokengs").build_model()
     next(model.parameters()).register_hook(lambda gradient: gradient * torch.inf)
     monkeypatch.setattr(Recipe, "build_model", Mock(return_value=model))
-    must_refuse(
-        "the first bad tensor is gradient of", run, tiny("tokengs"), tmp_path, kind=NonFiniteError
-    )
-    assert not losses(tmp_path)
+    must_refuse("the first bad tensor is gradient of", run, tiny("tokengs"), kind=NonFiniteError)
+    assert not losses()
 
 
-def test_skipping_comes_to_an_end(tmp_path, monkeypatch):
+def test_skipping_comes_to_an_end(monkeypatch):
     spoil(monkeypatch, range(2, 100), nan=True)
     monkeypatch.setattr("qgs.train.guard.MAX_SKIPPED", 2)
     recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
-    must_refuse("most 2 steps in a row", run, recipe, tmp_path, kind=NonFiniteError)
-    assert len(read_jsonl(tmp_path / "history.jsonl")) == 3
+    must_refuse("most 2 steps in a row", run, recipe, kind=NonFiniteError)
+    assert len(read_jsonl(Path("run/history.jsonl"))) == 3

@@ -52,11 +52,11 @@ def test_published_training():
     assert optimizer["warmup"] == 0.03 * recipe.training.steps
 
 
-def test_two_passes_train_a_head_that_grows(tmp_path):
+def test_two_passes_train_a_head_that_grows(here):
     growing = "model.head.level={schedule: steps, values: [0, 0.5, 1, 3], at: [1, 2, 4]}"
     two = "objective={type: globalsplat/two_passes}"
     recipe = resolve(TINY, [*SMALL.split(), two, growing])
-    folder = run(recipe, tmp_path / "run").folder
+    folder = run(recipe).folder
     assert [record["frustum"] > 0 for record in folder.history()] == [True] * 6
     model = qgs.load(folder.checkpoint)
     assert model.head.gaussians_per_query == 8  # those of the last step
