@@ -15,35 +15,30 @@ def small(name, *overrides):
     return qgs.compose(f"tiny/{name}.yaml", [*SMALL, *overrides]).eval()
 
 
-@pytest.fixture(params=["tokengs", "locus"])
-def model(request):
-    return small(request.param)
+VIEWS = odd_views(width=24)
 
 
-@pytest.fixture
-def views():
-    return odd_views(width=24)
-
-
-def test_the_api_in_five_lines(model, views, tmp_path):
-    gaussians = model(views).gaussians
+@pytest.mark.parametrize("name", ["tokengs", "locus"])
+def test_the_api_in_five_lines(name, tmp_path):
+    model = small(name)
+    gaussians = model(VIEWS).gaussians
     assert gaussians.means.shape == (2, 8 * 8, 3)
     black, white = (
-        model.render(gaussians, views.cameras, torch.full((3,), grey)) for grey in (0.0, 1.0)
+        model.render(gaussians, VIEWS.cameras, torch.full((3,), grey)) for grey in (0.0, 1.0)
     )
-    assert black.rgb.shape == views.images.shape
+    assert black.rgb.shape == VIEWS.images.shape
     torch.testing.assert_close(white.rgb - black.rgb, (1 - black.alpha).expand_as(black.rgb))
     qgs.save(model, tmp_path / "model.safetensors")
     again = qgs.load(tmp_path / "model.safetensors")
-    assert torch.equal(again(views.to(torch.float64)).gaussians.means, gaussians.means)
+    assert torch.equal(again(VIEWS.to(torch.float64)).gaussians.means, gaussians.means)
 
 
-def test_layers_that_are_decoded_and_refined(views):
+def test_layers_that_are_decoded_and_refined():
     model = small("locus")
-    assert list(model.train()(views).layers) == [2, 4]
-    assert list(model.eval()(views).layers) == [4]
-    assert list(model(views, layers=[1, 3]).layers) == [1, 3, 4]
-    must_refuse(r"layers \[5\] do not exist", model, views, layers=[5])
+    assert list(model.train()(VIEWS).layers) == [2, 4]
+    assert list(model.eval()(VIEWS).layers) == [4]
+    assert list(model(VIEWS, layers=[1, 3]).layers) == [1, 3, 4]
+    must_refuse(r"layers \[5\] do not exist", model, VIEWS, layers=[5])
     override = "model.decoder.layers.0.refinement={type: locus/refine, radius: false}"
     assert [len(x.refinements) for x in (model, small("locus", override))] == [1, 2]
 
