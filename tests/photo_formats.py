@@ -28,6 +28,11 @@ class PhotoSet:
     size: tuple[int, int]
 
 
+def noise(*shape, seed=0):
+    """Bytes, such as images (N, H, W, 3)."""
+    return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
+
+
 def write_photos(folder, images, name="{}.png"):
     """Save images (H, W, 3) under their numbers; their folder."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -239,5 +244,4 @@ def numbered_photos(path, count=10, size=(64, 48), cameras=(), **top):
 
 def noisy_photos(folder, count=7, step=0.1):
     """Nerfstudio photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
-    images = np.random.default_rng(0).integers(0, 256, (count, 20, 24, 3), dtype=np.uint8)
-    return write_row(folder, images, step, **listed_lens(20, 20, 12, 10, 20, 24))
+    return write_row(folder, noise(count, 20, 24, 3), step, **listed_lens(20, 20, 12, 10, 20, 24))

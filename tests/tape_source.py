@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from photo_formats import noise
 from walk import along_x, pinhole
 
 from qgs.contracts import Plugin, Scene, SceneSource
@@ -54,6 +55,5 @@ INSTALLED = ("qgs-tapes", "tapes", "from tape_source import plugin")
 def write_tape(file, step=0.1):
     """Noise, seen by cameras a step apart."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    images = np.random.default_rng(0).integers(0, 256, (6, 16, 16, 3), np.uint8)
     with file.open("wb") as opened:
-        np.savez(opened, images=images, c2w=along_x(step * np.arange(6)))
+        np.savez(opened, images=noise(6, 16, 16, 3), c2w=along_x(step * np.arange(6)))

@@ -4,7 +4,6 @@ import io
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import photo_formats
 import pytest
 import torch
@@ -42,8 +41,7 @@ CHANGED = {
 
 
 def noise(seed, kind):
-    pixels = np.random.default_rng(seed).integers(0, 256, (48, 64, 4), np.uint8)
-    return Image.fromarray(pixels).convert(kind)
+    return Image.fromarray(photo_formats.noise(48, 64, 4, seed=seed)).convert(kind)
 
 
 def photos(path, frames=4, convert="RGB", **options):

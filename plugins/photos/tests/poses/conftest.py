@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import textured_room
-from photo_formats import turned
+from photo_formats import noise, turned
 from PIL import Image
 from qgs_photos.poses.making import Options, make_poses
 from walked import PHOTOS, QUIET, SCALE, cut
@@ -33,9 +33,9 @@ def walk(images, tmp_path_factory):
     photos[4].save(folder / "4.avif", quality=95)
     photos[5].convert("RGBA").save(folder.parent / "5.png")
     (folder / "5.png").symlink_to(folder.parent / "5.png")
-    noise = np.random.default_rng(7).integers(0, 255, images[0].shape, np.uint8)
-    Image.fromarray(noise).save(folder / "other.png")
-    Image.fromarray(noise).save(folder / "broken.png")
+    other = Image.fromarray(noise(*images[0].shape, seed=7))
+    other.save(folder / "other.png")
+    other.save(folder / "broken.png")
     cut(folder / "broken.png", 0.5)
     for name in ("empty.jpg", "a.DNG", "._0.jpg"):
         (folder / name).touch()

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 from commands import run_qgs
+from photo_formats import noise
 from PIL import Image
 from qgs_photos.poses import making
 from qgs_photos.poses.photos import PosesError
@@ -26,7 +27,7 @@ def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
         "one view": images[:1] * 4,
         "bare": [np.full_like(image, 127) for image in images],
         "blurred": [np.array(Image.fromarray(i).resize((9, 6)).resize((180, 120))) for i in images],
-        "noise": np.random.default_rng(0).integers(0, 255, (3, 160, 240, 3), np.uint8),
+        "noise": noise(3, 160, 240, 3),
         "tiny": [image[:10, :10] for image in images],
         "cut off": images,
     }

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from photo_formats import noise
 from PIL import Image, ImageFilter
 from qgs_photos.poses.frames import FEWEST, extract, thinned
 from qgs_photos.poses.photos import camera_groups, photo_files, prepare
@@ -43,8 +44,7 @@ def test_videos_of_other_kinds_are_read(tmp_path):
 
 
 def test_a_picture_that_moves_fast_gives_more_frames(tmp_path):
-    wide = np.random.default_rng(0).integers(0, 255, (12, 100, 3), np.uint8)
-    wide = wide.repeat(8, 0).repeat(8, 1)
+    wide = noise(12, 100, 3).repeat(8, 0).repeat(8, 1)
     counts = []
     for step in (0, 8):  # pixels of 128
         images = [np.ascontiguousarray(wide[:, step * n : step * n + 128]) for n in range(80)]
