@@ -115,9 +115,8 @@ def remarks_on_all(walk, out):
     return " ".join(made.remarks)
 
 
-@pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("least", ["few.PARALLAX", "worker.FEW_MATCHES"])
-def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, least):
+def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, least, alone):
     monkeypatch.setattr(f"qgs_photos.poses.{least}", np.inf)
     remarks_on_all(walk, tmp_path / "made")
 
@@ -153,8 +152,7 @@ def learning(monkeypatch, tmp_path, alone):
     monkeypatch.setattr(learned, "_load", lambda *_: None)
 
 
-@pytest.mark.usefixtures("learning")
-def test_learned_features_give_poses_where_the_photos_have_them(images, shots, tmp_path):
+def test_learned_features_give_poses_where_the_photos_have_them(images, shots, tmp_path, learning):
     """Of a reduced photo, a grey one, and one without any."""
     grey = Image.fromarray(images[3]).convert("L")
     write_photos(tmp_path / "two", [np.array(grey), images[5], np.zeros((64, 64, 3), np.uint8)])
@@ -164,12 +162,10 @@ def test_learned_features_give_poses_where_the_photos_have_them(images, shots, t
     assert_close(tmp_path / "made", [shots[3], shots[5]])
 
 
-@pytest.mark.usefixtures("learning")
-def test_learned_features_connect_photos(walk, tmp_path):
+def test_learned_features_connect_photos(walk, tmp_path, learning):
     remarks_on_all(walk, tmp_path / "made")
 
 
-@pytest.mark.usefixtures("learning")
-def test_sift_connects_photos_where_learned_features_do_not(walk, tmp_path, monkeypatch):
+def test_sift_connects_photos_where_learned_features_do_not(walk, tmp_path, monkeypatch, learning):
     monkeypatch.setattr(learned, "learn", Mock(side_effect=RefusedError(NO_MATCHES)))
     assert "ALIKED" not in remarks_on_all(walk, tmp_path / "made")

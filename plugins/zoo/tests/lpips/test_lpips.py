@@ -107,8 +107,7 @@ def test_without_the_package_the_reason_names_the_extra(monkeypatch):
     assert "lpips" in metrics["lpips"].unavailable  # evaluations go on without it
 
 
-@pytest.mark.usefixtures("package")
-def test_weights_that_are_not_there_or_do_not_fit_are_named(tmp_path, monkeypatch):
+def test_weights_that_are_not_there_or_do_not_fit_are_named(tmp_path, monkeypatch, package):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     resnet = tmp_path / "resnet.safetensors"
     save_file({"conv1.weight": torch.zeros(1)}, resnet)
