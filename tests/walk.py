@@ -30,6 +30,13 @@ def pinhole(c2w, lens=(64.0, 64.0, 32.0, 32.0), size=(SIDE, SIDE)):
     return Cameras(c2w, torch.tensor(lens).to(c2w).expand(len(c2w), 4), size)
 
 
+def assert_rigid(c2w):
+    """Poses turn and mirror nothing."""
+    turn = torch.as_tensor(c2w)[..., :3, :3]
+    assert torch.allclose(turn @ turn.mT, torch.eye(3).to(turn), 0, 1e-5)
+    assert (torch.linalg.det(turn) > 0).all()
+
+
 def cloud(number, seed=0):
     """Gaussians (1, G) around the origin."""
     generator = torch.Generator().manual_seed(seed)

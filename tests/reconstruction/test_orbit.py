@@ -1,15 +1,14 @@
 import torch
 from torch.testing import assert_close
+from walk import assert_rigid
 
 from qgs.reconstruction.saving import orbit
 
 
 def test_the_loop_is_smooth_closed_and_rigid_and_passes_between_the_inputs(cameras):
     c2w = orbit(cameras, depth=1.0, frames=60).c2w[0]
-    rotation = c2w[:, :3, :3]
     eyes = c2w[:, :3, 3]
-    assert_close(rotation @ rotation.mT, torch.eye(3).expand(60, 3, 3))
-    assert (torch.linalg.det(rotation) > 0).all()
+    assert_rigid(c2w)
     steps = (eyes.roll(-1, 0) - eyes).norm(dim=-1)
     assert steps.max() < 3 * steps.mean()
     assert 0.1 < eyes[:, 0].mean() < 0.2

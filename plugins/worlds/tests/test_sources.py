@@ -9,6 +9,7 @@ from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.rooms.source import RoomScene, RoomsSource
 from qgs_worlds.worlds.source import WorldsSource
 from tables import assert_equal
+from walk import assert_rigid
 
 from qgs.checkpoint.models import checkpoint_path
 from qgs.geometry.rays import pixel_directions
@@ -43,11 +44,9 @@ def test_cameras_are_rigid_and_keep_clear_of_every_surface(source):
         else:
             shapes = scene.drawn.world.shapes
             c2w = scene.drawn.rig.c2w
-        turn = c2w[:, :3, :3]
+        assert_rigid(c2w)
         assert clearances(shapes, c2w[:, :3, 3]).min() > 0.15
-        assert np.linalg.inv(turn) == pytest.approx(turn.transpose(0, 2, 1), abs=1e-5)
-        assert np.linalg.det(turn).min() > 0.99
-        assert turn[:, 2, 1].max() < 0, "the image's y axis points down"
+        assert c2w[:, 2, 1].max() < 0, "the image's y axis points down"
 
 
 @pytest.mark.parametrize("size", [(17, 33), (130, 5)])

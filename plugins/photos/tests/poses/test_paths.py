@@ -13,7 +13,7 @@ from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, see
 from qgs_photos.poses.paths import path_of, read_path, walk
 from tables import assert_near, must_refuse, write_json
 from training_runs import tiny
-from walk import along_x, cloud, pinhole
+from walk import along_x, assert_rigid, cloud, pinhole
 from walked import frames
 
 import qgs
@@ -41,9 +41,7 @@ def wall(depth):
 def test_paths_are_rigid_and_take_small_steps():
     paths = [path_of(kind, cameras(), 3.0, 40) for kind in ("orbit", "spiral", "walk")]
     c2w = torch.stack(paths)
-    turn = c2w[..., :3, :3]
-    assert torch.allclose(turn @ turn.mT, torch.eye(3), 0, 1e-5)
-    assert (turn.det() > 0).all()
+    assert_rigid(c2w)
     assert c2w[..., :3, 3].diff(dim=1).norm(dim=-1).max() < 0.15
 
 
