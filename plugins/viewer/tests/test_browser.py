@@ -40,6 +40,7 @@ def page(tmp_path_factory):
 
 def drawn(page, unlike=None):
     """The scene once it stands still, has colours, and is another than before."""
+    page.until("the canvas", "!!document.querySelector('canvas')")
     pictures = [page.picture()[SCENE]]
 
     def stands():
@@ -60,7 +61,6 @@ def test_the_viewer(page):
         panel = Panel(server, source)
         address = f"127.0.0.1:{server.get_port()}"
         page.open(f"http://{address}")
-        page.until("the canvas", "!!document.querySelector('canvas')")
         opened = drawn(page)
         page.until("its name", f"document.body.innerText.includes({source.title!r})")
         assert page.evaluate("document.querySelector('#named')") is None
@@ -84,18 +84,24 @@ def test_the_viewer(page):
         assert {place.netloc for place in outside} == {address}
 
 
-def opened(page, tmp_path, scene):
-    """The file of a page of `scene` that is open."""
-    file = tmp_path / "scene.html"
-    file.write_text(scene_html(scene))
+def opened(page, tmp_path, html):
+    """The file of a page that is open."""
+    file = tmp_path / "page.html"
+    file.write_text(html)
     page.open(file.as_uri())
-    page.until("the canvas", "!!document.querySelector('canvas')")
     return file
+
+
+def assert_fits_a_phone(page):
+    phone = {"width": 420, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    page.call("Emulation.setDeviceMetricsOverride", **phone)
+    assert page.evaluate("document.documentElement.scrollWidth") == 420
+    page.call("Emulation.clearDeviceMetricsOverride")
 
 
 def test_a_page_draws_and_asks_for_nothing(page, tmp_path):
     source = open_source(MODEL)
-    file = opened(page, tmp_path, source.scene_of(source.frames))
+    file = opened(page, tmp_path, scene_html(source.scene_of(source.frames)))
     drawn(page)
     grey = (abs(page.picture() - 127.5).max(-1) < 1).mean()
     assert grey > 0.02  # the background of the model, not that of the page
@@ -131,7 +137,7 @@ def test_a_page_has_the_colors_of_several_directions(page, tmp_path, monkeypatch
         still = {"means": torch.zeros(1, 1, 3), "opacities": torch.ones(1, 1), "sh": sh}
         given = replace(cloud(1), **still)
         monkeypatch.setattr("qgs_viewer.page.first_eye", lambda _, eye=eye: (eye, (0, 0, 0)))
-        opened(page, tmp_path, QueryScene(given))
+        opened(page, tmp_path, scene_html(QueryScene(given)))
         shown = drawn(page)[168, 310]
         values = harmonics(normalize(-torch.tensor(eye), dim=0), count)
         expected = 255 * (given.colors + values @ sh)[0, 0]
@@ -146,9 +152,7 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     photos = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0)))(given, cameras).rgb
     names = ["</script><b>left</b>", "middle", "right"]
     tour = Tour("walk", "3 photos", Views(1 - photos, cameras), names, 2, cameras)
-    file = tmp_path / "scene.html"
-    file.write_text(gaussians_html(given, tour))
-    page.open(file.as_uri())
+    file = opened(page, tmp_path, gaussians_html(given, tour))
     page.until("the scene", "window.tour && !document.querySelector('#veil')")
     buttons = "[...document.querySelectorAll('#tour nav button')]"
     assert page.evaluate(f"{buttons}.map(b => b.innerText)") == ["play", "record", *names]
@@ -182,10 +186,7 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     page.evaluate(f"{buttons}[0].click()")
     page.until("a flight", lambda: abs(page.picture() - still).mean() > 8)
     page.evaluate(f"{buttons}[0].click()")
-    phone = {"width": 420, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-    page.call("Emulation.setDeviceMetricsOverride", **phone)
-    assert page.evaluate("document.documentElement.scrollWidth") == 420
-    page.call("Emulation.clearDeviceMetricsOverride")
+    assert_fits_a_phone(page)
     assert not page.errors
     assert_alone(page, file)
 
@@ -198,9 +199,8 @@ def assert_alone(page, file):
 def test_a_report(page, tmp_path):
     names = [stand_in(tmp_path / f"{kind}.safetensors") for kind in PAIR]
     models = open_models(names, None, "cpu")
-    file = tmp_path / "report.html"
-    file.write_text(report_html(Comparison(models, {}, {}), model_scenes(models, 2)))
-    page.open(file.as_uri())
+    html = report_html(Comparison(models, {}, {}), model_scenes(models, 2))
+    file = opened(page, tmp_path, html)
     page.until("the script", "document.readyState == 'complete' && !!window.theme.textContent")
 
     shown = "[...document.querySelectorAll('article')].map(a => a.checkVisibility())"
@@ -223,11 +223,7 @@ def test_a_report(page, tmp_path):
     page.evaluate(press)
     assert page.evaluate(paper) == white
 
-    phone = {"width": 420, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-    page.call("Emulation.setDeviceMetricsOverride", **phone)
-    assert page.evaluate("document.documentElement.scrollWidth") == 420
-    page.call("Emulation.clearDeviceMetricsOverride")
-
+    assert_fits_a_phone(page)
     assert not page.evaluate("!!document.querySelector('iframe')")
     page.evaluate("document.querySelector('.open').click()")
 
