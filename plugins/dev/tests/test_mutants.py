@@ -58,5 +58,4 @@ RENDERED = [("dilation", 0.1), ("dilation", 1.0), ("alpha_min", 1 / 128), ("back
 )
 def test_a_sound_component_of_unusual_options_passes(checks: list[str], case: Case) -> None:
     for name in checks:
-        result = run_check(CHECKS[name], case)
-        assert result.verdict == "passed", result.message
+        CHECKS[name].function(case)
