@@ -145,6 +145,13 @@ def put(path, content):
     path.write_bytes(content)
 
 
+def cut(path, part):
+    """Only the first part of a file."""
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * part)])
+    return path
+
+
 def uploaded(folder, place):
     """Copy the files in `folder` to a place of another file system."""
     for file in filter(Path.is_file, folder.rglob("*")):

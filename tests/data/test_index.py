@@ -4,7 +4,7 @@ from unittest.mock import Mock
 
 import torch
 from line_scenes import Line, Lines, plan_of, samples_of
-from photo_formats import opened, synthetic, write_nerfstudio
+from photo_formats import cut, opened, synthetic, write_nerfstudio
 from tables import assert_near, must_refuse, rows, write_json
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
@@ -61,8 +61,7 @@ def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(tmp
     for name in index:
         write_nerfstudio(sets / name, photos)
     (sets / "broken/transforms.json").write_text("{")
-    photo = sets / "cut/images/view_002.png"
-    photo.write_bytes(photo.read_bytes()[:200])
+    cut(sets / "cut/images/view_002.png", 0.1)
     (sets / "gap/images/view_001.png").unlink()
     plan = plan_of(opened(sets, (16, 16)), VIEWS, indexed(tmp_path, index))
     assert plan.wanted == tuple(index)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import textured_room
-from photo_formats import noise, turned
+from photo_formats import cut, noise, turned
 from PIL import Image
 from qgs_photos.poses.making import Options, make_poses
-from walked import PHOTOS, QUIET, SCALE, cut
+from walked import PHOTOS, QUIET, SCALE
 
 
 @pytest.fixture(scope="session")

@@ -9,13 +9,13 @@ import sys
 import numpy as np
 import pytest
 from commands import run_qgs
-from photo_formats import noise
+from photo_formats import cut, noise
 from PIL import Image
 from qgs_photos.poses import making
 from qgs_photos.poses.photos import PosesError
 from scipy.io import wavfile
 from tables import contents
-from walked import cut, write_photos, write_video
+from walked import write_photos, write_video
 
 
 def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):

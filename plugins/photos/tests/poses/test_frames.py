@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from photo_formats import noise
+from photo_formats import cut, noise
 from PIL import Image, ImageFilter
 from qgs_photos.poses.frames import FEWEST, extract, thinned
 from qgs_photos.poses.photos import camera_groups, photo_files, prepare
-from walked import cut, write_photos, write_turned, write_video
+from walked import write_photos, write_turned, write_video
 
 
 def numbered_images(count):

@@ -61,10 +61,3 @@ def assert_close(folder, shots):
     assert len(frames) == len(shots)
     found, true = (relative(np.stack([one.c2w for one in each])) for each in (frames, shots))
     assert np.median(np.linalg.norm(found - true, axis=(1, 2))) < 0.0175
-
-
-def cut(path, part):
-    """Only the first part of a file."""
-    data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * part)])
-    return path
