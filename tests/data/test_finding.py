@@ -10,6 +10,11 @@ from qgs.wording import warn_once
 
 FOUND = """
 images/N.png: images/N.png:
+./train/N: train/N.png:
+train/at_0.N: train/at_0.N.png:
+images/N.JPG: images/N.JPG:
+images\\N.jp2: images/N.jp2:
+images/N.exr: images/N.exr:
 C\\Users\\me\\spoon\\images\\N.png: images/N.png: told
 /data/me/spoon/images/N.png: images/N.png: told
 /data/N.png: N.png: told

@@ -8,12 +8,9 @@ import numpy as np
 import photo_formats
 import pytest
 import torch
-import yaml
 from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
 from tables import assert_equal, assert_near, must_not_find, must_refuse, read_json, write_json
-
-from qgs.data.photos.nerfstudio import image_name
 
 
 @pytest.fixture(autouse=True)
@@ -88,22 +85,6 @@ def test_splits(caplog):
 def test_a_split_that_names_no_frame_is_told():
     change(train_filenames=["images/other.png"])
     must_refuse(r"transforms\.json: 'train_filenames' names .*other\.png", read)
-
-
-LISTED = r"""
-./train/r_0: train/r_0.png
-train/at_0.5: train/at_0.5.png
-images/a.JPG: images/a.JPG
-images\b.jp2: images/b.jp2
-images/c.exr: images/c.exr
-../d: ../d.png
-"""
-"""A name in transforms.json, and the file that it means."""
-
-
-def test_names_of_images():
-    names = yaml.safe_load(LISTED)
-    assert {listed: image_name(listed) for listed in names} == names
 
 
 def test_an_angle_of_view_without_a_size_goes_with_the_first_image():
