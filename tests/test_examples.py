@@ -34,7 +34,7 @@ def test_loss_and_gradients_are_the_frameworks(nano):
     p = nano.Weights(
         {name: weight.detach().requires_grad_() for name, weight in model.named_parameters()}
     )
-    inputs, targets = (odd_views(2, 8, 16, seed=seed) for seed in (0, 3))
+    inputs, targets = (odd_views(2, 8, seed=seed) for seed in (0, 3))
 
     loss = passes(inputs, targets).total
     loss.backward()

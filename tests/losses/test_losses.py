@@ -20,9 +20,11 @@ from qgs.wording import warn_once
 POINTS = GOLDEN["points"]
 
 
-def photometric(rgb=PREDICTED, truth=TRUTH, **options):
-    cameras = CAMERAS.replace(size=truth.shape[-2:])
-    return judged(Photometric(Photometric.Config(**options)), Views(truth, cameras), rgb=rgb)
+VIEWS = Views(TRUTH, CAMERAS)
+
+
+def photometric(rgb=PREDICTED, **options):
+    return judged(Photometric(Photometric.Config(**options)), VIEWS, rgb=rgb)
 
 
 def test_valid_ssim_is_the_metric_of_large_enough_images():
@@ -39,8 +41,7 @@ def test_terms_have_weights_and_those_of_weight_zero_are_left_out():
 
 
 def test_mask_without_masks_is_refused():
-    views = Views(TRUTH, CAMERAS)
-    must_refuse("qgs/mask needs views with masks", judged, Mask(Mask.Config()), views)
+    must_refuse("qgs/mask needs views with masks", judged, Mask(Mask.Config()), VIEWS)
 
 
 def test_gradients_of_visibility_are_finite_everywhere():

@@ -21,14 +21,13 @@ def photo(number, size=(32, 18)):
     return photo_formats.encoded(Image.new("RGB", size, (10 * number, 50, 200)))
 
 
-def listing(**top):
-    given = listed_lens(100.0, 101.0, 60.0, 37.0, 72, 128)
-    return json.dumps(row_of_frames(4, **given | top)).encode()
+LENS = listed_lens(100.0, 101.0, 60.0, 37.0, 72, 128)
+LISTING = json.dumps(row_of_frames(4, **LENS)).encode()
 
 
-def scene_files(inside="", images="images_4", **top):
+def scene_files(inside="", images="images_4"):
     files = {f"{inside}{images}/{i}.png": photo(i) for i in range(4)}
-    return {f"{inside}transforms.json": listing(**top), **files}
+    return {f"{inside}transforms.json": LISTING, **files}
 
 
 def write(path, files):
@@ -96,7 +95,7 @@ def test_incomplete_and_broken_archives_are_told():
     for files, file in (
         ({"abc/images_4/0.png": b""}, r"abc\.zip"),
         ({"abc/transforms.json": b"{"}, r"abc/transforms\.json::.*abc\.zip"),
-        ({"abc/transforms.json": listing()}, "`images`"),
+        ({"abc/transforms.json": LISTING}, "`images`"),
     ):
         write("abc.zip", files)
         must_refuse(file, length, kind=(ValueError, OSError))

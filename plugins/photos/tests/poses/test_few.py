@@ -108,9 +108,9 @@ def alone(monkeypatch):
     monkeypatch.setattr(making, "run", lambda job, show: worker.mapped(job).values())
 
 
-def remarks_on_all(walk, out):
+def remarks_on_all(walk, folder):
     """Of all photos, which have poses."""
-    made = making.make_poses(walk, out, making.Options(side=240), QUIET)
+    made = making.make_poses(walk, folder / "made", making.Options(side=240), QUIET)
     assert len(made.posed) == PHOTOS
     return " ".join(made.remarks)
 
@@ -118,7 +118,7 @@ def remarks_on_all(walk, out):
 @pytest.mark.parametrize("least", ["few.PARALLAX", "worker.FEW_MATCHES"])
 def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, least, alone):
     monkeypatch.setattr(f"qgs_photos.poses.{least}", np.inf)
-    remarks_on_all(walk, tmp_path / "made")
+    remarks_on_all(walk, tmp_path)
 
 
 def detector(pixels):
@@ -163,9 +163,9 @@ def test_learned_features_give_poses_where_the_photos_have_them(images, shots, t
 
 
 def test_learned_features_connect_photos(walk, tmp_path, learning):
-    remarks_on_all(walk, tmp_path / "made")
+    remarks_on_all(walk, tmp_path)
 
 
 def test_sift_connects_photos_where_learned_features_do_not(walk, tmp_path, monkeypatch, learning):
     monkeypatch.setattr(learned, "learn", Mock(side_effect=RefusedError(NO_MATCHES)))
-    assert "ALIKED" not in remarks_on_all(walk, tmp_path / "made")
+    assert "ALIKED" not in remarks_on_all(walk, tmp_path)
