@@ -122,10 +122,8 @@ def too_small(context: RecipeContext, side: int, option: str, measure: str) -> I
         yield Problem(option, reason, "raise data.image_size, or remove this option")
 
 
-@full_precision
-def mean_squared_error(images: Tensor, truth: Tensor) -> Tensor:
-    """Return the mean of (images - truth)^2 over all elements."""
-    return F.mse_loss(images, truth)
+mean_squared_error = full_precision(F.mse_loss)
+"""Mean of the squared differences of two tensors, over all elements."""
 
 
 def mean_of_gaussians(values: Tensor, prediction: LayerPrediction) -> Tensor:
