@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch.optim import AdamW
 
-from qgs.contracts import Optimizer, OptimizerConfig, ParameterGroup, TrainingConfig
+from qgs.contracts import Optimizer, OptimizerConfig, ParameterGroup
 
 WARMUP_TIME = 0.1
 """Largest fraction of a time budget that is used for warm-up."""
@@ -49,17 +49,12 @@ class OneCycleAdamW(Optimizer):
         """AdamW's weight decay. It applies to parameters for which `ModelComponent.decays` is true.
         0 means no decay."""
 
-    def __init__(self, config: Config, training: TrainingConfig | None = None) -> None:
-        super().__init__(config, training)
-        self.options = config
-        self.peak = config.learning_rate
-        self.first = config.learning_rate / config.initial_divisor
-        self.last = self.first / config.final_divisor
-        self._descent_starts: float | None = None
+    config: Config
+    _descent_starts: float | None = None
 
     def check(self) -> None:
         """Raise ValueError if the warm-up fills all steps and no time budget shortens it."""
-        warmup = self.options.warmup
+        warmup = self.config.warmup
         steps = self.training.steps
         if not self.follows_schedule and self.training.seconds is None and warmup >= steps:
             raise ValueError(
@@ -69,30 +64,33 @@ class OneCycleAdamW(Optimizer):
 
     def build(self, groups: Sequence[ParameterGroup]) -> AdamW:
         """Build torch's fused AdamW; groups with `decays` false get a weight decay of 0."""
-        decay = self.options.weight_decay
+        decay = self.config.weight_decay
         own = [{**group, "weight_decay": decay if group["decays"] else 0.0} for group in groups]
-        return AdamW(own, lr=self.peak, betas=self.options.betas, fused=True)
+        return AdamW(own, lr=self.config.learning_rate, betas=self.config.betas, fused=True)
 
     def learning_rate(self, step: int, seconds: float) -> float:
         """Return the learning rate: that of the recipe's schedule, or else that of the cycle."""
         if self.follows_schedule:
             return super().learning_rate(step, seconds)
+        config = self.config
+        peak = config.learning_rate
+        first = peak / config.initial_divisor
         # steps - 1: the last step has the last rate, as in torch's OneCycleLR.
         of_steps = step / max(self.training.steps - 1, 1)
         of_seconds = seconds / (self.training.seconds or math.inf)
         used = min(max(of_steps, of_seconds), 1.0)
         if self._descent_starts is None:
-            top = self.options.warmup - 1
+            top = config.warmup - 1
             warmed = max(step / top if top > 0 else 1.0, of_seconds / WARMUP_TIME)
             if warmed < 1:
-                if self.options.warmup_shape == "linear":
-                    return self.first + (self.peak - self.first) * warmed
-                return _cosine(self.first, self.peak, warmed)
+                if config.warmup_shape == "linear":
+                    return first + (peak - first) * warmed
+                return _cosine(first, peak, warmed)
             # Kept, since a later end of the budget must not bring the warm-up back.
             self._descent_starts = used
         left = 1 - self._descent_starts
         part = (used - self._descent_starts) / left if left > 0 else 1.0
-        return _cosine(self.peak, self.last, min(part, 1.0))
+        return _cosine(peak, first / config.final_divisor, min(part, 1.0))
 
     def state(self) -> Mapping[str, float | None]:
         """Return `descent_starts`: budget fraction at which the rate began to fall; None before."""
