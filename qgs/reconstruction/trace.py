@@ -7,12 +7,12 @@ trace.layers[4].cross_attention.weights         # (scenes, heads, chosen queries
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from qgs.containers import TensorContainer, map_tensors
 from qgs.contracts import AttentionWeights
@@ -35,6 +35,7 @@ class LayerTrace(TensorContainer):
     self_attention: AttentionWeights | None = None
 
 
+@dataclass
 class Trace:
     """Record of a model's last forward pass.
 
@@ -42,45 +43,12 @@ class Trace:
     grid: numbers of views, rows and columns of image tokens; None if tokens are not patches.
     """
 
-    def __init__(self, wanted: Sequence[int], queries: Sequence[int] | None) -> None:
-        self.queries = torch.tensor([], dtype=torch.long)
-        self.grid: tuple[int, int, int] | None = None
-        self.layers: dict[int, LayerTrace] = {}
-        self._wanted = wanted
-        self._wanted_queries = queries
-        # Number of the layer that runs.
-        self._current = 0
+    queries: Tensor
+    grid: tuple[int, int, int] | None = None
+    layers: dict[int, LayerTrace] = field(default_factory=dict)
 
-    def _start(self, module: nn.Module, args: Any) -> None:
-        """Delete the record of the previous pass when the model starts."""
-        self.layers.clear()
-        self._current = 0
-
-    def _enter(self, module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
-        """Record the state before a layer when the layer starts."""
-        state, memory = args
-        self._current += 1
-        self.grid = memory.grid
-        # Some queries are known only now, such as those that a model makes of the photos.
-        if self._current == 1:
-            found = _checked(self._wanted_queries, range(state.features.shape[1]), "queries")
-            self.queries = torch.tensor(found, dtype=torch.long)
-        if self._current in self._wanted:
-            self.layers[self._current] = LayerTrace(self._chosen(state))
-
-    @torch.no_grad()
-    def _explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:
-        """Record the attention weights of the sublayer called `part` when the sublayer starts."""
-        if self._current in self._wanted:
-            weights = module.explain(*args, self.queries.to(args[0].features.device))
-            setattr(self.layers[self._current], part, weights)
-
-    def _leave(self, module: nn.Module, args: Any, state: QueryState) -> None:
-        """Record the state after a layer when its refinement ends."""
-        if self._current in self._wanted:
-            self.layers[self._current].after = self._chosen(state)
-
-    def _chosen(self, state: QueryState) -> QueryState:
+    def chosen(self, state: QueryState) -> QueryState:
+        """Return the recorded queries of a state, without gradients."""
         index = self.queries.to(state.features.device)
         return map_tensors(lambda tensor: tensor.detach()[:, index], state)
 
@@ -99,20 +67,49 @@ def trace(
     queries: indices of queries; None records all.
     Recorded tensors have no gradients. Raises ValueError for layers or queries that do not exist.
     """
-    numbers = _checked(layers, range(1, model.depth + 1), "layers")
+    wanted = _checked(layers, range(1, model.depth + 1), "layers")
     if model.queries.count is not None:
         _checked(queries, range(model.queries.count), "queries")
-    recorded = Trace(numbers, queries)
+    recorded = Trace(torch.tensor([], dtype=torch.long))
+    current = 0  # number of the layer that runs
+
+    def start(module: nn.Module, args: Any) -> None:
+        nonlocal current
+        recorded.layers.clear()
+        current = 0
+
+    def enter(module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
+        nonlocal current
+        state, memory = args
+        current += 1
+        recorded.grid = memory.grid
+        # Some queries are known only now, such as those that a model makes of the photos.
+        if current == 1:
+            found = _checked(queries, range(state.features.shape[1]), "queries")
+            recorded.queries = torch.tensor(found, dtype=torch.long)
+        if current in wanted:
+            recorded.layers[current] = LayerTrace(recorded.chosen(state))
+
+    @torch.no_grad()
+    def explain(part: str, module: Any, args: tuple[Any, ...]) -> None:
+        if current in wanted:
+            weights = module.explain(*args, recorded.queries.to(args[0].features.device))
+            setattr(recorded.layers[current], part, weights)
+
+    def leave(module: nn.Module, args: Any, state: QueryState) -> None:
+        if current in wanted:
+            recorded.layers[current].after = recorded.chosen(state)
+
     with ExitStack() as hooks:
-        hooks.enter_context(model.register_forward_pre_hook(recorded._start))
+        hooks.enter_context(model.register_forward_pre_hook(start))
         for layer in model.decoder:
-            hooks.enter_context(layer.register_forward_pre_hook(recorded._enter))
+            hooks.enter_context(layer.register_forward_pre_hook(enter))
             for part in ("cross_attention", "self_attention"):
                 if hasattr(layer, part):
-                    hook = partial(recorded._explain, part)
+                    hook = partial(explain, part)
                     hooks.enter_context(getattr(layer, part).register_forward_pre_hook(hook))
         for refinement in model.refinements:
-            hooks.enter_context(refinement.register_forward_hook(recorded._leave))
+            hooks.enter_context(refinement.register_forward_hook(leave))
         yield recorded
 
 
