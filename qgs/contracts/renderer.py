@@ -1,4 +1,4 @@
-"""Contract of the slot `renderer`, and helpers that check and prepare a renderer's inputs."""
+"""Contract of the slot `renderer`, which checks and prepares what a renderer draws."""
 
 from abc import abstractmethod
 from typing import Annotated, ClassVar
@@ -12,6 +12,7 @@ from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpe
 from qgs.contracts.settings import Far
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import seen_colors
+from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians, Rendering
 
 Channel = Annotated[float, Field(ge=0, le=1)]
@@ -69,7 +70,8 @@ class Renderer(Component, torch.nn.Module):
         "rendering.depth": FieldSpec((1, "H", "W"), frame="camera"),
     }
 
-    @abstractmethod
+    # Half precision has no digits for pixels.
+    @full_precision
     def forward(
         self,
         gaussians: Gaussians,  # (B, G)
@@ -82,8 +84,27 @@ class Renderer(Component, torch.nn.Module):
         Raises ValueError for Gaussians and cameras of different batch sizes or devices, and for
         cameras that require a gradient not listed in `camera_gradients`.
         """
+        gaussians, cameras = _prepared(gaussians, cameras)
+        backdrop = self._backdrop(background, gaussians.means)
+        return self.draw(gaussians, cameras, _channels_of(gaussians, cameras), backdrop)
 
-    def backdrop(self, background: Tensor | None, like: Tensor) -> Tensor:
+    @abstractmethod
+    def draw(
+        self,
+        gaussians: Gaussians,  # (B, G)
+        cameras: Cameras,  # (B, V)
+        channels: Tensor,  # (B, V, G, 3 + F)
+        backdrop: Tensor,  # (3,) RGB
+    ) -> Rendering:
+        """Render every scene from each of its cameras, in float64 if the means are float64.
+
+        Batch sizes and devices match, numbers are float32 or float64, and autocast is off.
+        channels: what is blended: colours of the Gaussians from each camera, then their features;
+            (B, 1, G, 3 + F) if colours do not depend on the camera.
+        backdrop: background of the colours, on the device of the Gaussians.
+        """
+
+    def _backdrop(self, background: Tensor | None, like: Tensor) -> Tensor:
         """Return `background` as RGB (3,) in dtype and device of `like`.
 
         None stands for the option `background`.
@@ -98,7 +119,7 @@ class Renderer(Component, torch.nn.Module):
         return background.to(like)
 
 
-def prepared(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+def _prepared(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
     """Return Gaussians and cameras in float64 if the means are float64, else in float32.
 
     Raises ValueError unless Gaussians (B, G) and cameras (B, V) match in shape and device.
@@ -122,7 +143,7 @@ def prepared(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras
     return gaussians.to(dtype), cameras.to(dtype)
 
 
-def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+def _channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
     """Return the channels to blend: the colours of Gaussians from each camera, then their features.
 
     The shape is (B, V, G, 3 + F): scenes, views, Gaussians, RGB and F features; or (B, 1, G, 3 + F)

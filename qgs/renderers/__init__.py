@@ -19,13 +19,13 @@ class AutoRenderer(Renderer):
     # Refused on the CPU too, so that results do not depend on the device.
     problems = GsplatRenderer.problems  # type: ignore[assignment]
 
-    def forward(
-        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    def draw(
+        self, gaussians: Gaussians, cameras: Cameras, channels: Tensor, backdrop: Tensor
     ) -> Rendering:
         """Render every scene from each of its cameras; raise RuntimeError if gsplat is missing."""
         kind = GsplatRenderer if gaussians.means.is_cuda else CpuRenderer
         # Created in each call, because options may follow a schedule.
-        return kind(self.config)(gaussians, cameras, background)
+        return kind(self.config).draw(gaussians, cameras, channels, backdrop)
 
 
 COMPONENTS: tuple[type[Component], ...] = (AutoRenderer, CpuRenderer, GsplatRenderer, TorchRenderer)

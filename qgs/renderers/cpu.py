@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.renderer import channels_of, prepared
 from qgs.machine import in_threads
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering, Size
@@ -34,35 +33,29 @@ class CpuRenderer(Renderer):
     name = "cpu"
     devices = ("cpu",)
 
-    def forward(
-        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    def draw(
+        self, gaussians: Gaussians, cameras: Cameras, channels: Tensor, backdrop: Tensor
     ) -> Rendering:
         """Render every scene from each of its cameras; raise ValueError for tensors off the CPU."""
-        gaussians, cameras = prepared(gaussians, cameras)
         if gaussians.means.device.type != "cpu":
             raise ValueError(
                 f"qgs/cpu renders CPU tensors, got Gaussians on {gaussians.means.device}; move "
                 "them with .to('cpu') or choose `renderer: {type: qgs/auto}`"
             )
-        config = self.config
-        # Half precision has no digits for pixels.
-        with torch.autocast("cpu", enabled=False):
-            channels = channels_of(gaussians, cameras)
-            count = channels.shape[-1]
-            given = (
-                gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities,
-                cameras.c2w, cameras.intrinsics,
-            )  # fmt: skip
-            geometry = [tensor.float() for tensor in given]
-            # Three at a time, as if all were colours.
-            parts = [
-                _Splat.apply(three.float(), *geometry, cameras.size, config)
-                for three in F.pad(channels, (0, -count % 3)).split(3, -1)
-            ]
-            blended = torch.cat([part[:, :, :3] for part in parts], 2)[:, :, :count]
-            sums = torch.cat([blended, parts[0][:, :, 3:]], 2)
-            backdrop = self.backdrop(background, gaussians.means)
-            return resolve(sums.to(gaussians.means.dtype), backdrop)
+        count = channels.shape[-1]
+        given = (
+            gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities,
+            cameras.c2w, cameras.intrinsics,
+        )  # fmt: skip
+        geometry = [tensor.float() for tensor in given]
+        # Three at a time, as if all were colours.
+        parts = [
+            _Splat.apply(three.float(), *geometry, cameras.size, self.config)
+            for three in F.pad(channels, (0, -count % 3)).split(3, -1)
+        ]
+        blended = torch.cat([part[:, :, :3] for part in parts], 2)[:, :, :count]
+        sums = torch.cat([blended, parts[0][:, :, 3:]], 2)
+        return resolve(sums.to(gaussians.means.dtype), backdrop)
 
 
 class _Splat(torch.autograd.Function):

@@ -16,7 +16,6 @@ from qgs.contracts import (
     Renderer,
     RendererConfig,
 )
-from qgs.contracts.renderer import channels_of, prepared
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -34,56 +33,64 @@ class GsplatRenderer(Renderer):
 
     def __init__(self, config: RendererConfig) -> None:
         super().__init__(config)
-        for problem in _unsupported(config):
+        for problem in self.problems(config):
             raise ValueError(f"{problem.option}: {problem.reason}; {problem.fix}")
 
     @classmethod
-    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+    def problems(
+        cls, config: ComponentConfig, context: RecipeContext | None = None
+    ) -> Iterable[Problem]:
         """Return a problem for each option that differs from its fixed value in the kernels."""
-        return _unsupported(config)
+        defaults = RendererConfig()
+        return [
+            Problem(
+                option,
+                f"gsplat's kernels fix this option at {getattr(defaults, option):g}, "
+                f"got {getattr(config, option):g}",
+                "remove the option, or choose qgs/torch or qgs/cpu as renderer",
+            )
+            for option in ("alpha_min", "alpha_cap", "transmittance_min")
+            if getattr(config, option) != getattr(defaults, option)
+        ]
 
-    def forward(
-        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    def draw(
+        self, gaussians: Gaussians, cameras: Cameras, channels: Tensor, backdrop: Tensor
     ) -> Rendering:
         """Render every scene from each of its cameras.
 
         Raises ValueError for tensors that are not on CUDA, and RuntimeError if gsplat is missing.
         """
-        gaussians, cameras = prepared(gaussians, cameras)
         _check_supported(gaussians, cameras)
         # gsplat's kernels divide by their number.
         if not gaussians.means.shape[1]:
-            return TorchRenderer(self.config)(gaussians, cameras, background)
+            return TorchRenderer(self.config).draw(gaussians, cameras, channels, backdrop)
         # Imported late: it needs CUDA.
         rasterization = import_module("gsplat").rasterization
 
-        with torch.autocast("cuda", enabled=False):
-            backdrop = self.backdrop(background, gaussians.means)
-            channels = channels_of(gaussians, cameras)
-            # Features are over 0.
-            backdrop = F.pad(backdrop, (0, channels.shape[-1] - 3))
-            height, width = cameras.size
-            focal, principal = cameras.intrinsics.split(2, -1)
-            calibration = torch.diag_embed(F.pad(focal, (0, 1), value=1.0))
-            calibration[..., :2, 2] = principal
-            # The packed path asserts with backgrounds and can mix gradients between scenes.
-            rgbd, alpha, _ = rasterization(
-                means=gaussians.means,
-                quats=gaussians.quats,
-                scales=gaussians.scales,
-                opacities=gaussians.opacities,
-                colors=channels.expand(-1, cameras.shape[1], -1, -1),
-                viewmats=cameras.w2c,
-                Ks=calibration,
-                width=width,
-                height=height,
-                near_plane=self.config.near,
-                far_plane=self.config.far,
-                eps2d=self.config.dilation,
-                packed=False,
-                backgrounds=backdrop.expand(*cameras.shape, -1).contiguous(),
-                render_mode="RGB+ED",
-            )
+        # Features are over 0.
+        backdrop = F.pad(backdrop, (0, channels.shape[-1] - 3))
+        height, width = cameras.size
+        focal, principal = cameras.intrinsics.split(2, -1)
+        calibration = torch.diag_embed(F.pad(focal, (0, 1), value=1.0))
+        calibration[..., :2, 2] = principal
+        # The packed path asserts with backgrounds and can mix gradients between scenes.
+        rgbd, alpha, _ = rasterization(
+            means=gaussians.means,
+            quats=gaussians.quats,
+            scales=gaussians.scales,
+            opacities=gaussians.opacities,
+            colors=channels.expand(-1, cameras.shape[1], -1, -1),
+            viewmats=cameras.w2c,
+            Ks=calibration,
+            width=width,
+            height=height,
+            near_plane=self.config.near,
+            far_plane=self.config.far,
+            eps2d=self.config.dilation,
+            packed=False,
+            backgrounds=backdrop.expand(*cameras.shape, -1).contiguous(),
+            render_mode="RGB+ED",
+        )
         images = rgbd.movedim(-1, -3)
         return Rendering(
             rgb=images[..., :3, :, :],
@@ -91,20 +98,6 @@ class GsplatRenderer(Renderer):
             depth=images[..., -1:, :, :],
             features=None if gaussians.features is None else images[..., 3:-1, :, :],
         )
-
-
-def _unsupported(config: ComponentConfig) -> list[Problem]:
-    defaults = RendererConfig()
-    return [
-        Problem(
-            option,
-            f"gsplat's kernels fix this option at {getattr(defaults, option):g}, "
-            f"got {getattr(config, option):g}",
-            "remove the option, or choose qgs/torch or qgs/cpu as renderer",
-        )
-        for option in ("alpha_min", "alpha_cap", "transmittance_min")
-        if getattr(config, option) != getattr(defaults, option)
-    ]
 
 
 def _check_supported(gaussians: Gaussians, cameras: Cameras) -> None:

@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.renderer import channels_of, prepared
 from qgs.geometry.constants import constant
 from qgs.geometry.transforms import quat_to_matrix, to_camera, to_pixels
 from qgs.types import Cameras, Gaussians, Rendering, Size
@@ -91,34 +90,31 @@ class TorchRenderer(Renderer):
 
     name = "torch"
 
-    def forward(
-        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    def draw(
+        self, gaussians: Gaussians, cameras: Cameras, channels: Tensor, backdrop: Tensor
     ) -> Rendering:
         """Render every scene from each of its cameras; half-precision inputs become float32."""
-        gaussians, cameras = prepared(gaussians, cameras)
         config = self.config
-        with torch.autocast(gaussians.means.device.type, enabled=False):
-            means, conics, depths, visible = project(
-                gaussians, cameras, config.near, config.far, config.dilation
+        means, conics, depths, visible = project(
+            gaussians, cameras, config.near, config.far, config.dilation
+        )
+        channels = channels.expand(-1, cameras.shape[1], -1, -1)
+        sums = []
+        for image in product(range(cameras.shape[0]), range(cameras.shape[1])):
+            # Front to back; equal depths stay in order.
+            order = depths[image].argsort(stable=True)
+            order = order[visible[image][order]]
+            z = depths[image][order][:, None]
+            weights = _weights(
+                means[image][order],
+                conics[image][order],
+                gaussians.opacities[image[0]][order],
+                cameras.size,
+                config,
             )
-            channels = channels_of(gaussians, cameras).expand(-1, cameras.shape[1], -1, -1)
-            sums = []
-            for image in product(range(cameras.shape[0]), range(cameras.shape[1])):
-                # Front to back; equal depths stay in order.
-                order = depths[image].argsort(stable=True)
-                order = order[visible[image][order]]
-                z = depths[image][order][:, None]
-                weights = _weights(
-                    means[image][order],
-                    conics[image][order],
-                    gaussians.opacities[image[0]][order],
-                    cameras.size,
-                    config,
-                )
-                summed = torch.cat([channels[image][order], z, torch.ones_like(z)], 1)
-                sums.append(torch.einsum("ghw,gc->chw", weights, summed))
-            backdrop = self.backdrop(background, gaussians.means)
-            return resolve(torch.stack(sums).unflatten(0, cameras.shape), backdrop)
+            summed = torch.cat([channels[image][order], z, torch.ones_like(z)], 1)
+            sums.append(torch.einsum("ghw,gc->chw", weights, summed))
+        return resolve(torch.stack(sums).unflatten(0, cameras.shape), backdrop)
 
 
 def resolve(sums: Tensor, background: Tensor) -> Rendering:

@@ -70,4 +70,4 @@ def test_auto_goes_by_where_the_gaussians_are(monkeypatch):
     assert_equal(auto(*scene).rgb, CpuRenderer(RendererConfig())(*scene).rgb)
     gsplat = Mock()
     monkeypatch.setattr("qgs.renderers.GsplatRenderer", gsplat)
-    assert AutoRenderer(RendererConfig())(ON_CUDA, scene[1]) is gsplat.return_value.return_value
+    assert auto.draw(ON_CUDA, scene[1], None, None) is gsplat.return_value.draw.return_value
