@@ -6,7 +6,7 @@ forward pass.
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from itertools import product
+from itertools import product, takewhile
 from typing import Any
 
 from qgs.contracts import (
@@ -27,7 +27,7 @@ from qgs.recipe.errors import Problems
 from qgs.recipe.places import DECODER, layer_place
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.sections import DecoderSettings, Draft
-from qgs.recipe.slots import AFTER_LAYERS
+from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import KeyPath, find, inline
 
 
@@ -164,10 +164,6 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
         yield (*DECODER, "layer_scale"), reason, fix
 
 
-_FLOW = ("encoder", "queries", *LAYER_SLOTS, *AFTER_LAYERS, "losses", "objective")
-"""Slots that read or write fields, in the order of their computation."""
-
-
 def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems) -> None:
     """Report fields that a component reads before they are written, or reads as the wrong type."""
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
@@ -225,7 +221,7 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
     now = {part.slot: f"`{part.type}`, {part.chosen_at}" for part in parts.values()}
     known = [
         f"`{kind}` in the slot `{slot}` (now {now.get(slot, 'empty')})"
-        for slot in _FLOW[: _FLOW.index(reader.slot)]
+        for slot in takewhile(lambda slot: slot != reader.slot, SLOTS)
         for kind, component in registry.components(slot).items()
         if missing.keys() <= _offered(component, default_config(component)).keys()
     ]

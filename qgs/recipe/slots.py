@@ -32,6 +32,7 @@ class Slot:
         return self.contract.slot
 
 
+# In the order of computation: a message names components of earlier slots.
 SLOTS = {
     slot.name: slot
     for slot in (
