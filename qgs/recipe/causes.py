@@ -27,16 +27,15 @@ def at_their_causes(
     plugins: Plugin objects that are used in place of installed plugins of the same names.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
-    left = found
+    left = {*found}
     # Only a refused recipe is read again for each layer.
     with suppress(RecipeError):
         while left and written.under is not None:
             older = draft_of(written.under, Problems(), plugins)
             known = _told(older)
-            fresh = [problem for problem in left if problem not in known]
-            left = [problem for problem in left if problem in known]
-            if fresh:
+            if fresh := left - known:
                 blames |= _blames(fresh, older, written, plugins)
+            left &= known
             written = written.under
     caused: dict[RecipeProblem, list[RecipeProblem]] = {}
     for problem in found:
@@ -55,7 +54,7 @@ def at_their_causes(
 
 
 def _blames(
-    found: Sequence[RecipeProblem], before: Draft, written: MapNode, plugins: Sequence[Plugin]
+    found: set[RecipeProblem], before: Draft, written: MapNode, plugins: Sequence[Plugin]
 ) -> dict[RecipeProblem, RecipeProblem]:
     """Map each problem in `found` to a new problem, at the line that caused it.
 
@@ -76,7 +75,7 @@ def _blames(
         with suppress(RecipeError):
             after = draft_of(base, Problems(), plugins)
             blame = _replacing(after, before) or _changing(path, value, origin, before)
-            for problem in _told(after).intersection(found):
+            for problem in _told(after) & found:
                 blames.setdefault(problem, blame or problem)
             before = after
     return blames
