@@ -220,9 +220,6 @@ class QueryState(TensorContainer):
     def __getitem__(self, name: str) -> Tensor:
         return self.fields[name]
 
-    def __contains__(self, name: object) -> bool:
-        return name in self.fields
-
     def replace(self, **changes: Any) -> Self:
         """Return a changed copy; `fields` adds fields, or replaces fields of equal name."""
         fields = {**self.fields, **changes.pop("fields", {})}
