@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 _C = TypeVar("_C")
-_DIGITS = {str(size): size for size in range(10)}
 
 
 class TensorContainer:
@@ -99,7 +98,7 @@ def check_shapes(
     A letter stands for one size, the same in all fields, and "..." for any leading axes, the same
     in all fields. known: required sizes, by letter. Fields that are None are not checked.
     """
-    sizes: dict[str, Any] = {**_DIGITS, **(known or {})}
+    sizes: dict[str, Any] = dict(known or {})
     for name, spec in shapes.items():
         tensor = getattr(container, name)
         axes = spec.split()
@@ -111,7 +110,8 @@ def check_shapes(
             leading = max(len(shape) - len(axes) + 1, 0)
             given = (shape[:leading], *shape[leading:])
         if len(given) != len(axes) or any(
-            sizes.setdefault(axis, size) != size for axis, size in zip(axes, given, strict=True)
+            sizes.setdefault(axis, int(axis) if axis.isdecimal() else size) != size
+            for axis, size in zip(axes, given, strict=True)
         ):
             wanted = []
             for axis in axes:
