@@ -62,10 +62,9 @@ def relative_to(reference: Tensor, c2w: Tensor) -> Tensor:
 
 @full_precision
 def scaled(c2w: Tensor, scale: Tensor | float) -> Tensor:
-    """Return poses with translations multiplied by `scale`, a number or one for each pose."""
-    factor = torch.as_tensor(scale, dtype=c2w.dtype, device=c2w.device)
+    """Return poses with translations multiplied by the number `scale`."""
     result = c2w.clone()
-    result[..., :3, 3] *= factor[..., None]
+    result[..., :3, 3] *= scale
     return result
 
 
