@@ -3,17 +3,11 @@
 import json
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from qgs.cli.options import Checkpoint, Device, Gaussians, Overrides, Threads, Tune, use_threads
-
-if TYPE_CHECKING:
-    from qgs.evaluate.results import Evaluation
-    from qgs.model import QueryGaussianModel
-    from qgs.recipe import Recipe
 
 
 def evaluate(
@@ -46,7 +40,7 @@ def evaluate(
         settings.append(f"evaluation.index={json.dumps(index, ensure_ascii=False)}")
 
     from qgs.checkpoint.model_file import CheckpointFile
-    from qgs.evaluate.evaluation import SECTIONS
+    from qgs.evaluate.evaluation import SECTIONS, evaluate_into
     from qgs.evaluate.tuning import tuning_settings
     from qgs.recipe import resolve
     from qgs.train.distributed import choose_device
@@ -92,29 +86,3 @@ def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:
         return folder
     numbered = (folder.with_name(f"{folder.name}-{number}") for number in count(2))
     return next(folder for folder in numbered if not folder.exists())
-
-
-def evaluate_into(
-    model: "QueryGaussianModel",
-    recipe: "Recipe",
-    step: int | None,
-    folder: Path,
-) -> "Evaluation":
-    """Evaluate `model` as `recipe` says, write the results into `folder` and print them."""
-    from rich.progress import Progress
-
-    from qgs.evaluate.evaluation import evaluate as judge
-
-    console = Console()
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("scoring scenes", total=None)
-        evaluation = judge(
-            model,
-            recipe,
-            step,
-            lambda done, total: progress.update(task, completed=done, total=total),
-        )
-    evaluation.write(folder)
-    evaluation.show(console)
-    console.print(f"results are in {folder}", soft_wrap=True)
-    return evaluation

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.evaluate import evaluate_into
 from qgs.cli.inspect import RecipeFile
 from qgs.cli.options import Device, Overrides, Threads, use_threads
 
@@ -41,6 +40,7 @@ def train(
         torchrun --standalone --nproc-per-node=8 -m qgs train RECIPE --out RUN
     """
     # Here, so that the help of all commands needs no torch.
+    from qgs.evaluate.evaluation import evaluate_into
     from qgs.evaluate.plan import read_index
     from qgs.recipe import resolve
     from qgs.train.guard import TrainingError

@@ -6,8 +6,11 @@ The baselines are images that are made from the input views without a model.
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import torch
+from rich.console import Console
+from rich.progress import Progress
 
 from qgs.contracts import Column, Metric, MetricInput, ViewSampler, Window
 from qgs.data.samples import Sample
@@ -87,6 +90,25 @@ def evaluate(
         step=step,
     )
     return replace(evaluation, remarks=_remarks(evaluation, model, recipe, scorer.seen))
+
+
+def evaluate_into(
+    model: QueryGaussianModel, recipe: Recipe, step: int | None, folder: Path
+) -> Evaluation:
+    """Evaluate `model` as `recipe` says, write the results into `folder` and print them."""
+    console = Console()
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("scoring scenes", total=None)
+        evaluation = evaluate(
+            model,
+            recipe,
+            step,
+            lambda done, total: progress.update(task, completed=done, total=total),
+        )
+    evaluation.write(folder)
+    evaluation.show(console)
+    console.print(f"results are in {folder}", soft_wrap=True)
+    return evaluation
 
 
 def _remarks(
