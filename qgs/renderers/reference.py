@@ -37,21 +37,25 @@ def project(
     in_world = rotations * gaussians.scales[..., None, :]  # R S, (B, G, 3, 3)
     in_camera = cameras.w2c[..., None, :3, :3] @ in_world[:, None]  # W R S, (B, V, G, 3, 3)
     with torch.no_grad():
-        _, usable = _conics(_image_factors(in_camera, centres, cameras), dilation)
+        _, usable = _conics(in_camera, centres, cameras, dilation)
     # Before anything can overflow: where() after it would pass on gradients 0 * inf.
     drawn = torch.where(usable[..., None, None], in_camera, 0.0)
-    conics, _ = _conics(_image_factors(drawn, centres, cameras), dilation)
+    conics, _ = _conics(drawn, centres, cameras, dilation)
     means = to_pixels(centres, cameras.intrinsics)
     return means, conics, centres[..., 2], in_range & usable
 
 
-def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor:
-    """Return the factors J W R S (B, V, G, 2, 3) of 2D covariances.
+def _conics(
+    factors: Tensor, centres: Tensor, cameras: Cameras, dilation: float
+) -> tuple[Tensor, Tensor]:
+    """Return the entries xx, xy, yy (B, V, G, 3) of inverse 2D covariances, and a bool mask.
 
-    J is the Jacobian of the projection, W the rotation to the camera, R and S rotation and scales
-    of a Gaussian. factors: W R S (B, V, G, 3, 3). centres: camera-frame means (B, V, G, 3).
-    In J, x/z and y/z are clamped to 15 % of the image beyond its borders, as in gsplat. Without
-    clamping, a Gaussian farther off screen could spread over the whole image.
+    The mask (B, V, G) is False where the inverse does not exist. The covariance is F F^T +
+    dilation * I, with F = J W R S: J is the Jacobian of the projection, W the rotation to the
+    camera, R and S rotation and scales of a Gaussian. factors: W R S (B, V, G, 3, 3).
+    centres: camera-frame means (B, V, G, 3). In J, x/z and y/z are clamped to 15 % of the image
+    beyond its borders, as in gsplat. Without clamping, a Gaussian farther off screen could spread
+    over the whole image.
     """
     focal, principal = cameras.intrinsics[:, :, None].split(2, -1)
     sides = cameras.size[::-1]
@@ -60,16 +64,8 @@ def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor
     z = centres[..., 2:]
     slopes = torch.maximum(centres[..., :2] / z, (low - principal) / focal)
     slopes = torch.minimum(slopes, (high - principal) / focal)[..., None]
-    return (focal / z)[..., None] * (factors[..., :2, :] - slopes * factors[..., 2:, :])
-
-
-def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
-    """Return the entries xx, xy, yy (..., 3) of inverse 2D covariances, and a bool mask (...).
-
-    The mask is False where the inverse does not exist. The covariance is F F^T + dilation * I, with
-    F from `factors` (..., 2, 3).
-    """
-    row_x, row_y = factors.unbind(-2)
+    rows = (focal / z)[..., None] * (factors[..., :2, :] - slopes * factors[..., 2:, :])
+    row_x, row_y = rows.unbind(-2)
     xx = (row_x * row_x).sum(-1)
     xy = (row_x * row_y).sum(-1)
     yy = (row_y * row_y).sum(-1)
