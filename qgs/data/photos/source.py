@@ -40,8 +40,6 @@ _CACHED = 512 * 2**20
 """Size in bytes of the cache of decoded images."""
 _TURNS = {3: 2, 6: 1, 8: 3}
 """Clockwise quarter turns by EXIF orientation. Orientations that mirror are ignored."""
-_QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""Rotation for a clockwise quarter turn: the new x axis is the old -y, the new y the old x."""
 
 
 class PhotosConfig(SceneSource.Config):
@@ -393,7 +391,8 @@ def _quarter(frame: PhotoFrame) -> PhotoFrame:
     return replace(
         frame,
         size=(width, height),
-        c2w=frame.c2w @ _QUARTER,
+        # The new x axis is the old -y, the new y the old x.
+        c2w=frame.c2w[:, [1, 0, 2, 3]] * [-1.0, 1.0, 1.0, 1.0],
         intrinsics=(fy, fx, height - cy, cx),
         lens=frame.lens and frame.lens.turned(),
     )
