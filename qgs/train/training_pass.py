@@ -1,6 +1,6 @@
 """Forward and backward pass of a training step: objective, model, losses and gradients."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 
 import torch
@@ -18,6 +18,8 @@ from qgs.precision import autocast
 from qgs.recipe import Recipe
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 
+Tensors = dict[str, Tensor]
+"""Tensors by name: terms, signs of life, gradients or parameters."""
 RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
 """Names of values in history.jsonl. A loss term must not have one of these names."""
 
@@ -73,7 +75,7 @@ class TrainingPass(nn.Module):
         `signs_of` (PSNR, alpha, deviation) for the last layer.
         Raises ValueError if two losses have a term of the same name.
         """
-        parameters = dict(self.losses.named_parameters(prefix="losses"))
+        parameters: Tensors = dict(self.losses.named_parameters(prefix="losses"))
         total = targets.images.new_zeros(())
         background = constant(self.model.renderer.config.background, targets.images)
         count = targets.images.shape[1]
@@ -81,8 +83,8 @@ class TrainingPass(nn.Module):
         # Not split if a loss compares views.
         if self.render_views and not any(x.renderings == "all" for x in self.losses.values()):
             parts = [targets.select(views) for views in _slices(targets.cameras, self.render_views)]
-        terms: dict[str, Tensor] = {}
-        signs: dict[str, Tensor] = {}
+        terms: Tensors = {}
+        signs: Tensors = {}
         rounds = [number for number in prediction.layers if number > len(self.model.decoder)]
         for number, weight in self.model.supervision.weights(rounds).items():
             layer = DetachedLayer(prediction.layers[number], parameters)
@@ -129,9 +131,9 @@ class TrainingPass(nn.Module):
         rendering: Rendering,
         target: Views,
         inputs: Views,
-    ) -> dict[str, Tensor]:
+    ) -> Tensors:
         """Call the losses of images, or those of Gaussians alone; return all terms by name."""
-        terms: dict[str, Tensor] = {}
+        terms: Tensors = {}
         for name, loss in self.losses.items():
             if of_images == (loss.renderings == "none"):
                 continue
@@ -152,7 +154,7 @@ def compute_gradients(
     training_pass: nn.Module,
     config: TrainingConfig,
     batches: Sequence[Batch],
-) -> dict[str, Tensor]:
+) -> Tensors:
     """Compute the clipped gradients of the mean loss of `batches`; return 0-d values by name.
 
     training_pass: the module wrapped by accelerate. The value "gradient" is the norm over all
@@ -160,7 +162,7 @@ def compute_gradients(
     not wait for the device.
     """
     device = accelerator.device
-    sums: dict[str, Tensor] = {}
+    sums: Tensors = {}
     for number, batch in enumerate(batches, start=1):
         # Only the last batch exchanges gradients between processes.
         last = number == len(batches)
@@ -184,17 +186,17 @@ class DetachedLayer:
     are absent. terms: detached sums of the losses' terms.
     """
 
-    def __init__(self, layer: LayerPrediction, parameters: Mapping[str, Tensor]) -> None:
+    def __init__(self, layer: LayerPrediction, parameters: Tensors) -> None:
         """Detach `layer`. parameters: parameters of the losses by name, which get gradients too."""
         self.prediction: LayerPrediction = map_tensors(
             lambda x: x.detach().requires_grad_() if x.requires_grad else x, layer
         )
-        self.gradients: dict[str, Tensor] = {}
-        self.terms: dict[str, Tensor] = {}
+        self.gradients: Tensors = {}
+        self.terms: Tensors = {}
         self._sources = _trained(parameters, layer)
         self._copies = _trained(parameters, self.prediction)
 
-    def add(self, terms: Mapping[str, Tensor], share: float) -> None:
+    def add(self, terms: Tensors, share: float) -> None:
         """Add `share` times the 0-d `terms` and their gradients, and free their autograd graph."""
         weighted = {name: share * term for name, term in terms.items()}
         _add(weighted, self.terms)
@@ -222,7 +224,7 @@ class DetachedLayer:
 
 
 @torch.no_grad()
-def signs_of(rendering: Rendering, target: Views, background: Tensor) -> dict[str, Tensor]:
+def signs_of(rendering: Rendering, target: Views, background: Tensor) -> Tensors:
     """Return the 0-d numbers "psnr", "alpha" and "deviation" of a rendering.
 
     psnr, alpha: means over all views. deviation: mean of |rgb - background| over the pixels of a
@@ -241,16 +243,16 @@ def _slices(cameras: Cameras, step: int) -> list[slice]:
     return [slice(first, first + step) for first in range(0, cameras.shape[1], step)]
 
 
-def _trained(parameters: Mapping[str, Tensor], layer: LayerPrediction) -> dict[str, Tensor]:
+def _trained(parameters: Tensors, layer: LayerPrediction) -> Tensors:
     tensors = {**parameters, **dict(named_tensors(layer))}
     return {name: tensor for name, tensor in tensors.items() if tensor.requires_grad}
 
 
-def _sum(terms: Mapping[str, Tensor]) -> Tensor:
+def _sum(terms: Tensors) -> Tensor:
     return torch.stack([*terms.values()]).sum() if terms else torch.zeros(())
 
 
-def _add(terms: Mapping[str, Tensor], sums: dict[str, Tensor]) -> None:
+def _add(terms: Tensors, sums: Tensors) -> None:
     for name, term in terms.items():
         term = term.detach()
         sums[name] = sums[name] + term if name in sums else term
