@@ -23,6 +23,9 @@ from qgs.recipe.sections import SETTINGS, Draft, draft_of
 from qgs.recipe.slots import SECTIONS
 from qgs.recipe.yaml_text import KeyPath, MapNode, inline, items_of
 
+Tree = Mapping[str, Any]
+"""Options by name, as a recipe nests them."""
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -37,7 +40,7 @@ class Recipe:
     releases: (distribution, version) of `qgs` and of every plugin in use, by name of the plugin.
     """
 
-    tree: Mapping[str, Any]
+    tree: Tree
     provenance: Mapping[str, str]
     parts: Parts
     dims: contracts.ModelDims
@@ -131,7 +134,7 @@ class Recipe:
 
 
 def resolve(
-    recipe: str | Path | Mapping[str, Any],
+    recipe: str | Path | Tree,
     overrides: Sequence[str] = (),
     plugins: Sequence[contracts.Plugin] = (),
 ) -> Recipe:
@@ -210,9 +213,7 @@ def spell_out(draft: Draft, parts: Parts) -> _Spelled:
             yield (name,), {}, draft.tree.origins.get(name, _DEFAULT)
 
 
-def _spelled(
-    path: KeyPath, values: Mapping[str, Any], written: MapNode, default: Origin | str
-) -> _Spelled:
+def _spelled(path: KeyPath, values: Tree, written: MapNode, default: Origin | str) -> _Spelled:
     """Yield path, value and origin of each of `values`, which are options at `path`.
 
     written: options that the recipe sets. Other options have the origin `default`.
@@ -252,7 +253,7 @@ def _shown_parts(parts: Parts) -> dict[KeyPath, Chosen]:
     return shown | own
 
 
-def flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+def flat(tree: Tree, above: str = "") -> dict[str, Any]:
     """Flatten nested mappings to one mapping from dotted path to value."""
     found: dict[str, Any] = {}
     for key, value in tree.items():
@@ -263,9 +264,7 @@ def flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     return found
 
 
-def differing_options(
-    a: Mapping[str, Any], b: Mapping[str, Any]
-) -> dict[str, tuple[str | None, str | None]]:
+def differing_options(a: Tree, b: Tree) -> dict[str, tuple[str | None, str | None]]:
     """Return the options that differ between the recipes `a` and `b`.
 
     Maps the dotted path of each option to its two values as YAML. None stands for an option that a
@@ -281,7 +280,7 @@ _NO_EFFECT_ONCE_TRAINED = re.compile(
 )
 
 
-def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+def differing_predictions(a: Tree, b: Tree) -> dict[str, tuple[str, str]]:
     """Return the `differing_options` that change the predictions of a trained model.
 
     Options of initial values, supervision and renderer are left out, since a trained model predicts
@@ -297,7 +296,7 @@ def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[st
 def annotated(recipe: Recipe) -> str:
     """Write the complete recipe as YAML with comments that give file and line of each value."""
 
-    def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
+    def lines_of(tree: Tree, path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():
             below = (*path, key)
             name = "  " * len(path) + inline(key)
