@@ -31,6 +31,8 @@ from qgs.recipe.recipe import differing_options
 
 State = Mapping[str, Any]
 """Tensors, JSON values, and nested mappings of such values, by name."""
+States = Mapping[str, State]
+"""States by the name of the object that restores its own."""
 
 HISTORY = "history.jsonl"
 EVALUATIONS = "evaluations.jsonl"
@@ -197,7 +199,7 @@ class Saver:
             self._write_checkpoint(self.folder.checkpoint, step, weights)
         wait_for_everyone()
 
-    def restore(self, states: Mapping[str, State]) -> None:
+    def restore(self, states: States) -> None:
         """Restore the weights and every entry of `stateful` from `states`.
 
         Raises CheckpointError if `states` does not fit this run.
@@ -219,7 +221,7 @@ class Saver:
         extra = {"step": str(step), KEY: self.model.trained_on.text}
         save(self.model, path, extra=extra, weights=weights)
 
-    def _write_state(self, states: Mapping[str, State]) -> None:
+    def _write_state(self, states: States) -> None:
         # The history must reach the disk first: a state ahead of it would leave a gap.
         history = self.folder.history_file
         with naming_full_disk(history), history.open("a") as file:
@@ -227,7 +229,7 @@ class Saver:
         write_state(self.folder.state, self.model.recipe or {}, states)
 
 
-def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, State]) -> None:
+def write_state(path: Path, recipe: Mapping[str, Any], states: States) -> None:
     """Write `states` to `path`, completely or not at all. recipe: complete recipe of the run."""
     # safetensors refuses views and tensors that share memory.
     tensors = copied(dict(named_tensors(states)))
@@ -235,7 +237,7 @@ def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, Stat
     write_tensors(path, tensors, {_STATES: json.dumps(values), RECIPE: json.dumps(recipe)})
 
 
-def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
+def read_state(path: Path) -> tuple[Recipe, States]:
     """Read a file that `write_state` wrote; return its recipe and states.
 
     Raises FileNotFoundError, CheckpointError for a damaged file, and RecipeError for a bad recipe.
@@ -253,7 +255,7 @@ def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
         return file.stored_recipe(), states
 
 
-def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
+def saved_state(folder: RunFolder, recipe: Recipe) -> States:
     """Return the saved states of the run in `folder`; empty if the run starts at step 0.
 
     A run that was stopped before its first save starts at step 0. Raises OtherRunError if `recipe`

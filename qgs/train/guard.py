@@ -18,7 +18,7 @@ from qgs.containers import named_tensors
 from qgs.contracts import TrainingConfig
 from qgs.data.samples import Batch
 from qgs.machine import is_out_of_memory
-from qgs.train.folder import Saver
+from qgs.train.folder import Saver, State
 from qgs.train.training_pass import TrainingPass
 from qgs.wording import listed
 
@@ -102,10 +102,10 @@ class Guard:
         self.signs = SignsOfLife()
         self.good = GoodWeights(self.training_pass.model)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         return {"skipped": self.skipped, "detector": asdict(self.signs)}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, state: State) -> None:
         self.skipped = state["skipped"]
         self.signs = SignsOfLife(**state["detector"])
 
@@ -292,10 +292,10 @@ class GoodWeights:
         # In host memory, because training needs the device's.
         self.copies = [*self.copies, (step, copied(present))][-2:]
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         return {"psnr": self.psnr, "best": self.best, "copies": dict(self.copies)}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, state: State) -> None:
         self.psnr = state["psnr"]
         self.best = state["best"]
         # The keys of JSON are strings.

@@ -15,7 +15,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from qgs.checkpoint.model_file import load_weights, unique_tensors
 from qgs.contracts import ModelComponent, Optimizer, ParameterGroup, TrainingConfig
-from qgs.train.folder import OtherRunError
+from qgs.train.folder import OtherRunError, State
 
 
 def make_optimizer(
@@ -98,11 +98,11 @@ class Counters:
         self.seconds += seconds
         return dict(zip(measured, numbers, strict=True))
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         """Return step, seconds, and the fingerprint of the scenes."""
         return {"step": self.step, "seconds": self.seconds, "scenes": self.scenes}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, state: State) -> None:
         """Continue counting from `state`.
 
         Raises OtherRunError if the training scenes have changed.
@@ -122,14 +122,14 @@ class RandomStates:
     Components draw random numbers from no other generators.
     """
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         """Return the states; all processes must call this."""
         own = {"torch": torch.get_rng_state()}
         if torch.cuda.is_initialized():
             own["cuda"] = torch.cuda.get_rng_state()
         return {str(rank): states for rank, states in enumerate(gather_object([own]))}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, state: State) -> None:
         """Restore the generators of this process; without a saved state for its rank, keep them."""
         rank = PartialState().process_index
         # A run may continue with more processes than before.
@@ -155,13 +155,13 @@ class OptimizerState:
         ]
         self._optimizer = optimizer
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         """Return the optimiser's values, such as moments, of every parameter by name."""
         kept = self._optimizer.state_dict()["state"]
         # A parameter without a gradient has no moments; its empty mapping records that.
         return {name: kept.get(place, {}) for place, name in enumerate(self._names)}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, state: State) -> None:
         """Restore the result of `state()`, but no learning rates or options of parameter groups.
 
         Raises KeyError if a parameter has no entry.

@@ -32,7 +32,7 @@ from qgs.recipe import Recipe
 from qgs.recipe.checks import keys_are_read
 from qgs.recipe.recipe import annotated, flat
 from qgs.train.distributed import StopRequest, choose_device, make_accelerator, stop_requests
-from qgs.train.folder import RunFolder, Saver, State, saved_state
+from qgs.train.folder import RunFolder, Saver, States, saved_state
 from qgs.train.guard import Guard, not_finite
 from qgs.train.initial import initialise
 from qgs.train.periodic import judge
@@ -133,7 +133,7 @@ class Trainer:
             # The order matters. The state is read before the model takes memory. The model draws
             # its random numbers before anything else does. The data comes last, because its first
             # batch depends on how many samples the restored run has seen.
-            saved: Mapping[str, State] = {}
+            saved: States = {}
             if resume and not self.folder.is_new:
                 if self.accelerator.is_main_process:
                     self.folder.take()
