@@ -170,11 +170,8 @@ class Trainer:
             resources.callback(self._stream.close)
             self._no_batches: Exception | None = None
             self._fetch()
-            self._resources = resources.pop_all()
-
-    def close(self) -> None:
-        """Stop loading batches, close trackers and unlock the folder."""
-        self._resources.close()
+            # Stops loading batches, closes trackers and unlocks the folder.
+            self.close = resources.pop_all().close
 
     def _build_model(self, initial: bool) -> None:
         """Build the model, its training pass, torch's optimiser and the moving average.
