@@ -32,6 +32,8 @@ MEASURED = 512
 """Number of training samples whose cameras `trained_domain` measures."""
 MAX_REPLACED = 10
 """Number of replacements to try for a failing sample before training stops."""
+Batches = Generator[Batch, None, None]
+"""Batches without end, whose threads or processes end when it is closed."""
 _SPAN = Span(Span.Config())
 
 
@@ -51,7 +53,7 @@ def training_batches(
     rank: int = 0,
     processes: int = 1,
     workers: int = 0,
-) -> Generator[Batch, None, None]:
+) -> Batches:
     """Return an endless generator of training batches, each with `batch_size` samples.
 
     Batch n consists of the samples of `stream` from n * batch_size * processes on, split among the
@@ -216,9 +218,7 @@ class SampleStream(Dataset[Batch | Exception]):
             raise SampleError(f"scene {scene.name!r}: {one_line(error)}") from error
 
 
-def _from_thread(
-    stream: SampleStream, numbers: Iterator[Sequence[int]]
-) -> Generator[Batch, None, None]:
+def _from_thread(stream: SampleStream, numbers: Iterator[Sequence[int]]) -> Batches:
     """Yield a batch for each list of sample numbers.
 
     A thread makes the next batch while the caller uses the last one.
@@ -232,9 +232,7 @@ def _from_thread(
             yield ready
 
 
-def _from_workers(
-    stream: SampleStream, numbers: Iterator[Sequence[int]], workers: int
-) -> Generator[Batch, None, None]:
+def _from_workers(stream: SampleStream, numbers: Iterator[Sequence[int]], workers: int) -> Batches:
     """Yield a batch for each list of sample numbers, made in `workers` other processes.
 
     Processes are spawned, because numba and torch do not survive a fork.
