@@ -85,7 +85,7 @@ def scene_rows(
     for inputs, targets in spread_windows(scene, views.inputs, domain, windows):
         found = find_scale(model, scene, inputs, targets, views).factor
         auto = float(own_world(scene, inputs, views.model_copy(update={"scale": "auto"}))[1])
-        sample = make_sample(scene, inputs, targets, constant_scale(views, 1.0), mirror=False)
+        sample = make_sample(scene, inputs, targets, constant_scale(views, 1.0))
         shown = {
             "found": rendered(model, sample, found),
             "auto": rendered(model, sample, auto),

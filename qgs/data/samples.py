@@ -72,7 +72,7 @@ def make_sample(
     input_frames: Frames,
     target_frames: Frames,
     views: ViewsConfig,
-    mirror: bool,
+    mirror: bool = False,
     noise: np.random.Generator | None = None,
     depths: bool = False,
 ) -> Sample:

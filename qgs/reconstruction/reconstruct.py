@@ -77,7 +77,7 @@ def reconstruct(
         scale = find_scale(model, found, *window, views) if views.scale == "search" else None
         if scale:
             views = constant_scale(views, scale.factor)
-        sample = make_sample(found, *window, views, mirror=False)
+        sample = make_sample(found, *window, views)
         chosen = find_size(model, found, *window, views) if free else None
         if chosen and chosen.halved:
             sample = half(sample, model) or sample

@@ -127,7 +127,7 @@ def find_scale(
         middle = given[len(given) // 2]
         further = (middle, *further[: FURTHER - 1])
         given = tuple(frame for frame in given if frame != middle)
-    sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
+    sample = make_sample(scene, given, further, constant_scale(views, 1.0))
     frames = given if len(given) > 1 else given + further
     sample = half(sample, model) or sample
     depth = seen_depth(scene, inputs)
@@ -296,7 +296,7 @@ def find_size(
         that was found.
     """
     judges = further_photos(scene, inputs, compared) or inputs
-    whole = make_sample(scene, inputs, judges, views, mirror=False)
+    whole = make_sample(scene, inputs, judges, views)
     small = half(whole, model)
     # Inputs of other times than the compared photos are no judges.
     if small is None or scene.times is not None:

@@ -64,7 +64,7 @@ def test_several_cameras_a_time_give_targets_of_one_time_and_inputs_of_several_c
 
 def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets():
     def made(scene, *frames):
-        return make_sample(scene, *frames, VIEWS, False)
+        return make_sample(scene, *frames, VIEWS)
 
     sample = made(moving(10, 2), (2, 11), (6, 7))
     assert sample.inputs.times.tolist() == [[0, 1]]

@@ -63,7 +63,7 @@ def test_the_better_size_is_taken_and_the_larger_of_equal_ones():
 
 def test_a_sample_without_targets_is_halved_and_a_moving_scene_is_not():
     errors = {8: 0.1, 16: 0.2}
-    sample = make_sample(Grey(), (1, 4), (), ViewsConfig(), mirror=False)
+    sample = make_sample(Grey(), (1, 4), (), ViewsConfig())
     small = half(sample, Painter(errors))
     assert small.inputs.images.shape == (1, 2, 3, 8, 8)
     assert small.targets.images.shape == (1, 0, 3, 8, 8)

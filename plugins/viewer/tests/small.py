@@ -50,7 +50,7 @@ def model_of(kind, *overrides):
 
 def sample_of(inputs=(1, 4), targets=(2, 3)):
     """The walk as a model sees it."""
-    return make_sample(Walk(), inputs, targets, VIEWS, mirror=False)
+    return make_sample(Walk(), inputs, targets, VIEWS)
 
 
 @cache
