@@ -139,14 +139,14 @@ def _view(c2w, lens, mean, factor, margin, height, width):
 
 
 @kernel
-def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, splats):
+def project_unit(means, scales, quats, c2w, lenses, opacities, bounds, limits, splats):
     """Fill `splats` (V, G, 9), views by Gaussians, for a range of Gaussians of one scene.
 
-    means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4): fx, fy,
-    cx, cy. bounds: (first, last) index of the range, `last` excluded. limits: near, far, dilation,
-    alpha_min, margin of `_axis`, height, width. `qgs.kernels.rasterisation` lists the 9 fields of a
-    splat. A splat ends at the Mahalanobis distance sqrt(2 ln(opacity / alpha_min)), where its alpha
-    falls to alpha_min. Half a pixel is added to its extents, against rounding.
+    means (G, 3), scales (G, 3), quats (G, 4), c2w (V, 4, 4), lenses (V, 4): fx, fy, cx, cy,
+    opacities (G,). bounds: (first, last) index of the range, `last` excluded. limits: near, far,
+    dilation, alpha_min, margin of `_axis`, height, width. `qgs.kernels.rasterisation` lists the 9
+    fields of a splat. A splat ends at the Mahalanobis distance sqrt(2 ln(opacity / alpha_min)),
+    where its alpha falls to alpha_min. Half a pixel is added to its extents, against rounding.
     """
     near, far, dilation, alpha_min, margin, height, width = limits
     for g in range(bounds[0], bounds[1]):

@@ -44,7 +44,7 @@ class CpuRenderer(Renderer):
             )
         count = channels.shape[-1]
         given = (
-            gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities,
+            gaussians.opacities, gaussians.means, gaussians.scales, gaussians.quats,
             cameras.c2w, cameras.intrinsics,
         )  # fmt: skip
         geometry = [tensor.float() for tensor in given]
@@ -62,8 +62,8 @@ class _Splat(torch.autograd.Function):
     """Autograd function that projects Gaussians and sums their values at each pixel, with weights.
 
     Returns sums (B, V, 5, H, W) of r, g, b, depth and 1, each multiplied by the blending weight of
-    the Gaussian at the pixel. Inputs: colors (B, V, G, 3) or (B, 1, G, 3), means, scales, quats,
-    opacities, c2w, intrinsics; image size and options of the renderer.
+    the Gaussian at the pixel. Inputs: colors (B, V, G, 3) or (B, 1, G, 3), opacities, means,
+    scales, quats, c2w, intrinsics; image size and options of the renderer.
     """
 
     @staticmethod
@@ -73,8 +73,7 @@ class _Splat(torch.autograd.Function):
 
         *tensors, size, config = inputs
         tensors = [tensor.contiguous() for tensor in tensors]
-        colors, *geometry = _arrays(*tensors)
-        opacities = geometry[3]
+        colors, opacities, *geometry = _arrays(*tensors)
         batch, views = tensors[5].shape[:2]
         splats = tensors[0].new_empty((batch, views, opacities.shape[1], kernels.SPLAT_FIELDS))
         sums = splats.new_empty((batch, views, kernels.SUMS, *size))
@@ -84,7 +83,7 @@ class _Splat(torch.autograd.Function):
 
         def project(scene: int, chunk: _Part) -> None:
             own = [array[scene] for array in geometry]
-            project_unit(*own, chunk[1], projection, rows[scene])
+            project_unit(*own, opacities[scene], chunk[1], projection, rows[scene])
 
         def blend(scene: int, view: int, stripe: _Part) -> None:
             image = scene, view
@@ -108,14 +107,14 @@ class _Splat(torch.autograd.Function):
         from qgs.kernels.projection import CAMERA_GRADIENTS, project_backward_unit
 
         saved = ctx.saved_tensors
-        colors, means, scales, quats, opacities, c2w, lenses, rows, orders, sums = _arrays(*saved)
+        colors, opacities, *geometry, rows, orders, sums = _arrays(*saved)
         batch, views, count, _ = rows.shape
         projection, blending, chunks, stripes = ctx.plan
         # Each stripe sums its own gradients, in an order that does not depend on threads.
         grads = np.zeros((batch, views, len(stripes), count, kernels.GRADIENTS), np.float32)
         given = slopes[0].contiguous().numpy()
         of_inputs = [torch.empty_like(tensor) for tensor in saved[1:5]]
-        of_means, of_scales, of_quats, of_opacities = _arrays(*of_inputs)
+        of_opacities, *of_geometry = _arrays(*of_inputs)
         # In float64: thousands of splats of either sign nearly cancel in a camera's gradient.
         of_cameras = np.zeros((batch, len(chunks), views, CAMERA_GRADIENTS))
         wants_cameras = any(ctx.needs_input_grad[5:7])
@@ -131,10 +130,11 @@ class _Splat(torch.autograd.Function):
 
         def project(scene: int, chunk: _Part) -> None:
             part, bounds = chunk
+            own = [array[scene] for array in geometry]
+            of_own = [array[scene] for array in of_geometry]
             project_backward_unit(
-                means[scene], scales[scene], quats[scene], c2w[scene], lenses[scene], bounds,
-                projection, rows[scene], summed[scene], wants_cameras, of_means[scene],
-                of_scales[scene], of_quats[scene], of_opacities[scene], of_cameras[scene, part],
+                *own, bounds, projection, rows[scene], summed[scene], wants_cameras, *of_own,
+                of_opacities[scene], of_cameras[scene, part],
             )  # fmt: skip
 
         in_threads(blend, product(range(batch), range(views), stripes))
