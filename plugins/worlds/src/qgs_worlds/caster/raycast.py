@@ -28,7 +28,7 @@ from qgs_worlds.caster.intervals import (
     torus,
     upright,
 )
-from qgs_worlds.caster.vectors import along, dot, inner, minus, narrow, over, triple
+from qgs_worlds.caster.vectors import along, dot, inner, minus, mix, narrow, over, triple
 
 # Part p of shape i has code 8 i + p; codes are float32, so that loops vectorise them with t.
 SKY = -1
@@ -53,46 +53,32 @@ def _corners(body, c2w, corners):
 
 
 @inner
-def _clipped(corners, points):
-    """Write the corners of a box, after clipping at the camera plane, to `points`.
-
-    Returns the number of points. Only the part of the box in front of the camera is kept.
-    """
-    n = 0
-    for k in range(8):
-        z = corners[k, 2]
-        if z > _PLANE:
-            for a in range(3):
-                points[n, a] = corners[k, a]
-            n += 1
-        for axis in range(3):
-            other = k | (1 << axis)
-            # each edge once, from its corner with the smaller number
-            if other != k and (z > _PLANE) != (corners[other, 2] > _PLANE):
-                w = (_PLANE - z) / (corners[other, 2] - z)
-                for a in range(3):
-                    points[n, a] = corners[k, a] + w * (corners[other, a] - corners[k, a])
-                n += 1
-    return n
-
-
-@inner
-def _covered(corners, points, intrinsics):
+def _covered(corners, intrinsics):
     """Return the range u0, u1, v0, v1 of pixel coordinates that a box covers.
 
-    If the box is behind the camera, u0 > u1. corners: result of `_corners`. points: working memory,
-    (20, 3).
+    Only the part of the box in front of the camera counts; if the whole box is behind the camera,
+    u0 > u1. corners: result of `_corners`.
     """
     u0 = v0 = np.inf
     u1 = v1 = -np.inf
-    # the corners bound the box in the image if none is behind the camera
-    for k in range(_clipped(corners, points)):
-        u = intrinsics[0] * points[k, 0] / points[k, 2] + intrinsics[2]
-        v = intrinsics[1] * points[k, 1] / points[k, 2] + intrinsics[3]
-        u0 = min(u0, u)
-        u1 = max(u1, u)
-        v0 = min(v0, v)
-        v1 = max(v1, v)
+    for k in range(8):
+        for axis in range(3):
+            start = corners[k]
+            end = corners[k ^ (1 << axis)]
+            # a corner bounds the box in the image, or else where its edge comes to the front
+            if start[2] > _PLANE:
+                w = 0.0
+            elif end[2] > _PLANE:
+                w = (_PLANE - start[2]) / (end[2] - start[2])
+            else:
+                continue
+            x, y, z = mix(start, end, w)
+            u = intrinsics[0] * x / z + intrinsics[2]
+            v = intrinsics[1] * y / z + intrinsics[3]
+            u0 = min(u0, u)
+            u1 = max(u1, u)
+            v0 = min(v0, v)
+            v1 = max(v1, v)
     return u0, u1, v0, v1
 
 
@@ -292,15 +278,13 @@ def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
         steps[j] = (j + 0.5) / samples
     o = narrow(c2w[:, 3])
     corners = np.empty((8, 3))
-    # a clipped box has at most its 8 corners and a point on each of its 12 edges
-    points = np.empty((20, 3))
     # one for all shapes, because allocating takes longer than small shapes do
     scratch = np.empty((2, 4, columns * samples), np.float32)
     # shape by shape, not ray by ray, because a loop over a row is vectorised
     for i in range(shapes.shape[0]):
         shape = shapes[i]
         _corners(shape.body, c2w, corners)
-        u0, u1, v0, v1 = _covered(corners, points, intrinsics)
+        u0, u1, v0, v1 = _covered(corners, intrinsics)
         first, last = _span(u0, u1, samples, 0.0, columns * samples)
         above, below = _span(v0, v1, samples, top, rows * samples)
         if first >= last or above >= below:
