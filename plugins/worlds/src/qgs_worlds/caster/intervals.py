@@ -370,20 +370,13 @@ def height_of(heights, x, y):
     return height_at(heights, x, y)
 
 
-@kernel
-def clearances(shapes, points):
+def clearances(shapes: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the distances in metres from F points (F, 3) to the boxes around S shapes, (F, S).
 
     A point inside a box has distance 0.
     """
-    distances = np.empty((points.shape[0], shapes.shape[0]))
-    for f in range(points.shape[0]):
-        for i in range(shapes.shape[0]):
-            body = shapes[i].body
-            place = local_point(body, points[f])
-            square = 0.0
-            for a in range(3):
-                away = max(abs(place[a]) - body.extent[a], 0.0) * body.unit[a]
-                square += away * away
-            distances[f, i] = math.sqrt(square)
-    return distances
+    body = shapes["body"]
+    way = points[:, None] - body["center"]
+    place = (body["axes"] @ way[..., None])[..., 0]
+    away = np.maximum(abs(place) - body["extent"], 0) * body["unit"]
+    return np.linalg.norm(away, axis=-1)
