@@ -121,45 +121,41 @@ def lit(shadows, light, own, p):
 
 @kernel
 def surroundings(shapes):
-    """Return the cache that `visible` keeps between points: three arrays.
+    """Return the cache that `visible` keeps between points: two arrays.
 
-    The first array (19, S) has 19 fields of the boxes around S shapes, field by field, so that
-    loops over shapes are vectorised. The second array (19, S) has the boxes near a point p.
-    The third array (5,) has p, the number of boxes near p, and the squared distance from p up to
-    which the second array is valid.
+    The first array (19, S) has space for 19 fields of the boxes around S shapes, field by field, so
+    that loops over shapes are vectorised; it gets the boxes near a point p. The second array (5,)
+    has p, the number of boxes near p, and the squared distance from p up to which these boxes are
+    valid.
     """
-    boxes = np.empty((_FIELDS, shapes.shape[0]), np.float32)
-    for i in range(shapes.shape[0]):
-        body = shapes[i].body
-        center = local(body, body.center)
-        for k in range(3):
-            for axis in range(3):
-                boxes[3 * k + axis, i] = body.axes[k, axis]
-            boxes[9 + k, i] = center[k]
-            boxes[12 + k, i] = body.extent[k]
-            boxes[15 + k, i] = body.unit[k]
-        boxes[18, i] = i
-    return boxes, np.empty_like(boxes), np.full(5, np.inf)
+    return np.empty((_FIELDS, shapes.shape[0]), np.float32), np.full(5, np.inf)
 
 
 @inner
 def _find(shapes, around, p, reach, slack):
-    """Copy the boxes near point p to the cache `around`, except boxes of `hollow` shapes.
+    """Write the boxes near point p to the cache `around`, except boxes of `hollow` shapes.
 
     reach: distance in metres at which shapes darken points. slack: distance in metres from p up to
-    which the copied boxes stay valid.
+    which the written boxes stay valid.
     """
-    boxes, near, place = around
+    near, place = around
     place[:3] = p
     place[4] = slack * slack
     count = 0
     reach = np.float32(1.6 * reach + slack)
     for i in range(shapes.shape[0]):
-        away = minus(shapes[i].body.center, p)
+        body = shapes[i].body
+        away = minus(body.center, p)
         size = shapes[i].radius + reach
         if dot(away, away) < size * size and not hollow(shapes[i]):
-            for k in range(_FIELDS):
-                near[k, count] = boxes[k, i]
+            center = local(body, body.center)
+            for k in range(3):
+                for axis in range(3):
+                    near[3 * k + axis, count] = body.axes[k, axis]
+                near[9 + k, count] = center[k]
+                near[12 + k, count] = body.extent[k]
+                near[15 + k, count] = body.unit[k]
+            near[18, count] = i
             count += 1
     place[3] = count
 
@@ -178,7 +174,7 @@ def visible(shapes, around, own, point, normal, strength, reach, footprint):
     nx, ny, nz = narrow(normal)
     low = np.float32(0.25 * reach)
     high = np.float32(0.8 * reach)
-    _, near, place = around
+    near, place = around
     moved = minus(place, point)
     if place[4] == np.inf or dot(moved, moved) > place[4]:
         _find(shapes, around, (x, y, z), reach, 0.3 * reach + 4 * footprint)
