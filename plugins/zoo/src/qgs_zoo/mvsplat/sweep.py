@@ -173,13 +173,12 @@ def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Te
     lens, pose: as in `warp_grid`.
     """
 
-    def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
+    def part(depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
         return torch.einsum("nchw,nckhw->nkhw", own, sampled_NCkhw)
 
     # Parts bound the memory of sampled features.
-    parts = depth.split(max(1, MAX_SAMPLES // own.numel()), 1)
-    return torch.cat(_each(part, [(own, other, depth_Nkhw) for depth_Nkhw in parts]), 1)
+    return _in_parts(part, own.numel(), depth)
 
 
 def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
@@ -191,31 +190,30 @@ def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose:
     """
     count, _, height, width = own.shape
     grid_NPD2 = warp_grid(depth, lens, pose).permute(0, 2, 3, 1, 4).flatten(1, 2)
-    own_NPC = own.flatten(2).mT
     other_NCQ = other.flatten(2)
 
-    def part(own_NpC: Tensor, other_NCQ: Tensor, grid_NpD2: Tensor) -> Tensor:
+    def part(own_NpC: Tensor, grid_NpD2: Tensor) -> Tensor:
         maps_X1hw = (own_NpC @ other_NCQ).reshape(-1, 1, height, width)
         found = warped(maps_X1hw, grid_NpD2.flatten(0, 1)[:, None, None])
         return found.view(count, -1, depth.shape[1])
 
-    chunk = max(1, MAX_SAMPLES // (count * height * width))
-    pairs = zip(own_NPC.split(chunk, 1), grid_NPD2.split(chunk, 1), strict=True)
-    parts = _each(part, [(own_NpC, other_NCQ, grid_NpD2) for own_NpC, grid_NpD2 in pairs])
-    return torch.cat(parts, 1).mT.unflatten(2, (height, width))
+    found_NPD = _in_parts(part, count * height * width, own.flatten(2).mT, grid_NPD2)
+    return found_NPD.mT.unflatten(2, (height, width))
 
 
-def _each(part: Callable[..., Tensor], given: Sequence[tuple[Tensor, ...]]) -> list[Tensor]:
-    """Return the results of calling `part` with each tuple of tensors in `given`.
+def _in_parts(part: Callable[..., Tensor], each: int, *whole: Tensor) -> Tensor:
+    """Return the result of `part` on the tensors `whole`, computed for parts of their second axis.
 
-    If there are several tuples, results are computed again in the backward pass, to save memory.
+    each: number of values that `part` samples for each index of this axis; MAX_SAMPLES bounds their
+    number in a part. If there are several parts, they are computed again in the backward pass, to
+    save memory.
     """
-    if len(given) == 1:
-        return [part(*given[0])]
-    return [
-        checkpoint(part, *tensors, use_reentrant=False, preserve_rng_state=False)
-        for tensors in given
-    ]
+    size = max(1, MAX_SAMPLES // each)
+    parts = [*zip(*(x.split(size, 1) for x in whole), strict=True)]
+    if len(parts) == 1:
+        return part(*whole)
+    found = [checkpoint(part, *x, use_reentrant=False, preserve_rng_state=False) for x in parts]
+    return torch.cat(found, 1)
 
 
 class DepthRange(ComponentConfig):
