@@ -9,10 +9,10 @@ from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, NonNegativeInt, PositiveInt, ValidationInfo, field_validator
+from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
-from qgs.contracts import ComponentConfig, ModelDims, OptionError, Problem, RecipeContext
+from qgs.contracts import ComponentConfig, ModelDims, Problem, RecipeContext
 from qgs.geometry.harmonics import SH_C0
 from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs.encoder import imagenet_normalised
@@ -63,9 +63,7 @@ class DepthSplatConfig(ComponentConfig):
     With two or three views, each view is compared with all others."""
     vit: VitConfig
     """Sizes and weights of DINOv2. `{}` is a ViT-S with random initial weights."""
-    blocks: tuple[NonNegativeInt, NonNegativeInt, NonNegativeInt, NonNegativeInt] = Field(
-        default=(2, 5, 8, 11), validate_default=True
-    )
+    blocks: tuple[NonNegativeInt, NonNegativeInt, NonNegativeInt, NonNegativeInt] = (2, 5, 8, 11)
     """Indices of the ViT blocks whose tokens are read. The first block has index 0. Published
     values for a ViT-L: 4, 11, 17, 23."""
     dpt: tuple[PositiveInt, PositiveInt, PositiveInt, PositiveInt] = (48, 96, 192, 384)
@@ -77,19 +75,6 @@ class DepthSplatConfig(ComponentConfig):
     corrects depths has half as many. Published values: 96 for a ViT-B, 128 for a ViT-L."""
     regressor: PositiveInt = 64
     """Number of channels between the two consecutive networks that predict Gaussians."""
-
-    @field_validator("blocks")
-    @classmethod
-    def _blocks_ascend_in_the_vit(
-        cls, blocks: tuple[int, int, int, int], info: ValidationInfo
-    ) -> tuple[int, int, int, int]:
-        depth = info.data["vit"].depth if "vit" in info.data else blocks[-1] + 1
-        if list(blocks) != sorted(set(blocks)) or blocks[-1] >= depth:
-            raise OptionError(
-                f"blocks must ascend and stay below the depth of the ViT, {depth}, got {blocks}",
-                "write four block numbers, such as [2, 5, 8, 11]",
-            )
-        return blocks
 
     @property
     def levels(self) -> list[int]:
@@ -339,6 +324,13 @@ class DepthSplatEncoder(Decaying, SweepEncoder):
         if config.features % (32 * config.scales):
             reason = f"{config.features} features do not split into heads of 32 in both sweeps"
             yield Problem("features", reason, "write a multiple of 64")
+        blocks = config.blocks
+        depth = config.vit.depth
+        if list(blocks) != sorted(set(blocks)) or blocks[-1] >= depth:
+            reason = (
+                f"blocks must ascend and stay below the depth of the ViT, {depth}, got {blocks}"
+            )
+            yield Problem("blocks", reason, "write four block numbers, such as [2, 5, 8, 11]")
         yield from super().problems(config, context)
 
     @classmethod
