@@ -6,7 +6,7 @@ import numpy as np
 
 from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.intervals import hit, upright
+from qgs_worlds.caster.intervals import hit, local_point
 from qgs_worlds.caster.patterns import mixture, smooth
 from qgs_worlds.caster.shading import TAKEN, on_axis, to_world
 from qgs_worlds.caster.vectors import along, dot, inner, minus, mix, narrow, times, triple
@@ -120,7 +120,7 @@ def _surface(shape, part, place):
     body = shape.body
     inside = body.kind == s.INTERIOR
     # the frame of the room is the world frame
-    p = place if inside else upright(body, minus(place, body.center))
+    p = place if inside else local_point(body, place)
     if body.kind == s.BALL or body.kind == s.CYLINDER:
         normal, u, v, across, up = _on_round(body, part, p)
         return shape.texture, to_world(body, normal), u, v, across, up

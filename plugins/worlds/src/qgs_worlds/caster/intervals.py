@@ -339,22 +339,11 @@ def hollow(shape):
     return shape.body.kind >= s.TORUS or shape.cut.kind != s.NOTHING
 
 
-@inner
-def upright(body, v):
-    """Return the world direction v in the frame of `body`, a shape that is turned only about z.
-
-    The result is the same as that of `local`, which is slower.
-    """
-    cos = body.axes[0, 0]
-    sin = body.axes[0, 1]
-    return cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]
-
-
 @kernel
 def hit(body, o, d):
     """Return the t at which a ray enters a BLOCK, BALL or CYLINDER; inf if the ray misses."""
-    p = upright(body, minus(o, body.center))
-    way = upright(body, d)
+    p = local_point(body, o)
+    way = local(body, d)
     if body.kind == s.BLOCK:
         near, far, _, _ = block(p, way, body.extent)
     elif body.kind == s.BALL:

@@ -26,7 +26,6 @@ from qgs_worlds.caster.intervals import (
     nearest,
     relief,
     torus,
-    upright,
 )
 from qgs_worlds.caster.vectors import along, dot, inner, minus, mix, narrow, over, triple
 
@@ -241,10 +240,10 @@ def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, are
     # a room's shape is upright and has no cut
     if body.kind >= s.BLOCK:
         extent = triple(body.extent)
-        lo = upright(body, minus(o, body.center))
-        ls = upright(body, step)
+        lo = local_point(body, o)
+        ls = local(body, step)
         for row in range(above, below):
-            lb = upright(body, _row_base(rays, top + (row + 0.5) / samples))
+            lb = local(body, _row_base(rays, top + (row + 0.5) / samples))
             depths = t[row, first:last]
             codes = code[row, first:last]
             _cover_row(depths, codes, own, body.kind, extent, along_row, lo, lb, ls)
