@@ -241,7 +241,7 @@ def _albedo(texture, shape, part, points, n, footprint):
         second += b * (1 - c)
         third += c
     base = triple(texture.colors[0])
-    rgb = along(base, second / (last - first), minus(texture.colors[1], base))
+    rgb = mix(base, texture.colors[1], second / (last - first))
     return along(rgb, third / (last - first), minus(texture.colors[2], base))
 
 

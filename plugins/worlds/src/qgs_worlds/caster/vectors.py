@@ -74,7 +74,7 @@ def product(a, b):
 @inner
 def mix(a, b, w):
     """Return a + w * (b - a), the linear interpolation from a to b."""
-    return a[0] + w * (b[0] - a[0]), a[1] + w * (b[1] - a[1]), a[2] + w * (b[2] - a[2])
+    return along(a, w, minus(b, a))
 
 
 @inner
