@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import ArrayLike
 
 from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.caster.lens import lens, look_along
@@ -105,7 +106,7 @@ def draw_cameras(
     points = rng.uniform(place.low, place.high, (64, 3))
     base = points[clearances(fixed, points).min(1).argmax()]
     eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
-    c2w = _look_at(eyes, np.array(place.targets[0]), np.zeros(count))
+    c2w = _look_at(eyes, np.array(place.targets[0]))
     return best._replace(c2w=c2w, motion="still")
 
 
@@ -132,7 +133,7 @@ def _draw(rng: Generator, place: Place, count: int, varied: bool, shrink: float)
         across = np.array([target[1] - base[1], base[0] - target[0], 0.0])
         step = across / np.linalg.norm(across) * max(rng.uniform(*PLAIN_TRAVEL) * shrink, 0.05)
         target = np.array([*target[:2], base[2] - rng.uniform(0.1, 0.4)])
-        c2w = _look_at(base + s[:, None] * step, target + 0.1 * s[:, None] * step, np.zeros(count))
+        c2w = _look_at(base + s[:, None] * step, target + 0.1 * s[:, None] * step)
         return Rig(c2w, rng.uniform(*PLAIN_FOV), distance, "walk")
     low, high = np.log(BASELINE)
     length = distance * math.exp(rng.uniform(low, high)) * shrink
@@ -241,7 +242,7 @@ def _turned(way: np.ndarray, angles: np.ndarray) -> Motion:
     return cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]
 
 
-def _look_at(eyes: np.ndarray, targets: np.ndarray, roll: np.ndarray) -> np.ndarray:
+def _look_at(eyes: np.ndarray, targets: np.ndarray, roll: ArrayLike = 0.0) -> np.ndarray:
     forward = targets - eyes
     flat = np.linalg.norm(forward[:, :2], axis=1)
     # never straight up or down, where the right direction is undefined
