@@ -61,9 +61,6 @@ def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
     """
     palette = Palette(rng)
     table = np.zeros(TEXTURES, s.TEXTURE)
-    for field in ("period", "stretch", "pattern_period", "aspect"):
-        table[field] = 1.0
-    table["gain"] = 0.5
     for row in table:
         fields = _varied(rng, palette, highlights) if varied else _plain(rng, palette)
         for name, value in fields.items():
@@ -76,7 +73,7 @@ def _plain(rng: Random, palette: Palette) -> Texture:
     """Return a random texture: a uniform colour, or a simple pattern of two colours."""
     base = palette.color()
     ramp = [palette.near(base, 0.1), base, palette.near(base, 0.1)]
-    fields = {"octaves": 1, "period": rng.uniform(0.3, 1), "contrast": 0.6}
+    fields = {"octaves": 1, "period": rng.uniform(0.3, 1), "contrast": 0.6, "stretch": 1.0}
     mark = base
     if rng.random() >= 0.5:
         mark = palette.color()
