@@ -6,7 +6,7 @@ import numpy as np
 
 from qgs.kernels import kernel
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.intervals import hit, local_point
+from qgs_worlds.caster.intervals import height_at, hit, local_point
 from qgs_worlds.caster.patterns import mixture, smooth
 from qgs_worlds.caster.shading import TAKEN, on_axis, to_world
 from qgs_worlds.caster.vectors import along, dot, inner, minus, mix, narrow, times, triple
@@ -158,17 +158,7 @@ def _wall_shadow(place, size, face):
 @inner
 def _floor_shadow(floor, place, size):
     """Return the light factor of the floor at a point, interpolated between cells of `floor`."""
-    last = floor.shape[0] - 1
-    # below the last line, so that cell i + 1 exists
-    a = min(max((place[0] / size[0] + 0.5) * last, 0.0), last - 1e-6)
-    b = min(max((place[1] / size[1] + 0.5) * last, 0.0), last - 1e-6)
-    i = int(a)
-    j = int(b)
-    a = a - i
-    b = b - j
-    low = floor[i, j] * (1 - b) + floor[i, j + 1] * b
-    high = floor[i + 1, j] * (1 - b) + floor[i + 1, j + 1] * b
-    return low * (1 - a) + high * a
+    return height_at(floor, 2 * place[0] / size[0], 2 * place[1] / size[1])
 
 
 @inner

@@ -225,10 +225,13 @@ def torus(o, d, thickness, start):
 
 @inner
 def height_at(heights, x, y):
-    """Return the height at x, y in [-1, 1], interpolated in the height map `heights` (G, G)."""
-    last = heights.shape[0] - 1
-    a = min(max((x + ONE) * _HALF, ZERO), _INSIDE) * np.float32(last)
-    b = min(max((y + ONE) * _HALF, ZERO), _INSIDE) * np.float32(last)
+    """Return the height at x, y in [-1, 1], interpolated in the height map `heights` (G, G).
+
+    Points outside of the map have the height at its border.
+    """
+    last = np.float32(heights.shape[0] - 1)
+    a = min(max((x + ONE) * _HALF, ZERO), _INSIDE) * last
+    b = min(max((y + ONE) * _HALF, ZERO), _INSIDE) * last
     i = int(a)
     j = int(b)
     a = a - np.float32(i)
