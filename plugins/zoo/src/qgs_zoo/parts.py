@@ -11,13 +11,17 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from qgs.containers import concatenated
-from qgs.contracts import MissingExtraError, Outcome
+from qgs.contracts import FieldSpec, MissingExtraError, Outcome
 from qgs.precision import full_precision
 from qgs.tokengs.blocks import merge_heads, split_heads
 from qgs.types import Cameras
 
-PIXEL_ENCODING = "camera centre; directions of z = 1: upper left corner, step across, step down"
-"""Encoding of the rays through a pixel or patch, (B, N, 4, 3).
+PIXEL_RAYS = FieldSpec(
+    (4, 3),
+    frame="world",
+    encoding="camera centre; directions of z = 1: upper left corner, step across, step down",
+)
+"""Field of the rays through a pixel or patch, (B, N, 4, 3).
 
 The ray through the point (u, v), from (0, 0) to (1, 1), has the direction corner + u * step across
 + v * step down."""
@@ -44,7 +48,7 @@ def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> T
 def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
     """Return the rays of each cell of images that are divided into rows x columns cells.
 
-    The result (B, V * rows * columns, 4, 3) has the encoding PIXEL_ENCODING: the camera's centre,
+    The result (B, V * rows * columns, 4, 3) is encoded as PIXEL_RAYS: the camera's centre,
     the direction through the cell's upper left corner, and what to add to this direction to reach
     the upper right and the lower left corner.
     """

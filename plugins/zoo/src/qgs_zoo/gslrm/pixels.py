@@ -16,7 +16,6 @@ from qgs.contracts import (
     Centers,
     ComponentConfig,
     Fields,
-    FieldSpec,
     ModelComponent,
     ModelDims,
     PatchEncoder,
@@ -30,7 +29,7 @@ from qgs.geometry.transforms import unit
 from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs import NORM_EPS, LinearHead
 from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
-from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, self_attention
+from qgs_zoo.parts import PIXEL_RAYS, pixel_rays, self_attention
 
 CHANNELS = 9
 """Input channels per pixel: 2 RGB - 1, moment o x d, unit direction d of its ray (paper, 3.1)."""
@@ -107,7 +106,7 @@ class Transformer(PatchEncoder):
 
 PATCH = "gslrm.patch"
 
-PATCH_FIELD: Fields = {PATCH: FieldSpec((4, 3), frame="world", encoding=PIXEL_ENCODING)}
+PATCH_FIELD: Fields = {PATCH: PIXEL_RAYS}
 
 
 class PixelQueries(Queries):

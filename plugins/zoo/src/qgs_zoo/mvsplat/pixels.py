@@ -35,12 +35,12 @@ from qgs_zoo.mvsplat.adapter import (
     coefficients,
     world_harmonics,
 )
-from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, quaternions
+from qgs_zoo.parts import PIXEL_RAYS, pixel_rays, quaternions
 
 PIXEL = "mvsplat.pixel"
 TURN = "mvsplat.turn"
 PIXEL_FIELDS: Fields = {
-    PIXEL: FieldSpec((4, 3), frame="world", encoding=PIXEL_ENCODING),
+    PIXEL: PIXEL_RAYS,
     TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
 }
 """Query fields: the rays through the pixel of a query, and the rotation of the pixel's camera."""
@@ -151,7 +151,7 @@ class OnRays(Centers):
 def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:
     """Return directions (B, N, K, 3) of rays through K points inside each of N pixels.
 
-    place: logits of the points' positions. pixel: encoded as PIXEL_ENCODING. unit: True gives
+    place: logits of the points' positions. pixel: encoded as PIXEL_RAYS. unit: True gives
     directions of length 1, False directions with z = 1 in the camera's frame.
     """
     _, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
