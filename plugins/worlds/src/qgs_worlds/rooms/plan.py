@@ -65,39 +65,35 @@ class Furnisher:
 
     def __init__(self, size: Size, eyes: np.ndarray) -> None:
         self.size = size
-        self.eyes = eyes.tolist()
+        self.eyes = eyes
         self.shapes: list[Shape] = []
-        self._taken: list[tuple[Point, Point]] = []
+        # lowest and highest corners of placed pieces
+        self._taken = np.empty((0, 2, 3))
 
     def place(self, piece: Piece, to: Point, turn: float) -> bool:
         """Place `piece` at `to` on the floor, turned by `turn` radians, if it fits.
 
         Returns True if the piece was placed, False if it does not fit.
         """
-        low, high = turned(*bounds(piece), to, turn)
-        if not self.free(low, high):
+        box = turned(*bounds(piece), to, turn)
+        if not self.free(box):
             return False
-        self._taken.append((low, high))
+        self._taken = np.append(self._taken, [box], 0)
         self.shapes += [shape.moved(turn, to) for shape in piece]
         return True
 
-    def free(self, low: Point, high: Point) -> bool:
+    def free(self, box: tuple[Point, Point]) -> bool:
         """Return True if a box is inside the room and clear of all placed pieces and cameras.
 
-        low, high: lowest and highest corner of the box.
+        box: its lowest and its highest corner.
         """
-        for extent, a, b in zip(self.size[:2], low, high, strict=False):
-            if a < -extent / 2 or b > extent / 2:
-                return False
-        for (x0, y0, _), (x1, y1, _) in self._taken:
-            beside_x = low[0] >= x1 + _GAP or high[0] <= x0 - _GAP
-            if not (beside_x or low[1] >= y1 + _GAP or high[1] <= y0 - _GAP):
-                return False
-        for eye in self.eyes:
-            apart = (max(a - x, x - b, 0.0) for a, x, b in zip(low, eye, high, strict=True))
-            if sum(away * away for away in apart) <= CLEARANCE**2:
-                return False
-        return True
+        low, high = np.array(box)
+        half = np.array(self.size[:2]) / 2
+        inside = (low[:2] >= -half) & (high[:2] <= half)
+        beside = np.maximum(low - self._taken[:, 1], self._taken[:, 0] - high)[:, :2].max(1)
+        away = np.maximum(low - self.eyes, self.eyes - high).clip(0)
+        clear = np.linalg.norm(away, axis=1) > CLEARANCE
+        return bool(inside.all() and (beside >= _GAP).all() and clear.all())
 
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
@@ -148,7 +144,7 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
     while position < along / 2 - 0.4:
         # drawing a piece takes long, so first test if any piece would fit
         spot = turned(*_SMALLEST, _from_wall(side, across / 2 - 0.2, position + 0.2), turn)
-        if furnisher.free(*spot):
+        if furnisher.free(spot):
             piece = make.piece(rng.choice(AGAINST_WALLS))
             low, high = bounds(piece)
             # the skirting board sticks out by 2 cm
