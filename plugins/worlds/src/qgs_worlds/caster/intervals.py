@@ -223,7 +223,7 @@ def torus(o, d, thickness, start):
     return NONE, -NONE, ZERO, ZERO
 
 
-@inner
+@kernel
 def height_at(heights, x, y):
     """Return the height at x, y in [-1, 1], interpolated in the height map `heights` (G, G).
 
@@ -354,12 +354,6 @@ def hit(body, o, d):
     else:
         near, far, _, _ = cylinder(p, way, body.extent)
     return near if (near > NEAR) & (near <= far) else NONE
-
-
-@kernel
-def height_of(heights, x, y):
-    """Call the kernel `height_at`, which Python cannot call directly."""
-    return height_at(heights, x, y)
 
 
 def clearances(shapes: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from random import Random
 import numpy as np
 
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.intervals import height_of
+from qgs_worlds.caster.intervals import height_at
 from qgs_worlds.caster.shapes import Point, Primitive, Shape, about_z, rod
 from qgs_worlds.worlds.things import Thing, Things, any_angle, placed, spread
 
@@ -177,7 +177,7 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         away = 9 * rng.random() ** 0.7
         x, y = _toward(any_angle(rng), away)
         lift = 0.0 if rng.random() < 0.85 else rng.uniform(0.3, 3)
-        ground = height_of(field, np.float32(x / _TERRAIN), np.float32(y / _TERRAIN))
+        ground = height_at(field, np.float32(x / _TERRAIN), np.float32(y / _TERRAIN))
         at = (x, y, lift + amplitude * ground)
         near += placed(things.draw(), at, any_angle(rng), spread(rng, 0.25, 2))
     shapes += near
