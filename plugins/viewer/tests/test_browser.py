@@ -20,6 +20,7 @@ from small import PAIR, stand_in
 from torch.nn.functional import normalize
 from walk import arc, cloud, pinhole
 
+from qgs.drawing.images import rgb_picture
 from qgs.geometry.harmonics import harmonics
 from qgs.renderers import AutoRenderer
 from qgs.types import Views
@@ -151,11 +152,13 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     given = cloud(200)
     photos = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0)))(given, cameras).rgb
     names = ["</script><b>left</b>", "middle", "right"]
-    tour = Tour("walk", "3 photos", Views(1 - photos, cameras), names, 2, cameras)
+    errors = [rgb_picture(1 - photo.flip(-1)) for photo in photos[0]]
+    tour = Tour("walk", "3 photos", Views(1 - photos, cameras), names, 2, cameras, errors)
     file = opened(page, tmp_path, gaussians_html(given, tour))
     page.until("the scene", "window.tour && !document.querySelector('#veil')")
     buttons = "[...document.querySelectorAll('#tour nav button')]"
-    assert page.evaluate(f"{buttons}.map(b => b.innerText)") == ["play", "record", *names]
+    shown = ["play", "record", "expected error", *names]
+    assert page.evaluate(f"{buttons}.map(b => b.innerText)") == shown
 
     def away(images=photos):
         """Of the window above the buttons from each image, as a mean of differences."""
@@ -172,16 +175,20 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
 
     left, middle, _ = away()
     assert left < 4 < middle / 2
-    page.evaluate(f"{buttons}[4].click()")
+    page.evaluate(f"{buttons}[5].click()")
     *_, middle, right = away()
     assert right < 4 < middle / 2
     photo = "document.querySelector('#tour img')"
     assert page.evaluate(f"{photo}.hidden")
-    page.evaluate(f"{buttons}[3].click()")
+    page.evaluate(f"{buttons}[4].click()")
     assert not page.evaluate(f"{photo}.hidden")
     slider = "document.querySelector('#tour input')"
     page.evaluate(f"{slider}.value = 100; {slider}.oninput()")
     assert away(1 - photos)[1] < 1
+    page.evaluate(f"{buttons}[2].click()")
+    assert away(1 - photos.flip(-1))[1] < 3
+    page.evaluate(f"{buttons}[2].click()")
+    assert page.evaluate(f"{photo}.style.clipPath") == "inset(0px 0px 0px 100%)"
     still = page.picture()
     page.evaluate(f"{buttons}[0].click()")
     page.until("a flight", lambda: abs(page.picture() - still).mean() > 8)

@@ -167,7 +167,8 @@ def test_a_tour_lists_cameras_and_names():
     lens = (60.0, 50.0, 32.0, 24.0)
     cameras = pinhole(arc([-20.0, 20], 3), lens, (48, 64))[None].to(torch.float32)
     views = Views(torch.rand(1, 2, 3, 48, 64), cameras)
-    page = gaussians_html(cloud(64), Tour("a", "b", views, ["</script>", "c"], 1, cameras))
+    black = [np.zeros((48, 64, 3), np.uint8)] * 2
+    page = gaussians_html(cloud(64), Tour("a", "b", views, ["</script>", "c"], 1, cameras, black))
     tour = json.loads(re.search("window.tour = (.*);</script>", page)[1])
     first, last = tour["stops"]
     assert (first["name"], "photo" in first, "photo" in last) == ("</script>", True, False)

@@ -38,7 +38,7 @@ def write(path, content, numbers):
 
 
 def assert_same(found, expected):
-    for part in ("means", "scales", "opacities", "colors", "sh"):
+    for part in ("means", "scales", "opacities", "colors", "sh", "features"):
         assert_close(getattr(found, part), getattr(expected, part), atol=2e-6, rtol=1e-5)
     turns = quat_to_matrix(found.quats), quat_to_matrix(expected.quats)
     assert_close(*turns, atol=1e-5, rtol=0)
@@ -46,13 +46,15 @@ def assert_same(found, expected):
 
 @pytest.mark.parametrize("count", [0, 3, 8, 15])
 def test_the_round_trip(tmp_path, count):
-    given = cloud(50).replace(sh=torch.randn(1, 50, count, 3) if count else None)
+    given = cloud(50)
+    if count:
+        given = given.replace(sh=torch.randn(1, 50, count, 3), features=torch.randn(1, 50, 2))
     save_gaussians(given, tmp_path / "a.glb")
     assert_same(qgs.load_ply(tmp_path / "a.glb"), given)
 
 
 def test_cameras_see_what_ours_see(tmp_path):
-    """In glTF, -Z is forward and +Y is up; the mean up direction of the cameras is +Y."""
+    """In glTF, -Z is forward and +Y is up: that of the cameras, from the ground at 0."""
     lens = (60.0, 50.0, 32.0, 24.0)
     cameras = pinhole(arc([-20, 0, 20], 3, 0.2), lens, (48, 64))[None].to(torch.float32)
     given = cloud(20)
@@ -65,6 +67,7 @@ def test_cameras_see_what_ours_see(tmp_path):
     places = np.array([node["translation"] for node in nodes])
     turns = Rotation.from_quat([node["rotation"] for node in nodes]).as_matrix()
     means = np.frombuffer(numbers, "<f4", 60).reshape(20, 3)
+    assert np.quantile(means[:, 1], 0.02) == pytest.approx(0, abs=1e-5)
     seen = (means - places[:3, None]) @ turns[:3] * [1, -1, -1]
     np.testing.assert_allclose(seen, to_camera(given.means, cameras)[0], atol=1e-5)
     up = turns[:3, :, 1].mean(0)

@@ -72,6 +72,10 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     assert record["refined_on"] == [f"images/{number}.png" for number in range(9) if number != 4]
     assert record["gaussians"] == qgs.load_ply(out / "scene.ply").count > 300
     assert record["mean"]["alpha"] > 0.99
+    expected, errors = np.transpose(record["expected_and_error"])
+    assert (np.diff(expected) > 0).all()
+    assert errors.mean() == pytest.approx(record["mean"]["error"], rel=0.01)
+    assert f"{record['mean']['error']:.3f}, expected {expected.mean():.3f}" in output
     is_worse = record["mean"]["psnr"] < record["mean"]["nearest_input"]
     assert is_worse == ("worse than the nearest photo" in output)
     assert record["command"] in output
@@ -89,15 +93,19 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
 def test_an_earlier_scene_is_optimised_further(photos, tmp_path):
     few = "--holdout 4 --seconds 0.3 --degree 0"
     earlier = tmp_path / "a"
-    made(f"scene {photos} {few} --size 32x48 --gaussians 300", earlier)
+    size = "--size 32x48 --gaussians 300 --scale-by 0.png 8.png 2.5"
+    _, first = made(f"scene {photos} {few} {size}", earlier)
     options = Options(earlier=earlier, holdout="4")
     start, _ = chosen_start(ScenePhotos(str(photos), options), options)
     ours = moved(start.gaussians, start.world[0], 1 / float(start.world[1]))
-    assert_close(ours.means, qgs.load_ply(earlier / "scene.ply").means[:, -300:])
+    assert first["optimised"] == start.gaussians.count
+    stored = qgs.load_ply(earlier / "scene.ply").means[:, -first["optimised"] :]
+    assert_close(first["factor"] * ours.means, stored)
     going_on = f"scene {photos} --from {earlier}"
     _, record = made(f"{going_on} {few}", tmp_path / "b")
-    assert record["optimised"] == 300
-    assert f" --from {earlier} --size 32x48 --gaussians 300 " in record["command"]
+    assert f" --from {earlier} --size 32x48 --gaussians {first['optimised']} " in record["command"]
+    assert record["command"].endswith(" --scale-by 0.png 8.png 2.5")
+    assert record["factor"] == pytest.approx(first["factor"])
     words = f"{going_on} --holdout 3 --out {tmp_path}/c".split()
     must_refuse("other photos", done, *words)
     must_not_find("scene.ply", done, "scene", photos, "--from", photos, "--out", tmp_path / "c")
@@ -132,20 +140,22 @@ def test_a_model_makes_the_start(photos, tmp_path):
 
 
 def test_a_file_has_the_cameras_too(photos, tmp_path):
-    """In the world of the photos, turned upright."""
-    few = "--holdout none --seconds 0.1 --size 32x48 --gaussians 300"
+    """In the world of the photos, turned upright, in metres; Gaussians have errors to expect."""
+    few = "--holdout none --seconds 0.1 --size 32x48 --gaussians 300 --scale-by 0.png 8.png 2.5"
     file = tmp_path / "scene.glb"
     output = done(*f"scene {photos} {few} --out {file}".split()).output
     assert names_in(tmp_path) == {"scene.glb"}
     assert f"wrote {file}" in output
-    assert qgs.load_ply(file).count > 300
+    assert qgs.load_ply(file).features.shape[1:] == (qgs.load_ply(file).count, 1)
     (length,) = struct.unpack_from("<I", file.read_bytes(), 12)
     content = json.loads(file.read_bytes()[20 : 20 + length])
     nodes = {node["name"]: node for node in content["nodes"][1:]}
     assert [*nodes] == [*(f"images/{number}.png" for number in range(9)), "flight"]
-    first, last = (nodes[f"images/{number}.png"]["translation"] for number in (0, 8))
-    given = qgs.read_photos(photos).cameras.c2w[0, [0, 8], :3, 3]
-    assert math.dist(first, last) == pytest.approx(math.dist(*given.tolist()), rel=1e-4)
+    places = [nodes[f"images/{number}.png"]["translation"] for number in (0, 4, 8)]
+    assert math.dist(places[0], places[2]) == pytest.approx(2.5)
+    given = qgs.read_photos(photos).cameras.c2w[0, [0, 4, 8], :3, 3].tolist()
+    ratio = math.dist(given[0], given[1]) / math.dist(given[0], given[2])
+    assert math.dist(places[0], places[1]) == pytest.approx(2.5 * ratio, rel=1e-4)
 
 
 def test_an_interrupt_before_the_optimisation_says_what_is_kept(photos, tmp_path, monkeypatch):
@@ -169,6 +179,11 @@ SENSELESS = """
 --seconds inf | --seconds
 --holdout 1 | --holdout
 --size big | HxW
+--scale-by 0.png 9.png 1 | no photo 9
+--scale-by 0.png 0.png 1 | needs two points
+--scale-by 0.png 8.png 0 | needs two points
+--scale-by 0.png 8.png:48,3 1 | 48 x 32 pixels
+--scale-by 0.png:a 8.png 1 | not NAME:X,Y
 """
 
 

@@ -128,8 +128,7 @@ def scene(
     """Make the best 3D scene from photos in a given time.
 
     Writes a PLY, a page, and scores on held-out photos; or one file, .glb with the photos' cameras.
-    First, Gaussians are made from depth in the photos or by a model; then they are optimised. The
-    chosen settings are printed as a command. Ctrl-C ends the optimisation and writes its result.
+    Prints chosen settings as a command. Ctrl-C ends the optimisation and writes its result.
     """
     began = perf_counter() - process_time()
     # what can be refused is refused before anything heavy is imported
@@ -163,6 +162,5 @@ def scene(
     try:
         make_scene(photos, out, options, began, 60 * minutes, Console())
     except KeyboardInterrupt:
-        # the optimisation itself ends early and writes its result
         typer.echo(f"{out} is not written; computed camera poses are kept for the next run")
         raise

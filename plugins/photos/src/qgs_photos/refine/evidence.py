@@ -1,4 +1,4 @@
-"""What photos of a scene show of its Gaussians: errors to expect in renders, and floaters."""
+"""Evidence that photos give on the Gaussians of a scene: errors to expect, and floaters."""
 
 import math
 from collections.abc import Iterator
@@ -24,9 +24,9 @@ _FACTOR = 4.7
 _OF_COUNT = -0.5
 _OF_ANGLE = 0.5
 _LARGEST_ANGLE = 1.0
-# Least error in photos, and error where no Gaussian is.
+# Least error in photos, and error where no Gaussian is if photos show no such place.
 _LEAST = 0.003
-_NOTHING = 0.3
+_EMPTY = 0.3
 # Floaters: their distance from a camera over the median depth of its photo, if few photos show
 # them or if many do; their standard deviation over the photo's longer side.
 _FEW = 2
@@ -37,12 +37,13 @@ _LARGE = 0.5
 
 @dataclass(frozen=True)
 class Evidence:
-    """What P photos of a scene show of its G Gaussians.
+    """Evidence that P photos of a scene give on its G Gaussians.
 
     gaussians: (1, G). eyes: centres of the photos' cameras (P, 3). shown: which photos show which
     Gaussians (P, G). nearest, largest: over the photos that show a Gaussian (G,), its least depth
     in units of the photo's median depth, and its largest standard deviation in units of the photo's
-    longer side. errors: errors to expect in views from the directions of the photos (G,).
+    longer side. errors: errors to expect in views from the directions of the photos (G,). empty:
+    the error to expect where no Gaussian is.
     """
 
     gaussians: Gaussians
@@ -51,6 +52,7 @@ class Evidence:
     nearest: Tensor
     largest: Tensor
     errors: Tensor
+    empty: Tensor
 
     def kept(self, keep: Tensor) -> "Evidence":
         """Return the evidence of the Gaussians in a mask (G,)."""
@@ -61,6 +63,7 @@ class Evidence:
             self.nearest[keep],
             self.largest[keep],
             self.errors[keep],
+            self.empty,
         )
 
     def error_map(self, cameras: Cameras) -> Tensor:
@@ -75,7 +78,7 @@ class Evidence:
         angles = cosines.amax(0).clamp(math.cos(_LARGEST_ANGLE), 1).acos()
         errors = self.errors * (_OF_ANGLE * angles).exp()
         render = VIEWER(replace(self.gaussians, features=errors[None, :, None]), cameras)
-        return (render.features + _NOTHING * (1 - render.alpha))[0, 0, 0]
+        return (render.features + self.empty * (1 - render.alpha))[0, 0, 0]
 
     def calibrated(self, judged: Views) -> "Evidence":
         """Return a copy whose errors are scaled to those in photos (1, H) that were left out.
@@ -89,7 +92,7 @@ class Evidence:
             found += float(errors_of(rgb, view.images).mean())
         count = judged.images.shape[1]
         scale = (found / expected) ** (count / (count + 0.5)) if count else 1.0
-        return replace(self, errors=scale * self.errors)
+        return replace(self, errors=scale * self.errors, empty=scale * self.empty)
 
     def cleaned(self, judged: Views, surroundings: int) -> "Evidence":
         """Return a copy without the floaters that photos (1, H), which were left out, contradict.
@@ -127,7 +130,8 @@ def evidence(gaussians: Gaussians, views: Views) -> Evidence:
     photos = views.images.shape[1]
     compared = evenly(range(photos), MOST)
     shares = [_shares(gaussians, views.select([photo])) for photo in compared]
-    weights, sums, depths, sizes = torch.stack(shares).unbind(1)
+    weights, sums, depths, sizes = torch.stack([share for share, _ in shares]).unbind(1)
+    holes, missed = torch.stack([hole for _, hole in shares]).sum(0)
     shown = weights > _SHOWN
     # as if one more pixel had the usual error
     errors = (sums.sum(0) + sums.sum() / weights.sum()) / (weights.sum(0) + 1)
@@ -139,6 +143,7 @@ def evidence(gaussians: Gaussians, views: Views) -> Evidence:
         depths.where(shown, math.inf).amin(0),
         sizes.where(shown, 0.0).amax(0),
         _FACTOR * (errors + _LEAST) * (1 + count) ** _OF_COUNT,
+        (missed + _EMPTY) / (holes + 1),
     )
 
 
@@ -146,12 +151,12 @@ def _each(views: Views) -> Iterator[Views]:
     return (views.select([view]) for view in range(views.images.shape[1]))
 
 
-def _shares(gaussians: Gaussians, view: Views) -> Tensor:
-    """Return what a photo (1, 1) shows of each of G Gaussians: (4, G).
+def _shares(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor]:
+    """Return what a photo (1, 1) shows of each of G Gaussians, (4, G), and of empty places, (2,).
 
     The rows are the sums over pixels of a Gaussian's weight, and of the weight times the error of
     the render; its depth in units of the photo's median depth; its largest standard deviation in
-    units of the photo's longer side.
+    units of the photo's longer side. The first two are given for empty places, too.
     """
     with torch.enable_grad():
         features = gaussians.means.new_zeros(1, gaussians.count, 2).requires_grad_()
@@ -163,4 +168,6 @@ def _shares(gaussians: Gaussians, view: Views) -> Tensor:
     depths = to_camera(gaussians.means, view.cameras)[0, 0, :, 2]
     usual = render.depth.detach()[render.alpha > 0.5].median()
     widths = gaussians.scales[0].amax(-1) * view.cameras.intrinsics[0, 0, 0] / depths
-    return torch.stack([*weights[0].T, depths / usual, widths / max(view.cameras.size)])
+    empty = 1 - render.alpha.detach()[0, 0, 0]
+    shares = torch.stack([*weights[0].T, depths / usual, widths / max(view.cameras.size)])
+    return shares, torch.stack([empty.sum(), (empty * errors).sum()])

@@ -1,0 +1,67 @@
+"""Checkpoints on the Hugging Face Hub, of which a folder takes the place."""
+
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from huggingface_hub import HfApi
+from tables import contents
+from torch.testing import assert_close
+from training_runs import tiny
+
+import qgs
+from qgs.checkpoint.hub import SCORES
+from qgs.domain import KEY, Domain
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """The folder to which uploads go, each into a folder of the repository's name."""
+
+    def upload_folder(_, repo_id, folder_path, **told):
+        assert told["revision"] == "v1"
+        return str(shutil.copytree(folder_path, tmp_path / "hub" / repo_id))
+
+    monkeypatch.setattr(
+        HfApi, "create_repo", lambda _, repo_id, **told: SimpleNamespace(repo_id=repo_id)
+    )
+    monkeypatch.setattr(HfApi, "upload_folder", upload_folder)
+    return tmp_path / "hub"
+
+
+def test_a_model_comes_back_and_its_card_says_what_the_checkpoint_knows(hub, tmp_path):
+    run = tmp_path / "run"
+    model = tiny("locus").build_model()
+    seen = Domain(values={"views": [2.0, 4.0], "fov": [50.0, 61.0]}, samples=2)
+    qgs.save(model, run / "checkpoint.safetensors", extra={"step": "1200", KEY: seen.text})
+    (run / SCORES).parent.mkdir()
+    (run / SCORES).write_text("| method | PSNR |\n")
+    url = qgs.push_to_hub(run, "me/locus", license="apache-2.0", branch="v1")
+    back = qgs.from_pretrained(url)
+    assert_close(back.state_dict(), model.state_dict(), rtol=0, atol=0)
+
+    assert {file.name for file in Path(url).iterdir()} == {
+        "README.md", "config.json", "checkpoint.safetensors",
+    }  # fmt: skip
+    _, data, text = (Path(url) / "README.md").read_text().split("---\n", 2)
+    assert yaml.safe_load(data)["license"] == "apache-2.0"
+    for told in (
+        'qgs.from_pretrained("me/locus")',
+        "pip install query-gaussians query-gaussians-locus query-gaussians-worlds",
+        "there are 2 to 4 input views",
+        "| method | PSNR |",
+        "Trained for 1,200 steps",
+        "type: locus/refine",
+    ):
+        assert told in text
+    # nobody else needs to know where the run lies
+    assert not any(str(tmp_path).encode() in file for file, _ in contents(Path(url)).values())
+
+
+def test_a_model_that_ships_keeps_its_card(hub):
+    url = qgs.push_to_hub("rooms/locus-64", "me/rooms", license="apache-2.0", branch="v1")
+    card = (Path(url) / "README.md").read_text()
+    assert "procedural rooms" in card
+    assert qgs.from_pretrained(url).trained_on.values
