@@ -27,12 +27,9 @@ _LARGEST_ANGLE = 1.0
 # Least error in photos, and error where no Gaussian is if photos show no such place.
 _LEAST = 0.003
 _EMPTY = 0.3
-# Floaters: their distance from a camera over the median depth of its photo, if few photos show
-# them or if many do; their standard deviation over the photo's longer side.
-_FEW = 2
+# Floaters: their depth over the median depth of a photo, at most, and photos that show them.
 _NEAR = 0.3
-_NEARER = 0.15
-_LARGE = 0.5
+_FEW = 2
 
 
 @dataclass(frozen=True)
@@ -40,31 +37,17 @@ class Evidence:
     """Evidence that P photos of a scene give on its G Gaussians.
 
     gaussians: (1, G). eyes: centres of the photos' cameras (P, 3). shown: which photos show which
-    Gaussians (P, G). nearest, largest: over the photos that show a Gaussian (G,), its least depth
-    in units of the photo's median depth, and its largest standard deviation in units of the photo's
-    longer side. errors: errors to expect in views from the directions of the photos (G,). empty:
-    the error to expect where no Gaussian is.
+    Gaussians (P, G). floating: Gaussians near a camera that few photos show (G,). errors: errors to
+    expect in views from the directions of the photos (G,). empty: the error to expect where no
+    Gaussian is.
     """
 
     gaussians: Gaussians
     eyes: Tensor
     shown: Tensor
-    nearest: Tensor
-    largest: Tensor
+    floating: Tensor
     errors: Tensor
     empty: Tensor
-
-    def kept(self, keep: Tensor) -> "Evidence":
-        """Return the evidence of the Gaussians in a mask (G,)."""
-        return Evidence(
-            self.gaussians[:, keep],
-            self.eyes,
-            self.shown[:, keep],
-            self.nearest[keep],
-            self.largest[keep],
-            self.errors[keep],
-            self.empty,
-        )
 
     def error_map(self, cameras: Cameras) -> Tensor:
         """Return the error to expect in each pixel of the render from a camera (1, 1): (H, W).
@@ -72,9 +55,10 @@ class Evidence:
         It grows with the angle between the directions of the view and of the nearest photo.
         """
         means = self.gaussians.means[0]
-        to_photos = F.normalize(self.eyes[:, None] - means, dim=-1)
         to_view = F.normalize(cameras.c2w[0, 0, :3, 3] - means, dim=-1)
-        cosines = (to_photos * to_view).sum(-1).where(self.shown, -1.0)
+        # of the vectors to photos, without a tensor of them
+        along = self.eyes @ to_view.T - (means * to_view).sum(-1)
+        cosines = (along / torch.cdist(self.eyes, means)).where(self.shown, -1.0)
         angles = cosines.amax(0).clamp(math.cos(_LARGEST_ANGLE), 1).acos()
         errors = self.errors * (_OF_ANGLE * angles).exp()
         render = VIEWER(replace(self.gaussians, features=errors[None, :, None]), cameras)
@@ -95,23 +79,22 @@ class Evidence:
         return replace(self, errors=scale * self.errors, empty=scale * self.empty)
 
     def cleaned(self, judged: Views, surroundings: int) -> "Evidence":
-        """Return a copy without the floaters that photos (1, H), which were left out, contradict.
+        """Return a copy without floating Gaussians, unless photos that were left out get worse.
 
-        Kinds of Gaussians that probably float are left out one after the other, and stay out if the
-        mean PSNR of `judged` does not fall. surroundings: number of first Gaussians that stay.
+        judged: these photos, (1, H); without any, or if their mean PSNR falls, nothing changes.
+        surroundings: number of the first Gaussians, which stay.
         """
-        keep = torch.ones_like(self.nearest, dtype=torch.bool)
-        best = quality(self.gaussians, judged)
-        few = self.shown.sum(0) <= _FEW
-        kinds = (self.nearest < _NEAR) & few, self.nearest < _NEARER, self.largest > _LARGE
-        for kind in kinds:
-            tried = keep & ~kind
-            tried[:surroundings] = True
-            found = quality(self.gaussians[:, tried], judged)
-            # without photos both are NaN
-            if found >= best:
-                keep, best = tried, found
-        return self.kept(keep)
+        keep = ~self.floating
+        keep[:surroundings] = True
+        kept = replace(
+            self,
+            gaussians=self.gaussians[:, keep],
+            shown=self.shown[:, keep],
+            floating=self.floating[keep],
+            errors=self.errors[keep],
+        )
+        # without photos both are NaN
+        return kept if quality(kept.gaussians, judged) >= quality(self.gaussians, judged) else self
 
 
 def quality(gaussians: Gaussians, views: Views) -> float:
@@ -130,18 +113,17 @@ def evidence(gaussians: Gaussians, views: Views) -> Evidence:
     photos = views.images.shape[1]
     compared = evenly(range(photos), MOST)
     shares = [_shares(gaussians, views.select([photo])) for photo in compared]
-    weights, sums, depths, sizes = torch.stack([share for share, _ in shares]).unbind(1)
+    weights, sums, depths = torch.stack([share for share, _ in shares]).unbind(1)
     holes, missed = torch.stack([hole for _, hole in shares]).sum(0)
     shown = weights > _SHOWN
     # as if one more pixel had the usual error
-    errors = (sums.sum(0) + sums.sum() / weights.sum()) / (weights.sum(0) + 1)
+    errors = (sums.sum(0) + sums.sum() / weights.sum().clamp_min(1)) / (weights.sum(0) + 1)
     count = shown.sum(0) * photos / len(compared)
     return Evidence(
         gaussians,
         views.cameras.c2w[0, compared, :3, 3],
         shown,
-        depths.where(shown, math.inf).amin(0),
-        sizes.where(shown, 0.0).amax(0),
+        (shown & (depths < _NEAR)).any(0) & (shown.sum(0) <= _FEW),
         _FACTOR * (errors + _LEAST) * (1 + count) ** _OF_COUNT,
         (missed + _EMPTY) / (holes + 1),
     )
@@ -152,11 +134,11 @@ def _each(views: Views) -> Iterator[Views]:
 
 
 def _shares(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor]:
-    """Return what a photo (1, 1) shows of each of G Gaussians, (4, G), and of empty places, (2,).
+    """Return what a photo (1, 1) shows of each of G Gaussians, (3, G), and of empty places, (2,).
 
     The rows are the sums over pixels of a Gaussian's weight, and of the weight times the error of
-    the render; its depth in units of the photo's median depth; its largest standard deviation in
-    units of the photo's longer side. The first two are given for empty places, too.
+    the render; and its depth in units of the photo's median depth. The first two are given for
+    empty places, too.
     """
     with torch.enable_grad():
         features = gaussians.means.new_zeros(1, gaussians.count, 2).requires_grad_()
@@ -167,7 +149,6 @@ def _shares(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor]:
         (weights,) = torch.autograd.grad(sums, features)
     depths = to_camera(gaussians.means, view.cameras)[0, 0, :, 2]
     usual = render.depth.detach()[render.alpha > 0.5].median()
-    widths = gaussians.scales[0].amax(-1) * view.cameras.intrinsics[0, 0, 0] / depths
     empty = 1 - render.alpha.detach()[0, 0, 0]
-    shares = torch.stack([*weights[0].T, depths / usual, widths / max(view.cameras.size)])
+    shares = torch.stack([*weights[0].T, depths / usual])
     return shares, torch.stack([empty.sum(), (empty * errors).sum()])
