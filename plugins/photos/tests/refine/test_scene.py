@@ -31,6 +31,7 @@ from training_runs import tiny
 from upath import UPath
 
 import qgs
+from qgs.containers import concatenated
 from qgs.data.samples import views_in
 from qgs.geometry.transforms import moved
 
@@ -156,6 +157,20 @@ def test_a_file_has_the_cameras_too(photos, tmp_path):
     given = qgs.read_photos(photos).cameras.c2w[0, [0, 4, 8], :3, 3].tolist()
     ratio = math.dist(given[0], given[1]) / math.dist(given[0], given[2])
     assert math.dist(places[0], places[1]) == pytest.approx(2.5 * ratio, rel=1e-4)
+
+
+def test_floaters_are_left_out_of_a_file(photos, photos_of_scene, tmp_path):
+    world = photos_world(photos_of_scene)
+    views = views_in(world, photos_of_scene.small, photos_of_scene.frames)
+    walls = photos_start(photos_of_scene.small, world, views, 400, 40)
+    eye, ahead = views.cameras.c2w[0, 0, :3, 3], views.cameras.c2w[0, 0, :3, 2]
+    scales = torch.full((1, 1, 3), 0.002)
+    near = walls[:, :1].replace(means=(eye + 0.05 * ahead)[None, None], scales=scales)
+    both = moved(concatenated([near, walls], 1), world[0], 1 / float(world[1]))
+    qgs.save_ply(both, tmp_path / "a.ply")
+    output = done(f"clean {tmp_path}/a.ply {photos} {tmp_path}/b.ply").output
+    assert f"{walls.count:,} of {both.count:,} Gaussians" in output
+    assert_close(qgs.load_ply(tmp_path / "b.ply").means, both.means[:, 1:])
 
 
 def test_an_interrupt_before_the_optimisation_says_what_is_kept(photos, tmp_path, monkeypatch):

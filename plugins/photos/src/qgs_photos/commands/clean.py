@@ -1,0 +1,47 @@
+"""The command `qgs clean`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from qgs.cli.options import SceneName
+from qgs.files import refuse_existing
+
+app = typer.Typer(help="Leave floaters out of a file of Gaussians.")
+
+
+@app.command()
+def clean(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="File of Gaussians.")],
+    photos: Annotated[str, typer.Argument(help="Photos of the scene, with poses in its world.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="New file; must not exist yet.")],
+    scene_name: SceneName = None,
+) -> None:
+    """Leave out Gaussians near a camera that at most two photos show.
+
+    Prints the mean PSNR of the photos before and after. Files of `qgs scene` are clean already.
+    """
+    refuse_existing(out)
+
+    from qgs.data.samples import views_in
+    from qgs.reconstruction.scene_formats import load_ply, save_gaussians
+    from qgs_photos.refine.evidence import evidence, quality
+    from qgs_photos.refine.initial import photos_world
+    from qgs_photos.refine.options import NONE, Options
+    from qgs_photos.refine.scene_photos import ScenePhotos
+    from qgs_photos.viewing import in_own_world
+
+    given = ScenePhotos(photos, Options(holdout=NONE, scene=scene_name))
+    world = photos_world(given)
+    views = views_in(world, given.small, given.frames)
+    gaussians = load_ply(source)
+    found = evidence(in_own_world(world, gaussians), views)
+    kept = gaussians[:, ~found.floating]
+    save_gaussians(kept, out)
+    before = quality(found.gaussians, views)
+    after = quality(found.gaussians[:, ~found.floating], views)
+    typer.echo(
+        f"wrote {out}: {kept.count:,} of {gaussians.count:,} Gaussians; mean PSNR of the photos "
+        f"{after:.2f} dB, before {before:.2f} dB"
+    )
