@@ -9,7 +9,7 @@ import gsply
 from qgs.files import replacing
 from qgs.geometry.transforms import moved
 from qgs.reconstruction.scene_formats import of_gsply, save_ply
-from qgs.types import SH_COUNTS, Gaussians
+from qgs.types import Gaussians
 from qgs_photos.formats import TURN
 
 # Bits of a coordinate in .spz, without its sign.
@@ -43,18 +43,10 @@ def _stored(gaussians: Gaussians) -> gsply.GSData:
     with TemporaryDirectory() as folder:
         plain = Path(folder, "plain.ply")
         save_ply(gaussians, plain)
-        whole = gsply.plyread(plain)
+        stored = gsply.plyread(plain)
     count = 0 if gaussians.sh is None else gaussians.sh.shape[-2]
-    degree = (0, *SH_COUNTS).index(count)
-    return gsply.GSData(
-        whole.means,
-        whole.scales,
-        whole.quats,
-        whole.opacities,
-        whole.sh0,
-        whole.shN[:, :count],
-        gsply.create_ply_format(degree),
-    )
+    stored.shN = stored.shN[:, :count]
+    return stored
 
 
 def load_spz(path: Path) -> Gaussians:
