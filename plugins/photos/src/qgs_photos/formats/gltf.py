@@ -251,18 +251,16 @@ def load_glb(path: Path) -> Gaussians:
 def _meshes(content: Mapping[str, Any]) -> Iterator[tuple[Tensor, Mapping[str, Any]]]:
     """Yield the transform to the world (4, 4), and the mesh, of each node that has a mesh."""
     unseen = dict(enumerate(content["nodes"]))
-
-    def below(index: int, outer: Tensor) -> Iterator[tuple[Tensor, Mapping[str, Any]]]:
+    roots = content["scenes"][content.get("scene", 0)]["nodes"]
+    left = [(root, torch.eye(4).double()) for root in roots]
+    while left:
+        index, outer = left.pop(0)
         # each comes once, so that a small file cannot stand for a large one
         node = unseen.pop(index)
         pose = outer @ _transform(node)
         if "mesh" in node:
             yield pose, content["meshes"][node["mesh"]]
-        for child in node.get("children", ()):
-            yield from below(child, pose)
-
-    for root in content["scenes"][content.get("scene", 0)]["nodes"]:
-        yield from below(root, torch.eye(4).double())
+        left[:0] = [(child, pose) for child in node.get("children", ())]
 
 
 def _transform(node: Mapping[str, Any]) -> Tensor:
