@@ -70,7 +70,7 @@ class Evidence:
         The fewer photos, the less: the best scale differs between photos of a scene, too.
         """
         expected = found = 0.0
-        for view in _each(judged):
+        for view in each_view(judged):
             expected += float(self.error_map(view.cameras).mean())
             rgb = VIEWER(self.gaussians, view.cameras).rgb
             found += float(errors_of(rgb, view.images).mean())
@@ -99,7 +99,7 @@ class Evidence:
 
 def quality(gaussians: Gaussians, views: Views) -> float:
     """Return the mean PSNR of renders of Gaussians (1, G) as photos (1, V); NaN without photos."""
-    scores = [psnr(VIEWER(gaussians, view.cameras).rgb, view.images) for view in _each(views)]
+    scores = [psnr(VIEWER(gaussians, view.cameras).rgb, view.images) for view in each_view(views)]
     return float(torch.stack(scores).mean()) if scores else math.nan
 
 
@@ -129,7 +129,8 @@ def evidence(gaussians: Gaussians, views: Views) -> Evidence:
     )
 
 
-def _each(views: Views) -> Iterator[Views]:
+def each_view(views: Views) -> Iterator[Views]:
+    """Yield the V views (1, 1) of `views` (1, V)."""
     return (views.select([view]) for view in range(views.images.shape[1]))
 
 

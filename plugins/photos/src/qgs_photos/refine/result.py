@@ -31,7 +31,7 @@ from qgs.reconstruction.scene_formats import (
 from qgs.terminal import print_lines
 from qgs.types import Cameras, Gaussians, Rendering, Views, World
 from qgs_photos.refine.adjusting import exposed, fitted_exposure
-from qgs_photos.refine.evidence import Evidence, errors_of
+from qgs_photos.refine.evidence import Evidence, each_view, errors_of
 from qgs_photos.refine.metric import Distance, in_metres, metres
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
@@ -42,7 +42,6 @@ _SHOWN = 6
 # Views on the page: of photos for the optimisation, and of held-out ones.
 _ON_PAGE = 12
 _JUDGED_ON_PAGE = 4
-_SCORES = ("psnr", "ssim", "exposed_psnr", "error", "expected_error", "alpha", "nearest_input")
 # Largest error in pictures, and their colours from 0 to this.
 _LARGEST_ERROR = 0.2
 _ERROR_MAP = "inferno"
@@ -206,30 +205,26 @@ def scores(result: Result) -> dict[str, Any]:
     """Return what metrics.json holds: command, facts on the optimisation, held-out scores."""
     refined = result.refined
     name_of = result.photos.small.frame_name
-    rows = list[dict[str, Any]]()
+    each = list[dict[str, float]]()
     errors = list[Tensor]()
-    for place, frame in enumerate(result.photos.held_out):
-        photo = result.judged.select([place])
+    for photo in each_view(result.judged):
         rendering = result.render(photo)
         # what no optimisation is needed for
         nearest = nearest_input(result.views, photo.cameras)
         expected = result.evidence.error_map(photo.cameras)
         error = errors_of(rendering.rgb, photo.images)[0, 0]
         errors.append(torch.stack([expected, error]).flatten(1))
-        rows.append(
-            {
-                "frame": frame,
-                "photo": name_of(frame),
-                "psnr": float(psnr(rendering.rgb, photo.images).mean()),
-                "ssim": float(ssim(rendering.rgb, photo.images).mean()),
-                "exposed_psnr": exposed_psnr(rendering.rgb, photo.images),
-                "error": float(error.mean()),
-                "expected_error": float(expected.mean()),
-                "alpha": float(rendering.alpha.mean()),
-                "nearest_input": float(psnr(nearest, photo.images).mean()),
-            }
-        )
-    mean = {name: sum(row[name] for row in rows) / len(rows) for name in _SCORES} if rows else {}
+        found = {
+            "psnr": psnr(rendering.rgb, photo.images),
+            "ssim": ssim(rendering.rgb, photo.images),
+            "exposed_psnr": exposed_psnr(rendering.rgb, photo.images),
+            "error": error,
+            "expected_error": expected,
+            "alpha": rendering.alpha,
+            "nearest_input": psnr(nearest, photo.images),
+        }
+        each.append({name: float(values.mean()) for name, values in found.items()})
+    mean = {name: sum(row[name] for row in each) / len(each) for name in each[0]} if each else {}
     return {
         "command": result.command,
         "gaussians": refined.gaussians.count,
@@ -243,8 +238,11 @@ def scores(result: Result) -> dict[str, Any]:
         "factor": result.factor,
         "scale_by": result.scale_by,
         "mean": mean,
-        "expected_and_error": groups(torch.cat(errors, 1)) if rows else [],
-        "held_out": rows,
+        "expected_and_error": groups(torch.cat(errors, 1)) if errors else [],
+        "held_out": [
+            {"frame": frame, "photo": name_of(frame), **row}
+            for frame, row in zip(result.photos.held_out, each, strict=True)
+        ],
     }
 
 
@@ -257,15 +255,15 @@ def groups(errors: Tensor) -> list[list[float]]:
     return [group.mean(1).tolist() for group in errors[:, order].tensor_split(_GROUPS, 1)]
 
 
-def exposed_psnr(rgb: Tensor, image: Tensor) -> float:
-    """Return the PSNR of the right half of `rgb`, with the exposure that fits the left half best.
+def exposed_psnr(rgb: Tensor, image: Tensor) -> Tensor:
+    """Return the PSNR (1, 1) of the right half, with the exposure that fits the left half best.
 
     rgb, image: render and photo (1, 1, 3, H, W). The exposure is an affine map of colours.
     """
     middle = rgb.shape[-1] // 2
     exposure = fitted_exposure(rgb[..., :middle], image[..., :middle])
     right = exposed(rgb[..., middle:], exposure).clamp(0, 1)
-    return float(psnr(right, image[..., middle:]).mean())
+    return psnr(right, image[..., middle:])
 
 
 def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> images.Picture:
