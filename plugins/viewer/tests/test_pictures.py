@@ -7,13 +7,13 @@ import torch.nn.functional as F
 from numpy.testing import assert_allclose
 from qgs_viewer import queries
 from qgs_viewer.look import CATEGORICAL
-from qgs_viewer.placement import IDENTITY, Placement, hit, on_photo, splats
+from qgs_viewer.placement import hit, on_photo, splats
 from renderers.scenes import make_scene
 from scipy.spatial.transform import Rotation
 from walk import arc, cloud, pinhole
 
 from qgs.drawing.images import NOTHING, finer
-from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.geometry.transforms import moved, to_camera, to_pixels
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import SpatialSupport
 
@@ -97,12 +97,14 @@ def test_attention_maps_share_one_scale_and_show_what_a_mask_hides_as_nothing():
 
 def test_covariances_are_those_of_points_that_were_placed_one_by_one():
     gaussians = cloud(5)
-    turn = torch.from_numpy(Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix())
-    place = Placement(turn, torch.tensor([1.0, -2.0, 0.5]).double(), 1.7)
-    found = splats(gaussians, place)
+    pose = torch.eye(4).double()
+    pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix())
+    pose[:3, 3] = torch.tensor([1.0, -2.0, 0.5])
+    found = splats(moved(gaussians, pose, 1.7))
     for g, turn in enumerate(Rotation.from_quat(gaussians.quats[0], scalar_first=True).as_matrix()):
         axes = turn * gaussians.scales[0, g].numpy()  # one standard deviation along each
-        ends = place.points(gaussians.means[0, g] + torch.from_numpy(axes.T)).numpy()
+        ends = gaussians.means[0, g].numpy() + axes.T
+        ends = 1.7 * ends @ pose[:3, :3].T.numpy() + pose[:3, 3].numpy()
         arms = ends - found.centers[g]
         assert_allclose(arms.T @ arms, found.covariances[g], rtol=1e-4, atol=1e-6)
 
@@ -113,7 +115,7 @@ def test_a_click_hits_what_the_renderer_shows_there():
     scene = cloud(60).to(torch.float64)
     scene.colors.requires_grad_()
     picture = TorchRenderer(TorchRenderer.Config())(scene, view[None], torch.zeros(3).double())
-    found = splats(cloud(60), IDENTITY)
+    found = splats(cloud(60))
     eye = view.c2w[0, :3, 3].numpy()
     checked = 0
     for v, u in product(range(8, 60, 6), repeat=2):

@@ -6,7 +6,6 @@ import torch
 from numpy.testing import assert_allclose
 from qgs_viewer.drawing import FAINT, Choice, painted, query_color
 from qgs_viewer.page import first_eye, up_of
-from qgs_viewer.placement import Placement
 from qgs_viewer.queries import PARTS, attention_pictures_of
 from qgs_viewer.query_scene import QueryScene
 from small import BY_DISTANCE, KINDS, model_scenes_of, source_of
@@ -15,7 +14,8 @@ from torch.testing import assert_close
 from walk import SIDE, arc, cloud, pinhole
 
 import qgs
-from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.geometry.poses import scaled
+from qgs.geometry.transforms import moved, to_camera, to_pixels
 from qgs.types import Views
 
 
@@ -63,12 +63,8 @@ def test_other_inputs_leave_the_scene_where_it_is():
     source = source_of("locus", BY_DISTANCE)
     every = [(frames, source.scene_of(frames)) for frames in ((1, 4), (4, 1), (4, 5, 1))]
     for frames, scene in every:
-        c2w = scene.views.cameras.c2w[0].double()[[frames.index(1), frames.index(4)]]
-        turned = scene.placement.rotation @ c2w[:, :3, :3]
-        places = scene.placement.points(c2w[:, :3, 3])
-        shown = every[0][1].views.cameras.c2w[0].double()
-        assert_equal(turned, shown[:, :3, :3], atol=1e-5)
-        assert_equal(places, shown[:, :3, 3], atol=1e-5)
+        c2w = scene.views.cameras.c2w[0, [frames.index(1), frames.index(4)]]
+        assert_equal(c2w, every[0][1].views.cameras.c2w[0], atol=1e-5)
 
 
 def test_a_picked_query_stands_out():
@@ -85,14 +81,14 @@ def test_a_picked_query_stands_out():
     assert_allclose(colored.colors[mine] * 255, [query_color(4)] * mine.sum(), atol=0.1)
 
 
-TURN = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double()
-PLACE = Placement(TURN, torch.tensor([0.0, 0, 5]).double(), 2.0)
+PLACE = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 5], [0, 0, 0, 1]]).double()
 
 
 def scene_from(c2w):
     """At a cloud around the origin, shown with z up, twice as large, around (0, 0, 5)."""
     images = torch.rand(1, len(c2w), 3, SIDE, SIDE)
-    return QueryScene(cloud(50), Views(images, pinhole(c2w.float())[None]), placement=PLACE)
+    cameras = pinhole((PLACE @ scaled(c2w.double(), 2.0)).float())[None]
+    return QueryScene(moved(cloud(50), PLACE, 2.0), Views(images, cameras))
 
 
 CIRCLE = arc(range(0, 360, 45), 3)

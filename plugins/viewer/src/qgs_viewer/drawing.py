@@ -185,11 +185,9 @@ class Drawing:
             return
         # one switch shows and hides all below it
         self.api.add_frame("/views", show_axes=False)
-        place = scene.placement
-        cameras = scene.views.cameras[0]
-        ends = on_photo(cameras, corners(cameras.size), self.photo_depth / place.scale)
-        ends = place.points(ends)
-        eyes = place.points(cameras.c2w[:, :3, 3])
+        cameras = scene.views.cameras[0].to("cpu", torch.float64)
+        ends = on_photo(cameras, corners(cameras.size), self.photo_depth)
+        eyes = cameras.c2w[:, :3, 3]
         # the edges of pyramids: from the eyes to the corners, and around the photos
         spokes = torch.stack([eyes[:, None].expand_as(ends), ends], 2)
         rims = torch.stack([ends, ends.roll(-1, 1)], 2)
@@ -198,7 +196,7 @@ class Drawing:
         for view, image in enumerate(scene.views.images[0]):
             corner, right, _, left = ends[view]
             # viser's pictures lie in the plane of x and y, as those of cameras do
-            turned = place.rotation @ cameras.c2w[view, :3, :3].cpu().double()
+            turned = cameras.c2w[view, :3, :3]
             # viser's frusta have their principal point in the middle, photos may not
             self.api.add_image(
                 f"/views/{view}",
@@ -297,4 +295,4 @@ def distance_to(scene: QueryScene) -> float:
         if not len(found):
             found = torch.cdist(cameras.c2w[0, :, :3, 3], solid)
     # a scene of one point has no size, and frusta of none would be invisible
-    return max(float(found.median()) * scene.placement.scale, 1e-6)
+    return max(float(found.median()), 1e-6)

@@ -35,7 +35,6 @@ from qgs.reconstruction.scenes import (
 )
 from qgs.types import Cameras, Views, World
 from qgs.wording import listed, one_line
-from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 
 PLY = "gaussians.ply"
@@ -112,12 +111,13 @@ class ModelSource:
             raise ValueError("a reconstruction needs input photos: choose at least one photo")
         # refuses frames that are not there, twice or too many
         picked, _ = checked_window(len(self.scene), frames)
-        world = own_world(self.scene, picked, self.views)
+        own, own_scale = own_world(self.scene, picked, self.views)
+        reference, scale = self.world
         device = next(self.model.parameters()).device
         inputs = make_sample(self.scene, picked, (), self.views, mirror=False).inputs.to(device)
         # other inputs have another world, while the user's view stays
-        place = Placement.between(world, self.world)
-        return explained(self.model, inputs, picked, place)
+        pose = scaled(torch.linalg.inv(reference.double()) @ own.double(), scale)
+        return explained(self.model, inputs, picked, (pose, float(scale) / float(own_scale)))
 
 
 Source = FixedSource | ModelSource

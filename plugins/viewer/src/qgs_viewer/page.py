@@ -25,7 +25,6 @@ from rich.console import Console
 
 from qgs.drawing.images import Picture, rgb_picture
 from qgs.files import refuse_existing, write_text
-from qgs.geometry.harmonics import rotated
 from qgs.geometry.poses import look_at_depth
 from qgs.types import Cameras, Gaussians, Views
 from qgs_viewer.drawing import FRUSTUM, Choice, Drawing, distance_to
@@ -133,7 +132,7 @@ def up_of(scene: QueryScene) -> torch.Tensor:
     if scene.views is None:
         return torch.tensor([0.0, -1.0, 0.0]).double()
     down = scene.views.cameras.c2w[0, :, :3, 1].cpu().double().mean(0)
-    return -(scene.placement.rotation @ F.normalize(down, dim=0))
+    return -F.normalize(down, dim=0)
 
 
 def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
@@ -145,14 +144,14 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
     """
     unit = distance_to(scene)
     if scene.views is None:
-        middle = scene.placement.points(scene.gaussians.means[0]).median(0).values
+        middle = scene.gaussians.means[0].detach().cpu().double().median(0).values
         return (middle - torch.tensor([0.0, 0.0, 2.5 * unit])).numpy(), middle.numpy()
     c2w = scene.views.cameras.c2w[0].cpu().double()
-    eyes = scene.placement.points(c2w[:, :3, 3])
+    eyes = c2w[:, :3, 3]
     apart = (eyes - eyes.mean(0)).norm(dim=-1)
     nearest = apart.argmin()
     eye = eyes[nearest]
-    aside, _, forward = (scene.placement.rotation @ c2w[nearest, :3, :3]).unbind(-1)
+    aside, _, forward = c2w[nearest, :3, :3].unbind(-1)
     target = eye + unit * forward
     if apart.max() > unit and not look_at_depth(c2w):
         return torch.lerp(eye, target, 2 * FRUSTUM).numpy(), target.numpy()
@@ -252,10 +251,9 @@ def harmonics_script(scene: QueryScene) -> str:
     gaussians = scene.gaussians
     if gaussians.sh is None:
         return ""
-    sh = rotated(gaussians.sh[0].cpu(), scene.placement.rotation)
     colors = gaussians.colors[0, :, None].cpu()
     # viser's colours are from 0 to 1, which those beside harmonics may leave
-    values = torch.cat([colors - colors.clamp(0, 1), sh], 1)
+    values = torch.cat([colors - colors.clamp(0, 1), gaussians.sh[0].cpu()], 1)
     most = float(values.abs().max()) + 1e-6
     # most coefficients are far smaller than the largest: 8 bits of their roots are closer
     roots = values.sign() * (values.abs() / most).sqrt()

@@ -1,4 +1,4 @@
-"""Place Gaussians, cameras and photos in the viewer's world; find the Gaussian on a ray."""
+"""Gaussians as viser takes them; points on photos; the Gaussian on a ray."""
 
 from dataclasses import dataclass
 
@@ -9,46 +9,12 @@ from torch import Tensor
 
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.precision import full_precision
-from qgs.types import Cameras, Gaussians, Size, World
+from qgs.types import Cameras, Gaussians, Size
 
 # Blending weight on a clicked ray below which a Gaussian is not hit.
 LEAST_WEIGHT = 0.02
 # A half of the largest number of float16, which viewers get covariances in.
 FLOAT16 = 2.0**15
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Similarity transform between two worlds, float64: p -> scale * rotation p + translation."""
-
-    rotation: Tensor
-    translation: Tensor
-    scale: float
-
-    @staticmethod
-    def between(world: World, other: World) -> "Placement":
-        """Return the transform from the world of one reconstruction into the world of another.
-
-        world, other: pose and scale of the first and the second world, as `own_world` returns them.
-        """
-        pose, scale = world
-        other_pose, other_scale = other
-        # out of the model's world into the photos', and into the other one
-        both = torch.linalg.inv(other_pose.double()) @ pose.double()
-        factor = float(other_scale) / float(scale)
-        return Placement(both[:3, :3], both[:3, 3] * float(other_scale), factor)
-
-    def points(self, points: Tensor) -> Tensor:
-        """Transform points (..., 3)."""
-        return self.scale * points.detach().cpu().double() @ self.rotation.mT + self.translation
-
-    def vectors(self, columns: Tensor) -> Tensor:
-        """Rotate and scale n vectors, the columns of (..., 3, n), without translation."""
-        return self.scale * self.rotation @ columns.detach().cpu().double()
-
-
-IDENTITY = Placement(torch.eye(3).double(), torch.zeros(3).double(), 1.0)
-"""Transform that maps every point to itself."""
 
 
 @dataclass(frozen=True)
@@ -74,15 +40,15 @@ class Splats:
 
 
 @full_precision
-def splats(gaussians: Gaussians, placement: Placement) -> Splats:
-    """Return the Gaussians (1, G) of one scene, placed in the viewer's world.
+def splats(gaussians: Gaussians) -> Splats:
+    """Return the Gaussians (1, G) of one scene.
 
     Spherical harmonics above degree 0 are left out, see `harmonics_script`.
     """
-    rotated = placement.vectors(quat_to_matrix(gaussians.quats[0]))
-    axes_G33 = rotated * gaussians.scales[0].detach().cpu().double()[:, None, :]
+    turns_G33 = quat_to_matrix(gaussians.quats[0]).cpu().double()
+    axes_G33 = turns_G33 * gaussians.scales[0].cpu().double()[:, None, :]
     return Splats(
-        centers=_array(placement.points(gaussians.means[0])),
+        centers=_array(gaussians.means[0]),
         covariances=_array(axes_G33 @ axes_G33.mT),
         opacities=_array(gaussians.opacities[0, :, None]),
         colors=_array(gaussians.colors[0].clamp(0, 1)),

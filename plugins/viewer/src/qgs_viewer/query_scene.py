@@ -8,28 +8,35 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import AttentionWeights, RendererConfig
+from qgs.geometry.poses import scaled
+from qgs.geometry.transforms import moved
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.trace import Trace, trace
 from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
-from qgs_viewer.placement import IDENTITY, Placement, Splats, on_photo, patch_centers, splats
+from qgs_viewer.placement import Splats, on_photo, patch_centers, splats
 
 Background = tuple[float, float, float]
 NEUTRAL: Background = RendererConfig().background
 """Default background of renderers, RGB in [0, 1]."""
+Placement = tuple[Tensor, float]
+"""Transform into the viewer's world: pose (4, 4), float64, and factor, as for `moved`."""
 
 
 @dataclass(frozen=True)
 class Inside:
-    """The model that made a scene, with its intermediate results.
+    """The model that made a scene, with its intermediate results in the world of the model.
 
-    memory: tokens of the input photos. states: states of the queries before the first decoder layer
-    and after each layer. traces: records of passes in which one query's attention was asked for, by
-    index of the query.
+    views: the input views (1, V). memory: tokens of their photos. states: states of the queries
+    before the first decoder layer and after each layer. placement: transform from that world into
+    the viewer's. traces: records of passes in which one query's attention was asked for, by index
+    of the query.
     """
 
     model: QueryGaussianModel
+    views: Views
     memory: ImageMemory
     states: Sequence[QueryState]
+    placement: Placement
     traces: dict[int, Trace] = field(default_factory=dict)
 
 
@@ -37,16 +44,14 @@ class Inside:
 class QueryScene:
     """A reconstruction: Gaussians (1, G), the input views (1, V), and the model's queries.
 
-    frames: indices of the input views in their scene. placement: transform from the world of the
-    Gaussians and views into the viewer's world. inside: the model and its intermediate results;
-    None if only the Gaussians are known, and then there are no queries. background: RGB in [0, 1]
-    behind the Gaussians.
+    All are in the viewer's world. frames: indices of the input views in their scene. inside: the
+    model and its intermediate results; None if only the Gaussians are known, and then there are no
+    queries. background: RGB in [0, 1] behind the Gaussians.
     """
 
     gaussians: Gaussians
     views: Views | None = None
     frames: Sequence[int] = ()
-    placement: Placement = IDENTITY
     inside: Inside | None = None
     background: Background = NEUTRAL
 
@@ -69,8 +74,8 @@ class QueryScene:
 
     @cached_property
     def splats(self) -> Splats:
-        """All Gaussians in the viewer's world."""
-        return splats(self.gaussians, self.placement)
+        """All Gaussians as viser takes them."""
+        return splats(self.gaussians)
 
     def query_of(self, gaussian: int) -> int:
         """Return the index of the query that made the Gaussian with the index `gaussian`."""
@@ -93,8 +98,10 @@ class QueryScene:
         found = self.inside.model.queries.support(self.inside.states[layer])
         if found is None:
             return None
-        place = self.placement
-        return SpatialSupport(place.points(found.centers), place.vectors(found.axes))
+        pose, factor = self.inside.placement
+        rotation = factor * pose[:3, :3]
+        centers, axes = (part.detach().cpu().double() for part in (found.centers, found.axes))
+        return SpatialSupport(centers @ rotation.T + pose[:3, 3], rotation @ axes)
 
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
         """Return the cross-attention of a query in a layer to all patches of `grid`: (1, h, 1, M).
@@ -104,12 +111,12 @@ class QueryScene:
         attention.
         """
         inside = self.inside
-        if inside is None or inside.memory.grid is None or self.views is None or not layer:
+        if inside is None or inside.memory.grid is None or not layer:
             return None
         if query not in inside.traces:
             # all layers at once: users walk through them, and one pass costs as much as any
             with torch.no_grad(), trace(inside.model, queries=[query]) as record:
-                inside.model.predict(self.views, inside.memory, inside.states[0])
+                inside.model.predict(inside.views, inside.memory, inside.states[0])
             inside.traces[query] = record
         return inside.traces[query].layers[layer].cross_attention
 
@@ -129,7 +136,7 @@ class QueryScene:
         found = self.support(layer)
         if found is not None:
             return found.centers[0, query]
-        return self.placement.points(self.gaussians.means[0, self.members(query)]).mean(0)
+        return self.gaussians.means[0, self.members(query)].cpu().double().mean(0)
 
     def strongest(
         self, query: int, layer: int, count: int, depth: float
@@ -143,20 +150,22 @@ class QueryScene:
         weights = self.attention(query, layer)
         if weights is None or self.views is None:
             return None
-        cameras = self.views.cameras[0]
+        cameras = self.views.cameras[0].to("cpu", torch.float64)
         pixels = patch_centers(self.grid, cameras.size)
-        points = on_photo(cameras, pixels, depth / self.placement.scale).flatten(0, 1)
+        points = on_photo(cameras, pixels, depth).flatten(0, 1)
         shares = weights.weights[0, :, 0].float().mean(0).cpu()
         # heads differ, the mean is what figures of papers show
         strongest = shares.topk(min(count, len(shares)))
         side = depth * cameras.size[1] / self.grid[2] / float(cameras.intrinsics[0, 0])
-        read = self.placement.points(points.cpu()[strongest.indices])
-        return read, strongest.values, side
+        return points[strongest.indices], strongest.values, side
 
 
 @torch.no_grad()
 def explained(
-    model: QueryGaussianModel, views: Views, frames: Sequence[int], placement: Placement = IDENTITY
+    model: QueryGaussianModel,
+    views: Views,
+    frames: Sequence[int],
+    placement: Placement | None = None,
 ) -> QueryScene:
     """Reconstruct a scene from V views (1, V) by `model`, with its queries after each layer.
 
@@ -168,11 +177,18 @@ def explained(
     prediction = model.predict(views, memory, start, range(1, model.depth + 1))
     # supports are asked for layer by layer, and the start counts as a layer
     states = [start, *(layer.state for layer in prediction.layers.values())]
+    pose, factor = placement or (torch.eye(4).double(), 1.0)
+    gaussians = prediction.gaussians
+    shown = views
+    if placement:
+        gaussians = moved(gaussians.to("cpu"), pose, factor)
+        c2w = pose @ scaled(views.cameras.c2w.cpu().double(), factor)
+        cameras = views.cameras.replace(c2w=c2w).to("cpu", torch.float32)
+        shown = views.replace(cameras=cameras)
     return QueryScene(
-        prediction.gaussians,
-        views,
+        gaussians,
+        shown,
         frames,
-        placement,
-        inside=Inside(model, memory, states),
+        inside=Inside(model, views, memory, states, (pose, factor)),
         background=model.renderer.config.background,
     )
