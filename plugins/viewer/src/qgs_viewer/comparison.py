@@ -25,6 +25,7 @@ from qgs.evaluate.results import Evaluation
 from qgs.model import QueryGaussianModel
 from qgs.model_text import heading
 from qgs.recipe import Recipe, resolve
+from qgs.recipe.recipe import differing_options
 from qgs.reconstruction.scale import (
     FoundScale,
     FoundSize,
@@ -52,14 +53,16 @@ the longest part of a report."""
 JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
 OF_THE_METHOD = (
-    "optimizer.parts",
-    "training.judge_inputs",
-    "evaluation.tuning",
-    "evaluation.tuning_rate",
-    "views.scale",
-    "views.scale_factor",
+    "optimizer.parts.",
+    "training.judge_inputs.",
+    "evaluation.tuning.",
+    "evaluation.tuning_rate.",
+    "views.scale.",
+    "views.scale_factor.",
 )
 """Options that may differ between compared recipes, because they belong to the method.
+
+A dot ends each name, which leaves out longer names.
 
 They set learning rates of parts of the model, a loss on input views, what tuning changes and how
 fast, and the scale of the model's world. No score depends on the unit of that world.
@@ -295,15 +298,12 @@ def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> No
 
     The options in OF_THE_METHOD, such as `views.scale`, may differ.
     """
-
-    def compared(section: str, recipe: Recipe) -> dict[str, Any]:
-        options = recipe.tree[section] or {}
-        return {name: x for name, x in options.items() if f"{section}.{name}" not in OF_THE_METHOD}
-
     first = next(iter(recipes))
     for name, recipe in recipes.items():
         # one protocol for all, or their scores could not be set side by side
-        unequal = [s for s in sections if compared(s, recipe) != compared(s, recipes[first])]
+        paths = differing_options(recipe.tree, recipes[first].tree)
+        places = {path.split(".")[0] for path in paths if not f"{path}.".startswith(OF_THE_METHOD)}
+        unequal = [section for section in sections if section in places]
         if unequal:
             raise ValueError(
                 f"{name} and {first} differ in {', '.join(unequal)}, so their scores cannot be "
