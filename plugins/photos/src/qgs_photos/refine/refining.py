@@ -149,9 +149,8 @@ def seconds_of_step(
     Runs four steps with all spherical harmonics. Returns the least time of the last three steps,
     and the additional time of the first step, in which kernels compile.
     """
-    run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras)
-    run.levels = run.levels[-1:]
-    run.grows = False
+    # at the end of the schedule
+    run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras, 1.0)
     times = list[float]()
     with torch.enable_grad():
         for _ in range(4):
@@ -174,7 +173,7 @@ class _Run:
         renderer: nn.Module,
         swept: float,
         extras: Extras,
-        begin: float = 0.0,
+        begin: float,
     ) -> None:
         began = perf_counter()
         self.renderer = renderer
