@@ -4,13 +4,13 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Scene
 from qgs.geometry.poses import scaled
 from qgs.types import Cameras, Gaussians, World
 from qgs.wording import did_you_mean, warn_once
+from qgs_photos.refine.sweeping import pixel_rays
 from qgs_photos.viewing import VIEWER
 
 Distance = tuple[str, str, float]
@@ -74,16 +74,14 @@ def metres(distance: Distance, gaussians: Gaussians, cameras: Cameras, photos: S
 def located(point: Point, gaussians: Gaussians, cameras: Cameras) -> Tensor:
     """Return a point in the world of Gaussians (1, G) and all photos' cameras (1, F): (3,)."""
     camera = cameras[:, [point.frame]]
-    pose = camera.c2w[0, 0]
+    centre = camera.c2w[0, 0, :3, 3]
     if point.place is None:
-        return pose[:3, 3]
-    size = pose.new_tensor(camera.size).flip(0)
-    pixel = pose.new_tensor(point.place) * size
+        return centre
+    pixel = centre.new_tensor(point.place) * centre.new_tensor(camera.size).flip(0)
     column, row = pixel.long().tolist()
     depth = VIEWER(gaussians, camera).depth[0, 0, 0, row, column]
-    focal, principal = camera.intrinsics[0, 0].split(2)
-    local = F.pad((pixel - principal) / focal, (0, 1), value=1.0) * depth
-    return pose[:3, :3] @ local + pose[:3, 3]
+    x, y = pixel - 0.5
+    return centre + depth * pixel_rays(camera, 0, y, x)
 
 
 def in_metres(world: World, factor: float) -> World:
