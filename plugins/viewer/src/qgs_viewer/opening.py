@@ -16,7 +16,7 @@ from qgs.checkpoint.models import CHECKPOINT
 from qgs.cli.options import parse_size
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.images import decode_rgb, read_image, to_tensor
-from qgs.data.samples import make_sample, own_world
+from qgs.data.samples import cameras_in, make_sample, own_world
 from qgs.data.view_samplers import evenly
 from qgs.domain import Domain, verdict
 from qgs.geometry.poses import scaled
@@ -117,7 +117,9 @@ class ModelSource:
         inputs = make_sample(self.scene, picked, (), self.views, mirror=False).inputs.to(device)
         # other inputs have another world, while the user's view stays
         pose = scaled(torch.linalg.inv(reference.double()) @ own.double(), scale)
-        return explained(self.model, inputs, picked, (pose, float(scale) / float(own_scale)))
+        placement = (pose, float(scale) / float(own_scale))
+        cameras = cameras_in(self.world, self.scene, picked)
+        return explained(self.model, inputs, picked, placement, cameras)
 
 
 Source = FixedSource | ModelSource

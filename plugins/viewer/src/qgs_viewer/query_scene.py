@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import AttentionWeights, RendererConfig
-from qgs.geometry.poses import scaled
 from qgs.geometry.transforms import moved
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.trace import Trace, trace
-from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
+from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, SpatialSupport, Views
 from qgs_viewer.placement import Splats, on_photo, patch_centers, splats
 
 Background = tuple[float, float, float]
@@ -166,29 +165,24 @@ def explained(
     views: Views,
     frames: Sequence[int],
     placement: Placement | None = None,
+    cameras: Cameras | None = None,
 ) -> QueryScene:
     """Reconstruct a scene from V views (1, V) by `model`, with its queries after each layer.
 
     frames: indices of the views in their scene. placement: transform from the model's world into
-    the viewer's world; by default both worlds are equal.
+    the viewer's world. cameras: those of the views in the viewer's world. By default both worlds
+    are equal.
     """
     memory = model.encoder(views)
     start = model.queries(memory, views)
     prediction = model.predict(views, memory, start, range(1, model.depth + 1))
     # supports are asked for layer by layer, and the start counts as a layer
     states = [start, *(layer.state for layer in prediction.layers.values())]
-    pose, factor = placement or (torch.eye(4).double(), 1.0)
     gaussians = prediction.gaussians
-    shown = views
-    if placement:
-        gaussians = moved(gaussians.to("cpu"), pose, factor)
-        c2w = pose @ scaled(views.cameras.c2w.cpu().double(), factor)
-        cameras = views.cameras.replace(c2w=c2w).to("cpu", torch.float32)
-        shown = views.replace(cameras=cameras)
     return QueryScene(
-        gaussians,
-        shown,
+        moved(gaussians.to("cpu"), *placement) if placement else gaussians,
+        views.replace(cameras=cameras or views.cameras),
         frames,
-        inside=Inside(model, views, memory, states, (pose, factor)),
+        inside=Inside(model, views, memory, states, placement or (torch.eye(4).double(), 1.0)),
         background=model.renderer.config.background,
     )
