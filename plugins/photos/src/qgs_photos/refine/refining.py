@@ -9,6 +9,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from time import perf_counter
+from timeit import repeat
 
 import torch
 from rich.console import Console
@@ -151,14 +152,10 @@ def seconds_of_step(
     """
     # at the end of the schedule
     run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras, 1.0)
-    times = list[float]()
     with torch.enable_grad():
-        for _ in range(4):
-            began = perf_counter()
-            run.optimise()
-            times.append(perf_counter() - began)
-    least = min(times[1:])
-    return least, times[0] - least
+        first, *others = repeat(run.optimise, number=1, repeat=4)
+    least = min(others)
+    return least, first - least
 
 
 class _Run:
