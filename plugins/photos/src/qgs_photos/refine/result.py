@@ -193,10 +193,8 @@ def page_of(result: Result, record: Mapping[str, Any]) -> str:
     if mean := record["mean"]:
         note += f"; held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}"
     title = Path(result.photos.path).resolve().name
-    errors = [
-        error_picture(result.evidence.error_map(stops.cameras[:, [stop]]))
-        for stop in range(len(names))
-    ]
+    evidence = result.evidence
+    errors = [error_picture(evidence.error_map(stop.cameras)) for stop in each_view(stops)]
     tour = Tour(title, note, stops, names, len(best), refined.cameras, errors)
     return gaussians_html(refined.gaussians, tour)
 
@@ -274,7 +272,7 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
     every = -(-len(rows) // _SHOWN)
     views = result.judged.select(slice(None, None, every))
     renders = result.render(views).rgb[0]
-    errors = [result.evidence.error_map(views.cameras[:, [view]]) for view in range(len(renders))]
+    errors = [result.evidence.error_map(view.cameras) for view in each_view(views)]
     pictures = {
         "photo": [rgb_picture(image) for image in views.images[0]],
         "render": [rgb_picture(image) for image in renders],
