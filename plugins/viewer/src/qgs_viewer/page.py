@@ -149,9 +149,7 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
     c2w = scene.views.cameras.c2w[0].cpu().double()
     eyes = c2w[:, :3, 3]
     apart = (eyes - eyes.mean(0)).norm(dim=-1)
-    nearest = apart.argmin()
-    eye = eyes[nearest]
-    aside, _, forward = c2w[nearest, :3, :3].unbind(-1)
+    aside, _, forward, eye = c2w[apart.argmin(), :3].unbind(-1)
     target = eye + unit * forward
     if apart.max() > unit and not look_at_depth(c2w):
         return torch.lerp(eye, target, 2 * FRUSTUM).numpy(), target.numpy()
