@@ -29,7 +29,7 @@ from qgs.reconstruction.scene_formats import (
     writer_of,
 )
 from qgs.terminal import print_lines
-from qgs.types import Cameras, Gaussians, Rendering, Views, World
+from qgs.types import Gaussians, Rendering, Views, World
 from qgs_photos.refine.adjusting import exposed, fitted_exposure
 from qgs_photos.refine.evidence import Evidence, each_view, errors_of
 from qgs_photos.refine.metric import Distance, in_metres, metres
@@ -89,11 +89,6 @@ class Result:
         reference, scale = self.world
         return moved(gaussians, reference, 1 / float(scale))
 
-    def cameras(self) -> dict[str, Cameras]:
-        """Return cameras (1, 1) of the V photos in their world, by their names."""
-        names = map(self.photos.small.frame_name, self.photos.frames)
-        return in_photos_world(self.world, self.refined.cameras, names)
-
     def read_back(self, file: Path) -> "Result":
         """Return a copy of this result with the Gaussians in `file`, so as to score the file."""
         gaussians = in_own_world(self.world, load_ply(file).to(self.world[0].device))
@@ -119,7 +114,9 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
         stored = refined.gaussians
         if out.suffix.lower() == ".glb":
             stored = replace(stored, features=result.evidence.errors[None, :, None])
-        save_gaussians(result.in_photos_world(stored), out, result.cameras())
+        names = map(result.photos.small.frame_name, result.photos.frames)
+        cameras = in_photos_world(result.world, refined.cameras, names)
+        save_gaussians(result.in_photos_world(stored), out, cameras)
         record = scores(result.read_back(out))
         written = [out]
     else:
