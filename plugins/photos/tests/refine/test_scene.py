@@ -97,9 +97,9 @@ def test_an_earlier_scene_is_optimised_further(photos, tmp_path):
     size = "--size 32x48 --gaussians 300 --scale-by 0.png 8.png 2.5"
     _, first = made(f"scene {photos} {few} {size}", earlier)
     options = Options(earlier=earlier, holdout="4")
-    start, _ = chosen_start(ScenePhotos(str(photos), options), options)
-    ours = moved(start.gaussians, start.world[0], 1 / float(start.world[1]))
-    assert first["optimised"] == start.gaussians.count
+    world, given, _ = chosen_start(ScenePhotos(str(photos), options), options)
+    ours = moved(given, world[0], 1 / float(world[1]))
+    assert first["optimised"] == given.count
     stored = qgs.load_ply(earlier / "scene.ply").means[:, -first["optimised"] :]
     assert_close(first["factor"] * ours.means, stored)
     going_on = f"scene {photos} --from {earlier}"

@@ -6,7 +6,7 @@ from pydantic import BaseModel, PositiveFloat, PositiveInt, ValidationError
 
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.types import Size
-from qgs_photos.refine.initial import Initialisation, chosen_initialisation, photos_world
+from qgs_photos.refine.initial import Start, chosen_initialisation, photos_world
 from qgs_photos.refine.metric import Distance, in_metres
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.scene_photos import ScenePhotos
@@ -24,7 +24,7 @@ class _Record(BaseModel):
     scale_by: Distance | None
 
 
-def chosen_start(photos: ScenePhotos, options: Options) -> tuple[Initialisation, Options]:
+def chosen_start(photos: ScenePhotos, options: Options) -> Start:
     """Return the start of the optimisation: from the scene `options.earlier`, if it is given.
 
     Surroundings of that scene are left out, since they are made anew. The options are returned with
@@ -36,7 +36,7 @@ def chosen_start(photos: ScenePhotos, options: Options) -> tuple[Initialisation,
     """
     folder = options.earlier
     if folder is None:
-        return chosen_initialisation(photos, options), options
+        return chosen_initialisation(photos, options)
     if options.model or options.frames or options.scale:
         raise ValueError("--from replaces a model: leave out --model, --frames and --scale")
     file = folder / "scene.ply"
@@ -60,6 +60,6 @@ def chosen_start(photos: ScenePhotos, options: Options) -> tuple[Initialisation,
     gaussians = every[:, -record.optimised :]
     count = options.gaussians or gaussians.count
     size = options.size or record.size
-    start = Initialisation(None, world, gaussians)
     scale_by = options.scale_by or record.scale_by
-    return start, replace(options, size=size, gaussians=count, scale_by=scale_by)
+    options = replace(options, size=size, gaussians=count, scale_by=scale_by)
+    return world, gaussians, options

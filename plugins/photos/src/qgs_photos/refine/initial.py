@@ -1,7 +1,7 @@
 """Make the first Gaussians of `qgs scene`: by a model, or from the photos alone."""
 
 import struct
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
 from scipy.spatial import KDTree
@@ -36,23 +36,13 @@ _NEIGHBOURS = 3
 _FIXED = struct.Struct("<Q3d3BdQ")
 
 
-@dataclass(frozen=True)
-class Initialisation:
-    """Start of the optimisation: given Gaussians, or only the world frame of future Gaussians.
-
-    model: name of the model, or "none"; None if an earlier scene gives the Gaussians. world:
-    reference pose (4, 4) and scale of the world of the Gaussians, see `own_world`. gaussians: of
-    the model or scene, (1, G); None if Gaussians are to be placed from the photos. frames: names of
-    the model's input photos, separated by commas; None without a model.
-    """
-
-    model: str | None
-    world: World
-    gaussians: Gaussians | None = None
-    frames: str | None = None
+Start = tuple[World, Gaussians | None, Options]
+"""Start of the optimisation: reference pose (4, 4) and scale of the world of the Gaussians, see
+`own_world`; Gaussians (1, G), or None if they are to be placed from the photos; the options, with
+the model, input frames and scale that made the Gaussians."""
 
 
-def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisation:
+def chosen_initialisation(photos: ScenePhotos, options: Options) -> Start:
     """Choose between a model and the photos alone as the start; if a model is chosen, run it.
 
     Without --model, --frames and --scale, the photos alone are chosen if there are at least ENOUGH
@@ -67,7 +57,7 @@ def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisati
         )
     enough = not of_model and len(photos.frames) >= ENOUGH
     if options.model == NONE or (options.model is None and enough):
-        return Initialisation(NONE, photos_world(photos))
+        return photos_world(photos), None, replace(options, model=NONE)
     name = options.model or shipped_model()
     result = reconstruct(
         load(name, options.device),
@@ -78,7 +68,9 @@ def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisati
         overrides=scale_settings(options.scale),
     )
     inputs = ",".join(map(photos.small.frame_name, result.sample.input_frames))
-    return Initialisation(name, result.sample.world, result.gaussians, inputs)
+    world = result.sample.world
+    used = replace(options, model=name, frames=inputs, scale=float(world[1]))
+    return world, result.gaussians, used
 
 
 def shipped_model() -> str:

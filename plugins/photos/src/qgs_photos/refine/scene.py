@@ -23,7 +23,7 @@ from qgs_photos.refine.adjusting import DIFFER, brightness
 from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.evidence import MOST, evidence
-from qgs_photos.refine.initial import Initialisation, photos_start
+from qgs_photos.refine.initial import photos_start
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import RefinedScene, refine, seconds_of_step
 from qgs_photos.refine.result import Result, has_viewer, write_scene
@@ -63,8 +63,8 @@ def make_scene(
     opened = perf_counter() - began
     with console.status("choosing a size for the time"):
         print_lines(console, map(str, faults_of_given_poses(photos)[:1]))
-        start, options = chosen_start(photos, options)
-        small = views_in(start.world, photos.small, photos.frames).to(options.device)
+        world, given, options = chosen_start(photos, options)
+        small = views_in(world, photos.small, photos.frames).to(options.device)
         # What masks leave out is empty, and black in viewers.
         color = (0.0, 0.0, 0.0) if options.masks else edge_color(small)
         renderer = AutoRenderer(AutoRenderer.Config(background=color))
@@ -77,15 +77,15 @@ def make_scene(
         size = plan.affordable(left())
         count = plan.count(size)
         end += min(len(photos.frames), MOST) * plan.mean_step(size)
-        every = views_of(photos, start.world, size, options)
+        every = views_of(photos, world, size, options)
     budget = left()
     chosen = replace(options, size=size, gaussians=count, seconds=budget)
-    command = with_start(chosen, start).command(path, str(out))
+    command = chosen.command(path, str(out))
     # before the optimisation: an interrupted one can be repeated
     print_lines(console, [command, *plan.sentences(size, opened, budget)])
     most = int(SWEEP * budget / seconds_of_pixel)
     with console.status("placing Gaussians at pixels"):
-        gaussians = start.gaussians or photos_start(photos.small, start.world, small, count, most)
+        gaussians = given or photos_start(photos.small, world, small, count, most)
     views = every.select(slice(len(photos.frames)))
     refined = refine(
         gaussians,
@@ -93,7 +93,7 @@ def make_scene(
         left(),
         count=count,
         # a model's Gaussians leave holes that pixels fill; the others are at pixels already
-        swept=0.5 if start.frames else 0.0,
+        swept=0.5 if options.frames else 0.0,
         renderer=renderer,
         console=console,
         extras=options.extras,
@@ -101,7 +101,7 @@ def make_scene(
     )
     with console.status("scoring held-out photos and writing files"):
         around = None if options.masks else color
-        result = finished(command, start.world, refined, photos, every, around)
+        result = finished(command, world, refined, photos, every, around)
         result = result.in_metres(options.scale_by)
         write_scene(result, out, page, began, console)
 
@@ -162,12 +162,6 @@ def faults_of_given_poses(photos: ScenePhotos) -> Sequence[Finding]:
     if isinstance(photos.small, PhotoScene) and not is_inside(path, photos.small.folder):
         return []
     return faults_of_poses(path, photos.name, _JUDGING)
-
-
-def with_start(options: Options, start: Initialisation) -> Options:
-    """Return `options` with the model, input frames and scale that were used for `start`."""
-    scale = float(start.world[1]) if start.frames else None
-    return replace(options, model=start.model, frames=start.frames, scale=scale)
 
 
 def masked(views: Views) -> Views:
