@@ -32,7 +32,7 @@ from qgs.terminal import print_lines
 from qgs.types import Gaussians, Rendering, Views, World
 from qgs_photos.refine.adjusting import exposed, fitted_exposure
 from qgs_photos.refine.evidence import Evidence, each_view, errors_of
-from qgs_photos.refine.metric import Distance, in_metres, metres
+from qgs_photos.refine.metric import Distance
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.viewing import VIEWER, in_own_world
@@ -58,7 +58,7 @@ class Result:
     scale of the world of the Gaussians, see `own_world`. views: the V photos of the optimisation,
     (1, V). judged: the H held-out photos on which the scene is scored, (1, H). evidence: what the
     photos show of the Gaussians. factor: by which the photos' world is multiplied in files,
-    because of the measured distance `scale_by`.
+    because of the measured distance `scale_by`; 1 without one.
     """
 
     command: str
@@ -69,20 +69,8 @@ class Result:
     views: Views
     judged: Views
     evidence: Evidence
-    factor: float = 1.0
-    scale_by: Distance | None = None
-
-    def in_metres(self, distance: Distance | None) -> "Result":
-        """Return the result in metres by a measured distance; unchanged without one."""
-        if distance is None:
-            return self
-        every = concatenated([self.refined.cameras, self.judged.cameras], 1)
-        # in the order of the photos
-        frames = torch.tensor([*self.photos.frames, *self.photos.held_out]).argsort()
-        units = metres(distance, self.refined.gaussians, every[:, frames], self.photos.small)
-        factor = units * float(self.world[1])
-        world = in_metres(self.world, factor)
-        return replace(self, world=world, factor=factor, scale_by=distance)
+    factor: float
+    scale_by: Distance | None
 
     def in_photos_world(self, gaussians: Gaussians) -> Gaussians:
         """Return Gaussians (1, G) in the world coordinates of the photos' cameras."""

@@ -8,6 +8,7 @@ from time import perf_counter
 import torch
 from rich.console import Console
 
+from qgs.containers import concatenated
 from qgs.data.photos.finding import is_inside
 from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import views_in
@@ -24,6 +25,7 @@ from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.evidence import MOST, evidence
 from qgs_photos.refine.initial import photos_start
+from qgs_photos.refine.metric import Distance, in_metres, metres
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import RefinedScene, refine, seconds_of_step
 from qgs_photos.refine.result import Result, has_viewer, write_scene
@@ -101,8 +103,7 @@ def make_scene(
     )
     with console.status("scoring held-out photos and writing files"):
         around = None if options.masks else color
-        result = finished(command, world, refined, photos, every, around)
-        result = result.in_metres(options.scale_by)
+        result = finished(command, world, refined, photos, every, around, options.scale_by)
         write_scene(result, out, page, began, console)
 
 
@@ -113,11 +114,12 @@ def finished(
     photos: ScenePhotos,
     every: Views,
     color: Sequence[float] | None,
+    distance: Distance | None,
 ) -> Result:
     """Return the result of an optimisation with surroundings, and without floaters.
 
     every: photos of the optimisation, then the held-out photos: (1, V). color: RGB of surroundings;
-    None leaves them out.
+    None leaves them out. distance: measured distance by which files are in metres, if given.
     """
     optimised = refined.gaussians
     whole = optimised if color is None else surrounded(optimised, every, color)
@@ -128,7 +130,15 @@ def finished(
     found = found.cleaned(judged, around).calibrated(judged)
     refined = replace(refined, gaussians=found.gaussians)
     count = found.gaussians.count - around
-    return Result(command, count, world, refined, photos, views, judged, found)
+    factor = 1.0
+    if distance:
+        cameras = concatenated([refined.cameras, judged.cameras], 1)
+        # in the order of the photos
+        frames = torch.tensor([*photos.frames, *photos.held_out]).argsort()
+        units = metres(distance, found.gaussians, cameras[:, frames], photos.small)
+        factor = units * float(world[1])
+        world = in_metres(world, factor)
+    return Result(command, count, world, refined, photos, views, judged, found, factor, distance)
 
 
 def views_of(photos: ScenePhotos, world: World, size: Size, options: Options) -> Views:
