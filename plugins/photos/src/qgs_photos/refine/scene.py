@@ -14,7 +14,6 @@ from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import views_in
 from qgs.paths import opened_path
 from qgs.reconstruction.scene_formats import writer_of
-from qgs.reconstruction.scenes import Size
 from qgs.renderers import AutoRenderer
 from qgs.terminal import print_lines
 from qgs.types import Gaussians, Views, World
@@ -79,7 +78,9 @@ def make_scene(
         size = plan.affordable(left())
         count = plan.count(size)
         end += min(len(photos.frames), MOST) * plan.mean_step(size)
-        every = views_of(photos, world, size, options)
+        frames = (*photos.frames, *photos.held_out)
+        every = views_in(world, photos.at(size), frames).to(options.device)
+        every = masked(every) if options.masks else every
     budget = left()
     chosen = replace(options, size=size, gaussians=count, seconds=budget)
     command = chosen.command(path, str(out))
@@ -139,13 +140,6 @@ def finished(
         factor = units * float(world[1])
         world = in_metres(world, factor)
     return Result(command, count, world, refined, photos, views, judged, found, factor, distance)
-
-
-def views_of(photos: ScenePhotos, world: World, size: Size, options: Options) -> Views:
-    """Return the photos of size (H, W) for the optimisation, then the held-out photos: (1, V)."""
-    frames = (*photos.frames, *photos.held_out)
-    views = views_in(world, photos.at(size), frames).to(options.device)
-    return masked(views) if options.masks else views
 
 
 def with_exposure(
