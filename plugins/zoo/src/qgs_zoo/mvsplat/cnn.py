@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from qgs_zoo.mvsplat.unet import conv3
+
 WIDTHS = (64, 96, 128)
 """Channels of the three stages of the CNN (released code)."""
 
@@ -28,8 +30,8 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
-        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        self.conv1 = conv3(inputs, outputs, stride=stride, bias=False)
+        self.conv2 = conv3(outputs, outputs, bias=False)
         self.stride = stride
         same = stride == 1 and inputs == outputs
         self.downsample = None if same else nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride))

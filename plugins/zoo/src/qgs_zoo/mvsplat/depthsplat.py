@@ -266,7 +266,7 @@ class DepthSplat(nn.Module):
         self.feature_upsampler = dpt_head(sizes, depth=False)
         features = sizes.full_features
         hidden = sizes.regressor
-        self.gaussian_regressor = two_convolutions(features + 5, hidden, hidden, "zeros")
+        self.gaussian_regressor = two_convolutions(features + 5, hidden, hidden)
         raw = GAUSSIAN_CHANNELS + 3 * harmonics
         self.gaussian_head = two_convolutions(hidden + features + 4, raw, raw, "replicate")
         # Scales and harmonics start at their constant offsets.

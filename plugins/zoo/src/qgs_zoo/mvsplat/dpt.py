@@ -59,7 +59,7 @@ class Scratch(nn.Module):
     def __init__(self, channels: Sequence[int], features: int, ends_in_depth: bool) -> None:
         super().__init__()
         for number, width in enumerate(channels, start=1):
-            projected = nn.Conv2d(width, features, 3, padding=1, bias=False)
+            projected = conv3(width, features, bias=False)
             self.add_module(f"layer{number}_rn", projected)
             fusion = Fusion(features, coarsest=number == len(channels))
             self.add_module(f"refinenet{number}", fusion)
@@ -111,7 +111,7 @@ class DptHead(nn.Module):
                 nn.ConvTranspose2d(c2, c2, 4, 4),
                 nn.ConvTranspose2d(c4, c4, 2, 2),
                 nn.Identity(),
-                nn.Conv2d(c16, c16, 3, 2, 1),
+                conv3(c16, c16, stride=2),
             ]
         )
         # One exists even if nothing joins: it then maps the features of the ViT alone.

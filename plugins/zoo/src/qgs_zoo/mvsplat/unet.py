@@ -5,6 +5,7 @@ The U-Net is the one of latent diffusion, without the embedding of time.
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -14,19 +15,18 @@ from torch import Tensor, nn
 
 HEAD_WIDTH = 32
 
-Padding = Literal["zeros", "replicate"]
-
-
-def conv3(inputs: int, outputs: int, padding: Padding = "zeros") -> nn.Conv2d:
-    """Make a 3 x 3 convolution that keeps height and width."""
-    return nn.Conv2d(inputs, outputs, 3, padding=1, padding_mode=padding)
+conv3 = partial(nn.Conv2d, kernel_size=3, padding=1)
+"""Function that makes a 3 x 3 convolution, which keeps height and width at a stride of 1."""
+group_norm = partial(nn.GroupNorm, 8)
+"""Function that makes a GroupNorm with 8 groups for a width that is a multiple of 8."""
 
 
 def two_convolutions(
-    inputs: int, hidden: int, outputs: int, padding: Padding = "zeros"
+    inputs: int, hidden: int, outputs: int, padding: Literal["zeros", "replicate"] = "zeros"
 ) -> nn.Sequential:
     """Make a sequence of a 3 x 3 convolution, a GELU and a 3 x 3 convolution."""
-    return nn.Sequential(conv3(inputs, hidden, padding), nn.GELU(), conv3(hidden, outputs, padding))
+    first = conv3(inputs, hidden, padding_mode=padding)
+    return nn.Sequential(first, nn.GELU(), conv3(hidden, outputs, padding_mode=padding))
 
 
 def zeroed(module: nn.Module) -> nn.Module:
@@ -39,11 +39,6 @@ def zeroed(module: nn.Module) -> nn.Module:
 def resized(x_BCHW: Tensor, size: Sequence[int]) -> Tensor:
     """Resize maps bilinearly to `size` (H, W), with `align_corners=True` of torch."""
     return F.interpolate(x_BCHW, tuple(size), mode="bilinear", align_corners=True)
-
-
-def group_norm(width: int) -> nn.GroupNorm:
-    """Make a GroupNorm with 8 groups; `width` is a multiple of 8."""
-    return nn.GroupNorm(8, width)
 
 
 class OverViews(nn.Sequential):
@@ -130,7 +125,7 @@ class UNet(nn.Module):
         for level in range(levels):
             down.append(block(width, lowest=level == levels - 1))
             if level < levels - 1:
-                down.append([named(op=nn.Conv2d(width, width, 3, 2, padding=1))])
+                down.append([named(op=conv3(width, width, stride=2))])
         for level in reversed(range(levels)):
             up += [block(2 * width, lowest=level == levels - 1) for _ in range(2)]
             finer = named(twice=nn.Upsample(scale_factor=2), conv=conv3(width, width))
