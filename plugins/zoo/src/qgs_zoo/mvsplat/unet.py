@@ -6,7 +6,7 @@ The U-Net is the one of latent diffusion, without the embedding of time.
 from collections import OrderedDict
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -46,28 +46,33 @@ class OverViews(nn.Sequential):
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
         for module in self:
-            takes_views = isinstance(module, OverViews | ViewAttention | UNet)
+            takes_views = isinstance(module, ViewAttention | UNet)
             x_NCHW = module(x_NCHW, views) if takes_views else module(x_NCHW)
         return x_NCHW
 
 
+def with_norm(inputs: int, outputs: int, pre_norm: bool) -> list[nn.Module]:
+    """Make a 3 x 3 convolution, a norm and a SiLU. pre_norm: True puts the convolution last."""
+    convolution = conv3(inputs, outputs)
+    if pre_norm:
+        return [group_norm(inputs), nn.SiLU(), convolution]
+    return [convolution, group_norm(outputs), nn.SiLU()]
+
+
 class ResidualBlock(nn.Module):
-    """Residual block of two convolutions.
+    """Residual block of two convolutions, which starts as its skip connection.
 
     pre_norm: True puts a norm before each convolution, False after each convolution.
     """
 
     def __init__(self, inputs: int, outputs: int, pre_norm: bool) -> None:
         super().__init__()
-        first = conv3(inputs, outputs)
-        second = conv3(outputs, outputs)
+        self.in_layers = nn.Sequential(*with_norm(inputs, outputs, pre_norm))
+        last = with_norm(outputs, outputs, pre_norm)
+        zeroed(last[2 if pre_norm else 1])
         if pre_norm:
-            self.in_layers = nn.Sequential(group_norm(inputs), nn.SiLU(), first)
             # The identity replaces a dropout of 0 of the release, so that parameter names match.
-            last: Any = (group_norm(outputs), nn.SiLU(), nn.Identity(), zeroed(second))
-        else:
-            self.in_layers = nn.Sequential(first, group_norm(outputs), nn.SiLU())
-            last = (second, zeroed(group_norm(outputs)), nn.SiLU())
+            last.insert(2, nn.Identity())
         self.out_layers = nn.Sequential(*last)
         same = inputs == outputs
         self.skip_connection = nn.Identity() if same else nn.Conv2d(inputs, outputs, 1)
@@ -117,29 +122,25 @@ class UNet(nn.Module):
             attention = [ViewAttention(width, pre_norm)] if lowest else []
             return [ResidualBlock(inputs, width, pre_norm), *attention]
 
-        def named(**layers: nn.Module) -> nn.Sequential:
-            return nn.Sequential(OrderedDict(layers))
-
         down: list[list[nn.Module]] = [[conv3(width, width)]]
         up: list[list[nn.Module]] = []
-        for level in range(levels):
-            down.append(block(width, lowest=level == levels - 1))
-            if level < levels - 1:
-                down.append([named(op=conv3(width, width, stride=2))])
+        for _ in range(levels - 1):
+            down.append(block(width, lowest=False))
+            down.append([nn.Sequential(OrderedDict(op=conv3(width, width, stride=2)))])
+        down.append(block(width, lowest=True))
         for level in reversed(range(levels)):
             up += [block(2 * width, lowest=level == levels - 1) for _ in range(2)]
-            finer = named(twice=nn.Upsample(scale_factor=2), conv=conv3(width, width))
-            up[-1] += [finer] if level else []
+            finer = OrderedDict(twice=nn.Upsample(scale_factor=2), conv=conv3(width, width))
+            up[-1] += [nn.Sequential(finer)] if level else []
         self.input_blocks = nn.ModuleList(OverViews(*modules) for modules in down)
-        blocks = (ResidualBlock(width, width, pre_norm) for _ in range(2))
+        first = ResidualBlock(width, width, pre_norm)
+        second = ResidualBlock(width, width, pre_norm)
         # the identity keeps the number of the second block, so that parameter names match
-        self.middle_block = nn.Sequential(next(blocks), nn.Identity(), next(blocks))
+        self.middle_block = nn.Sequential(first, nn.Identity(), second)
         self.output_blocks = nn.ModuleList(OverViews(*modules) for modules in up)
-        final = conv3(width, width)
+        self.out = nn.Sequential(*with_norm(width, width, pre_norm))
         if pre_norm:
-            self.out = nn.Sequential(group_norm(width), nn.SiLU(), zeroed(final))
-        else:
-            self.out = nn.Sequential(final, group_norm(width), nn.SiLU())
+            zeroed(self.out[2])
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
         """Return maps with the shape of `x_NCHW`: `views` maps of each scene, scene by scene."""
