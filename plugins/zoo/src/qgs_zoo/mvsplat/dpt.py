@@ -37,54 +37,19 @@ class Fusion(nn.Module):
     def __init__(self, channels: int, coarsest: bool) -> None:
         super().__init__()
         self.out_conv = nn.Conv2d(channels, channels, 1)
-        self.resConfUnit1 = None if coarsest else ResidualUnit(channels)
+        self.resConfUnit1 = nn.Identity() if coarsest else ResidualUnit(channels)
         self.resConfUnit2 = ResidualUnit(channels)
 
-    def forward(self, coarse: Tensor | None, skip: Tensor, size: Sequence[int]) -> Tensor:
+    def forward(self, coarse: Tensor, skip: Tensor, size: Sequence[int]) -> Tensor:
         """Return the sum of the maps `skip` and `coarse`, resized to `size`: (X, F, *size).
 
-        X: number of images. F: channels. coarse: sum of all maps coarser than `skip`, or None if
+        X: number of images. F: channels. coarse: sum of all maps coarser than `skip`, which is 0 if
         `skip` is the coarsest map.
         """
-        if self.resConfUnit1 is not None and coarse is not None:
-            skip = coarse + self.resConfUnit1(skip)
+        summed = coarse + self.resConfUnit1(skip)
         # The release resizes first. The weights of resizing sum to 1, so it commutes with a 1 x 1
         # convolution, which has a quarter of the pixels here.
-        return resized(self.out_conv(self.resConfUnit2(skip)), size)
-
-
-class Scratch(nn.Module):
-    """Part of a DPT head that adds maps of four resolutions, with the published parameter names."""
-
-    def __init__(self, channels: Sequence[int], features: int, ends_in_depth: bool) -> None:
-        super().__init__()
-        for number, width in enumerate(channels, start=1):
-            projected = conv3(width, features, bias=False)
-            self.add_module(f"layer{number}_rn", projected)
-            fusion = Fusion(features, coarsest=number == len(channels))
-            self.add_module(f"refinenet{number}", fusion)
-        last: list[nn.Module] = []
-        if ends_in_depth:
-            # The correction is 0 before training.
-            hidden = two_convolutions(features, features // 2, 16, "replicate")
-            last = [*hidden, nn.GELU(), zeroed(nn.Conv2d(16, 1, 1))]
-        self.output_conv = nn.Sequential(*last)
-
-    def forward(self, maps: Sequence[Tensor]) -> Tensor:
-        """Return a full-size map from maps at 1/2, 1/4, 1/8 and 1/16 of the image size.
-
-        The result for X images has F channels, (X, F, H, W). With `ends_in_depth`, it is a
-        correction of depth, (X, 1, H, W).
-        """
-        path = None
-        # From coarse to fine: each fusion doubles the size.
-        for number in range(len(maps), 0, -1):
-            skip = self.get_submodule(f"layer{number}_rn")(maps[number - 1])
-            full = [2 * side for side in maps[0].shape[-2:]]
-            size = maps[number - 2].shape[-2:] if number > 1 else full
-            path = self.get_submodule(f"refinenet{number}")(path, skip, size)
-        assert path is not None
-        return self.output_conv(path)
+        return resized(self.out_conv(self.resConfUnit2(summed)), size)
 
 
 class DptHead(nn.Module):
@@ -119,7 +84,18 @@ class DptHead(nn.Module):
             nn.Conv2d(own + other, own, 1)
             for own, other in zip(channels[:LEVELS], joined, strict=True)
         )
-        self.scratch = Scratch(channels, features, ends_in_depth)
+        # The names of the layers that add maps, from coarse to fine, are published.
+        self.scratch = nn.ModuleDict()
+        for number, own in enumerate(channels, start=1):
+            self.scratch[f"layer{number}_rn"] = conv3(own, features, bias=False)
+            fusion = Fusion(features, coarsest=number == len(channels))
+            self.scratch[f"refinenet{number}"] = fusion
+        last: list[nn.Module] = []
+        if ends_in_depth:
+            # The correction is 0 before training.
+            hidden = two_convolutions(features, features // 2, 16, "replicate")
+            last = [*hidden, nn.GELU(), zeroed(nn.Conv2d(16, 1, 1))]
+        self.scratch["output_conv"] = nn.Sequential(*last)
 
     def forward(
         self,
@@ -136,4 +112,11 @@ class DptHead(nn.Module):
         ]
         for level, (before, behind) in enumerate(joined):
             own[level] = self.concat_projects[level](torch.cat([*before, own[level], *behind], 1))
-        return self.scratch(own)
+        path = own[0].new_zeros(())
+        full = [2 * side for side in own[0].shape[-2:]]
+        sizes = [full, *(x.shape[-2:] for x in own)]
+        # From coarse to fine: each fusion doubles the size.
+        for number in range(len(own), 0, -1):
+            skip = self.scratch[f"layer{number}_rn"](own[number - 1])
+            path = self.scratch[f"refinenet{number}"](path, skip, sizes[number - 1])
+        return self.scratch["output_conv"](path)
