@@ -5,7 +5,7 @@ of the image size. Scale 0 means the first plane sweep, scale 1 the second.
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -254,45 +254,6 @@ def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
     return DptHead(sizes.vit.width, sizes.dpt, features, others, depth)
 
 
-class DepthSplat(nn.Module):
-    """Network that predicts depths and raw Gaussians of all pixels from images and cameras.
-
-    harmonics: number of coefficients for each of the three colours.
-    """
-
-    def __init__(self, sizes: DepthSplatConfig, harmonics: int) -> None:
-        super().__init__()
-        self.depth_predictor = DepthPredictor(sizes)
-        self.feature_upsampler = dpt_head(sizes, depth=False)
-        features = sizes.full_features
-        hidden = sizes.regressor
-        self.gaussian_regressor = two_convolutions(features + 5, hidden, hidden)
-        raw = GAUSSIAN_CHANNELS + 3 * harmonics
-        self.gaussian_head = two_convolutions(hidden + features + 4, raw, raw, "replicate")
-        # Scales and harmonics start at their constant offsets.
-        with torch.no_grad():
-            for parameter in self.gaussian_head[2].parameters():
-                parameter[3:6] = 0
-                parameter[GAUSSIAN_CHANNELS:] = 0
-
-    def forward(self, images_BV3HW: Tensor, sweep: Sweep) -> tuple[list[Tensor], Tensor]:
-        """Return depths (B, V, H, W) from each sweep, and raw Gaussians (B, V, 10 + 3 K, H, W).
-
-        K: number of harmonics per colour.
-        """
-        found = self.depth_predictor(images_BV3HW, sweep)
-        features_NFHW = self.feature_upsampler(found.maps, found.joined)
-        images_N3HW = images_BV3HW.flatten(0, 1)
-        # Depth, up to `far`, not its inverse (released code).
-        depth_N1HW = found.depths[-1].flatten(0, 1)[:, None]
-        seen = torch.cat([images_N3HW, depth_N1HW, found.confidence, features_NFHW], 1)
-        hidden = self.gaussian_regressor(seen)
-        raw = self.gaussian_head(
-            torch.cat([hidden, images_N3HW, features_NFHW, found.confidence], 1)
-        )
-        return found.depths, raw.unflatten(0, images_BV3HW.shape[:2])
-
-
 class DepthSplatEncoder(Decaying, SweepEncoder):
     """Encoder that predicts depth and raw Gaussian of each pixel, with a plane sweep and a ViT.
 
@@ -340,7 +301,21 @@ class DepthSplatEncoder(Decaying, SweepEncoder):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.network = DepthSplat(config, coefficients(degree_of(dims.width)))
+        # The names of its parts are published.
+        self.network: Any = nn.ModuleDict()
+        self.network.depth_predictor = DepthPredictor(config)
+        self.network.feature_upsampler = dpt_head(config, depth=False)
+        features = config.full_features
+        hidden = config.regressor
+        self.network.gaussian_regressor = two_convolutions(features + 5, hidden, hidden)
+        raw = GAUSSIAN_CHANNELS + 3 * coefficients(degree_of(dims.width))
+        head = two_convolutions(hidden + features + 4, raw, raw, "replicate")
+        self.network.gaussian_head = head
+        # Scales and harmonics start at their constant offsets.
+        with torch.no_grad():
+            for parameter in head[2].parameters():
+                parameter[3:6] = 0
+                parameter[GAUSSIAN_CHANNELS:] = 0
 
     def load_pretrained(self) -> None:
         self.network.depth_predictor.pretrained.load(self.config.vit.weights)
@@ -349,14 +324,23 @@ class DepthSplatEncoder(Decaying, SweepEncoder):
         # Chosen once: both scales and the transformer read the same views.
         neighbours = nearest_neighbours(views.cameras.c2w, self.config.neighbours)
         sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
-        depths, raw_BVCHW = self.network(views.images, sweep)
-        gaussian, sh_BVCHW = at_least_float32(raw_BVCHW).tensor_split([GAUSSIAN_CHANNELS], 2)
+        found = self.network.depth_predictor(views.images, sweep)
+        features_NFHW = self.network.feature_upsampler(found.maps, found.joined)
+        images_N3HW = views.images.flatten(0, 1)
+        # Depth, up to `far`, not its inverse (released code).
+        depth_N1HW = found.depths[-1].flatten(0, 1)[:, None]
+        seen = torch.cat([images_N3HW, depth_N1HW, found.confidence, features_NFHW], 1)
+        hidden = self.network.gaussian_regressor(seen)
+        seen = torch.cat([hidden, images_N3HW, features_NFHW, found.confidence], 1)
+        raw_NCHW = at_least_float32(self.network.gaussian_head(seen))
+        raw_BVCHW = raw_NCHW.unflatten(0, near_BV.shape)
+        gaussian, sh_BVCHW = raw_BVCHW.tensor_split([GAUSSIAN_CHANNELS], 2)
         sh_BV3KHW = sh_BVCHW.unflatten(2, (3, -1))
         # The pixel's colour is added to the constant: an untrained network copies the photo.
         constant = sh_BV3KHW[:, :, :, :1] + ((views.images - 0.5) / SH_C0)[:, :, :, None]
         sh_BV3KHW = torch.cat([constant, sh_BV3KHW[:, :, :, 1:]], 3)
         # Logarithms of depths have about the range of features.
-        logs = [depth[:, :, None].log() for depth in depths]
+        logs = [depth[:, :, None].log() for depth in found.depths]
         numbers = torch.cat([logs[-1], gaussian, sh_BV3KHW.flatten(2, 3)], 2)
         # It is the last number, where `mvsplat/exchange` expects it.
         coarse = logs[:1] if self.config.coarse_depth else []
