@@ -334,14 +334,14 @@ class DepthSplatEncoder(Decaying, SweepEncoder):
         seen = torch.cat([hidden, images_N3HW, features_NFHW, found.confidence], 1)
         raw_NCHW = at_least_float32(self.network.gaussian_head(seen))
         raw_BVCHW = raw_NCHW.unflatten(0, near_BV.shape)
-        gaussian, sh_BVCHW = raw_BVCHW.tensor_split([GAUSSIAN_CHANNELS], 2)
-        sh_BV3KHW = sh_BVCHW.unflatten(2, (3, -1))
         # The pixel's colour is added to the constant: an untrained network copies the photo.
-        constant = sh_BV3KHW[:, :, :, :1] + ((views.images - 0.5) / SH_C0)[:, :, :, None]
-        sh_BV3KHW = torch.cat([constant, sh_BV3KHW[:, :, :, 1:]], 3)
+        first = GAUSSIAN_CHANNELS
+        step = coefficients(degree_of(self.dims.width))
+        constant = raw_BVCHW[:, :, first::step] + (views.images - 0.5) / SH_C0
+        raw_BVCHW = raw_BVCHW.slice_scatter(constant, 2, first, step=step)
         # Logarithms of depths have about the range of features.
         logs = [depth[:, :, None].log() for depth in found.depths]
-        numbers = torch.cat([logs[-1], gaussian, sh_BV3KHW.flatten(2, 3)], 2)
+        numbers = torch.cat([logs[-1], raw_BVCHW], 2)
         # It is the last number, where `mvsplat/exchange` expects it.
         coarse = logs[:1] if self.config.coarse_depth else []
         left = self.dims.width - numbers.shape[2] - len(coarse)
