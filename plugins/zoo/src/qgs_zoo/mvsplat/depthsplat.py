@@ -5,7 +5,7 @@ of the image size. Scale 0 means the first plane sweep, scale 1 the second.
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -87,21 +87,6 @@ class DepthSplatConfig(ComponentConfig):
         return [0, first - 1, first, *sweeps, sweeps[-1]]
 
 
-class Depths(NamedTuple):
-    """Results of `DepthPredictor`.
-
-    depths: camera-frame z (B, V, H, W) in world units, one tensor for each sweep; a DPT head
-    corrects only the last tensor. confidence: largest probability of a depth in the last sweep,
-    (B V, 1, H, W). maps: tokens of the ViT (B V, C, H/8, W/8). joined: maps of other networks,
-    which a DPT head reads together with `maps`.
-    """
-
-    depths: list[Tensor]
-    confidence: Tensor
-    maps: list[Tensor]
-    joined: Joined
-
-
 class Pyramid(nn.Module):
     """Network that returns its input, and a second map of twice the size with half the channels."""
 
@@ -167,8 +152,16 @@ class DepthPredictor(nn.Module):
         """Return the number of depths that a sweep tries. Scale 0 is the first sweep."""
         return self.sizes.candidates // 4**scale
 
-    def forward(self, images_BV3HW: Tensor, sweep: Sweep) -> Depths:
-        """Return the depths of all pixels."""
+    def forward(
+        self, images_BV3HW: Tensor, sweep: Sweep
+    ) -> tuple[list[Tensor], Tensor, list[Tensor], Joined]:
+        """Return depths of all pixels, confidences, maps of the ViT, and maps to join with these.
+
+        Depths are camera-frame z (B, V, H, W) in world units, one tensor for each sweep; a DPT head
+        corrects only the last tensor. The confidence of a pixel is the largest probability of a
+        depth in the last sweep, (B V, 1, H, W). The maps of the ViT are (B V, C, H/8, W/8). A DPT
+        head reads them together with the maps of other networks.
+        """
         size = images_BV3HW.shape[-2:]
         shape = images_BV3HW.shape[:2]
         normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
@@ -197,7 +190,7 @@ class DepthPredictor(nn.Module):
         full[-1] = (full[-1] + correction_N1HW).clamp(*bounds(sweep))
         depths = [(1 / x[:, 0]).unflatten(0, shape) for x in full]
         confidence_N1HW = F.interpolate(confidence_N1hw, size, mode="nearest")
-        return Depths(depths, confidence_N1HW, maps, self.beside(cnn, multi))
+        return depths, confidence_N1HW, maps, self.beside(cnn, multi)
 
     def match(
         self, cnn: Stages, multi: Sequence[Tensor], mono: Sequence[Tensor], sweep: Sweep
@@ -324,14 +317,14 @@ class DepthSplatEncoder(Decaying, SweepEncoder):
         # Chosen once: both scales and the transformer read the same views.
         neighbours = nearest_neighbours(views.cameras.c2w, self.config.neighbours)
         sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
-        found = self.network.depth_predictor(views.images, sweep)
-        features_NFHW = self.network.feature_upsampler(found.maps, found.joined)
+        depths, confidence, maps, joined = self.network.depth_predictor(views.images, sweep)
+        features_NFHW = self.network.feature_upsampler(maps, joined)
         images_N3HW = views.images.flatten(0, 1)
         # Depth, up to `far`, not its inverse (released code).
-        depth_N1HW = found.depths[-1].flatten(0, 1)[:, None]
-        seen = torch.cat([images_N3HW, depth_N1HW, found.confidence, features_NFHW], 1)
+        depth_N1HW = depths[-1].flatten(0, 1)[:, None]
+        seen = torch.cat([images_N3HW, depth_N1HW, confidence, features_NFHW], 1)
         hidden = self.network.gaussian_regressor(seen)
-        seen = torch.cat([hidden, images_N3HW, features_NFHW, found.confidence], 1)
+        seen = torch.cat([hidden, images_N3HW, features_NFHW, confidence], 1)
         raw_NCHW = at_least_float32(self.network.gaussian_head(seen))
         raw_BVCHW = raw_NCHW.unflatten(0, near_BV.shape)
         # The pixel's colour is added to the constant: an untrained network copies the photo.
@@ -340,7 +333,7 @@ class DepthSplatEncoder(Decaying, SweepEncoder):
         constant = raw_BVCHW[:, :, first::step] + (views.images - 0.5) / SH_C0
         raw_BVCHW = raw_BVCHW.slice_scatter(constant, 2, first, step=step)
         # Logarithms of depths have about the range of features.
-        logs = [depth[:, :, None].log() for depth in found.depths]
+        logs = [depth[:, :, None].log() for depth in depths]
         numbers = torch.cat([logs[-1], raw_BVCHW], 2)
         # It is the last number, where `mvsplat/exchange` expects it.
         coarse = logs[:1] if self.config.coarse_depth else []
