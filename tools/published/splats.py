@@ -128,7 +128,7 @@ def watch_transformer(kept: Recorder, transformer: Any, size: Sequence[int], las
         shift = (size[0] // 4, size[1] // 4) if index % 2 else (0, 0)
 
         def whole(out: Tensor, shift: tuple[int, int] = shift) -> Tensor:
-            return out_of_windows(out, (size[0], size[1]), shift).permute(0, 1, 4, 2, 3)
+            return out_of_windows(out, (size[0], size[1]), shift)
 
         kept.output(f"transformer_self.{index}", layer.self_attn, whole)
         kept.output(f"transformer.{index + 1}", layer, whole)

@@ -65,21 +65,21 @@ def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
     return torch.where(piece_WL[:, :, None] == piece_WL[:, None], 0.0, MASKED)
 
 
-def in_windows(x_BVHWC: Tensor, shift: tuple[int, int]) -> Tensor:
-    """Roll maps (B, V, H, W, C) by minus `shift` (rows, columns), and cut them into 2 x 2 windows.
+def in_windows(x_BVCHW: Tensor, shift: tuple[int, int]) -> Tensor:
+    """Roll maps (B, V, C, H, W) by minus `shift` (rows, columns), and cut them into 2 x 2 windows.
 
     Returns (B, V, 4, L, C), with L the number of pixels in a window.
     """
     if any(shift):
-        x_BVHWC = x_BVHWC.roll((-shift[0], -shift[1]), (2, 3))
-    return rearrange(x_BVHWC, "n v (a h) (b w) c -> n v (a b) (h w) c", a=SPLIT, b=SPLIT)
+        x_BVCHW = x_BVCHW.roll((-shift[0], -shift[1]), (3, 4))
+    return rearrange(x_BVCHW, "n v c (a h) (b w) -> n v (a b) (h w) c", a=SPLIT, b=SPLIT)
 
 
 def out_of_windows(x_BVWLC: Tensor, size: tuple[int, int], shift: tuple[int, int]) -> Tensor:
-    """Invert `in_windows`: join windows to maps (B, V, H, W, C) of `size` (H, W)."""
-    pattern = "n v (a b) (h w) c -> n v (a h) (b w) c"
-    x_BVHWC = rearrange(x_BVWLC, pattern, a=SPLIT, b=SPLIT, h=size[0] // SPLIT)
-    return x_BVHWC.roll(shift, (2, 3)) if any(shift) else x_BVHWC
+    """Invert `in_windows`: join windows to maps (B, V, C, H, W) of `size` (H, W)."""
+    pattern = "n v (a b) (h w) c -> n v c (a h) (b w)"
+    x_BVCHW = rearrange(x_BVWLC, pattern, a=SPLIT, b=SPLIT, h=size[0] // SPLIT)
+    return x_BVCHW.roll(shift, (3, 4)) if any(shift) else x_BVCHW
 
 
 class Attention(nn.Module):
@@ -173,10 +173,9 @@ class WindowTransformer(nn.Module):
         size = (x_BVCHW.shape[-2], x_BVCHW.shape[-1])
         shifted = (size[0] // SPLIT // 2, size[1] // SPLIT // 2)
         mask = shift_mask(*size, x_BVCHW.device)
-        x_BVHWC = x_BVCHW.permute(0, 1, 3, 4, 2)
         for index, layer in enumerate(self.layers):
             shift = shifted if index % 2 else (0, 0)
-            x_BVWLC = in_windows(x_BVHWC, shift)
+            x_BVWLC = in_windows(x_BVCHW, shift)
             x_BVWLC = layer(x_BVWLC, neighbours_BVJ, mask if index % 2 else None)
-            x_BVHWC = out_of_windows(x_BVWLC, size, shift)
-        return x_BVHWC.permute(0, 1, 4, 2, 3)
+            x_BVCHW = out_of_windows(x_BVWLC, size, shift)
+        return x_BVCHW
