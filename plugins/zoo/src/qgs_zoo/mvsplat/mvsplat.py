@@ -3,7 +3,7 @@
 The networks are a CNN, a window transformer, a plane sweep and two U-Nets.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -80,100 +80,82 @@ class MVSplatEncoder(SweepEncoder):
         cnn = CNN(config.features, (2, 1), config.cnn_widths)
         transformer = WindowTransformer(config.features)
         self.backbone = nn.ModuleDict({"backbone": cnn, "transformer": transformer})
-        self.depth_predictor = DepthPredictor(config, dims.width)
-
-    def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        neighbours = cyclic_neighbours(*views.cameras.shape, device=near_BV.device)
-        normalized_N3HW = imagenet_normalised(views.images).flatten(0, 1)
-        cnn_NDhw = self.backbone["backbone"](normalized_N3HW).features
-        cnn_BVDhw = cnn_NDhw.unflatten(0, views.cameras.shape)
-        # The transformer reads other views in ascending order, the sweep in cyclic order.
-        ascending_BVJ = neighbours.sort(-1).values
-        features_BVDhw = self.backbone["transformer"](with_positions(cnn_BVDhw), ascending_BVJ)
-        sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
-        return self.depth_predictor(views.images, cnn_NDhw, features_BVDhw, sweep)
-
-
-class DepthPredictor(nn.Module):
-    """Network that predicts depths and raw Gaussians from features at 1/4 of the image size."""
-
-    def __init__(self, config: MVSplatEncoder.Config, numbers: int) -> None:
-        super().__init__()
         count = config.candidates
         cost = config.cost_width
         fine = config.depth_width
         width = config.features
-        gaussian = numbers - 2
+        gaussian = dims.width - 2
         matched = count + width
-        self.corr_refine_net = OverViews(
+        nets: Any = nn.ModuleDict()
+        self.depth_predictor = nets
+        nets.corr_refine_net = OverViews(
             conv3(matched, cost),
             group_norm(cost),
             nn.GELU(),
             UNet(cost, config.cost_levels, pre_norm=False),
             conv3(cost, count),
         )
-        self.compares = config.cost_volume
-        self.regressor_residual = nn.Conv2d(matched, count, 1)
-        self.depth_head_lowres = two_convolutions(count, 2 * count, count)
-        self.stride = config.stride
+        nets.regressor_residual = nn.Conv2d(matched, count, 1)
+        nets.depth_head_lowres = two_convolutions(count, 2 * count, count)
         scale = FACTOR // config.stride
         upscale = nn.Upsample(scale_factor=scale, mode="bilinear", align_corners=True)
         # GELU comes after the resizing, not before it.
-        self.upsampler = nn.Sequential(conv3(2 * width, width), upscale, nn.GELU())
-        self.proj_feature = conv3(width, fine)
-        self.refine_unet = OverViews(
+        nets.upsampler = nn.Sequential(conv3(2 * width, width), upscale, nn.GELU())
+        nets.proj_feature = conv3(width, fine)
+        nets.refine_unet = OverViews(
             conv3(3 + fine + 2, fine),
             nn.GroupNorm(4, fine),
             nn.GELU(),
             UNet(fine, config.depth_levels, pre_norm=False),
         )
-        self.to_gaussians = two_convolutions(fine + 3 + width, 2 * gaussian, gaussian)
-        self.to_disparity = two_convolutions(fine, 2 * fine, 2)
+        nets.to_gaussians = two_convolutions(fine + 3 + width, 2 * gaussian, gaussian)
+        nets.to_disparity = two_convolutions(fine, 2 * fine, 2)
 
-    def forward(
-        self, images_BV3HW: Tensor, cnn_NDhw: Tensor, features_BVDhw: Tensor, sweep: Sweep
-    ) -> Tensor:
-        """Return C numbers per pixel (B, V, C, H, W).
-
-        These numbers are the logarithm of the depth, the opacity logit and the rest of the raw
-        Gaussian.
-        """
-        views = images_BV3HW.shape[1]
-        # These networks see images in [0, 1]; only the CNN sees normalised ones.
-        images_N3HW = images_BV3HW.flatten(0, 1)
-        features_NDhw = features_BVDhw.flatten(0, 1)
+    def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
+        neighbours = cyclic_neighbours(*near_BV.shape, device=near_BV.device)
+        normalized_N3HW = imagenet_normalised(views.images).flatten(0, 1)
+        cnn_NDhw = self.backbone["backbone"](normalized_N3HW).features
+        cnn_BVDhw = cnn_NDhw.unflatten(0, near_BV.shape)
+        # The transformer reads other views in ascending order, the sweep in cyclic order.
+        ascending_BVJ = neighbours.sort(-1).values
+        features_BVDhw = self.backbone["transformer"](with_positions(cnn_BVDhw), ascending_BVJ)
+        sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
         disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)
+        # These networks see images in [0, 1]; only the CNN sees normalised ones.
+        images_N3HW = views.images.flatten(0, 1)
         # With fewer Gaussians than pixels, colours are means over squares.
-        if self.stride > 1:
-            images_N3HW = F.avg_pool2d(images_N3HW, self.stride)
+        if self.config.stride > 1:
+            images_N3HW = F.avg_pool2d(images_N3HW, self.config.stride)
         size = images_N3HW.shape[2:]
         disparity_N1HW = resized(disparity_N1hw, size)
         confidence_N1HW = F.interpolate(confidence_N1hw, tuple(size), mode="nearest")
-        full_NDHW = self.upsampler(torch.cat([features_NDhw, cnn_NDhw], 1))
-        projected = self.proj_feature(full_NDHW)
+        nets = self.depth_predictor
+        full_NDHW = nets.upsampler(torch.cat([features_BVDhw.flatten(0, 1), cnn_NDhw], 1))
+        projected = nets.proj_feature(full_NDHW)
         seen = torch.cat([images_N3HW, projected, disparity_N1HW, confidence_N1HW], 1)
-        refined = self.refine_unet(seen, views)
-        raw = self.to_gaussians(torch.cat([refined, images_N3HW, full_NDHW], 1))
-        change_N1HW, logit_N1HW = self.to_disparity(refined).split(1, 1)
+        refined = nets.refine_unet(seen, near_BV.shape[1])
+        raw = nets.to_gaussians(torch.cat([refined, images_N3HW, full_NDHW], 1))
+        change_N1HW, logit_N1HW = nets.to_disparity(refined).split(1, 1)
         fine_N1HW = (disparity_N1HW + at_least_float32(change_N1HW)).clamp(*bounds(sweep))
-        return torch.cat([-fine_N1HW.log(), logit_N1HW, raw], 1).unflatten(0, (-1, views))
+        return torch.cat([-fine_N1HW.log(), logit_N1HW, raw], 1).unflatten(0, near_BV.shape)
 
     def match(self, features_BVDhw: Tensor, sweep: Sweep) -> tuple[Tensor, Tensor]:
         """Return inverse depths and confidences, each (B V, 1, h, w), at 1/4 of the image size.
 
         The confidence of a pixel is the largest probability of a depth of the sweep.
         """
-        count = self.regressor_residual.out_channels
+        count = self.config.candidates
         candidates_ND11 = evenly_spaced(*bounds(sweep), count)
         size = features_BVDhw.shape[3:]
         volume_BVDhw = features_BVDhw.new_zeros(*sweep.near.shape, count, *size)
-        if self.compares:
+        if self.config.cost_volume:
             volume_BVDhw = cost_volume(features_BVDhw, candidates_ND11, sweep)
         matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
-        refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
+        nets = self.depth_predictor
+        refined = nets.corr_refine_net(matched, features_BVDhw.shape[1])
         # The network only corrects the volume, so that matches survive an untrained U-Net.
-        refined = refined + self.regressor_residual(matched)
-        return expected_disparity(self.depth_head_lowres(refined), candidates_ND11)
+        refined = refined + nets.regressor_residual(matched)
+        return expected_disparity(nets.depth_head_lowres(refined), candidates_ND11)
 
 
 @full_precision
