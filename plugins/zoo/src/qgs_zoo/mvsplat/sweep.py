@@ -18,6 +18,7 @@ from torch.utils.checkpoint import checkpoint
 from qgs.contracts import ComponentConfig, Encoder, Problem, RecipeContext, memory_fields
 from qgs.contracts.settings import Far
 from qgs.geometry.constants import constant
+from qgs.geometry.rays import pixel_directions
 from qgs.precision import at_least_float32, full_precision
 from qgs.types import Cameras, ImageMemory, Views
 from qgs_zoo.mvsplat.pixels import OfPixels
@@ -109,22 +110,18 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
     the pixels' camera to the frame of the other camera.
     """
     height, width = depth_NDhw.shape[-2:]
-    fx, fy, cx, cy = (x[:, None, None] for x in lens_N4.unbind(-1))
     # Pixel centres are whole numbers here, without the half of rays: published weights expect it.
-    x_w = torch.arange(width, device=depth_NDhw.device).to(depth_NDhw)
-    y_h1 = torch.arange(height, device=depth_NDhw.device).to(depth_NDhw)[:, None]
-    ray = torch.broadcast_tensors((x_w - cx) / fx, (y_h1 - cy) / fy, torch.ones_like(fx))
-    ray_Nhw3 = torch.stack(ray, -1)
+    half = constant([0, 0, 0.5, 0.5], lens_N4)
+    ray_Nhw3 = pixel_directions(lens_N4 + half, (height, width))
     turned_Nhw3 = torch.einsum("nij,nhwj->nhwi", pose_N44[:, :3, :3], ray_Nhw3)
     point = turned_Nhw3[:, None] * depth_NDhw[..., None] + pose_N44[:, None, None, None, :3, 3]
-    x, y, depth = point.unbind(-1)
-    # Only the divisor is bounded (released code): behind the camera the centre is scaled too.
-    z = depth.clamp_min(MIN_DEPTH)
     # The lens of this view is used for the other view too (released code). For views with different
     # lenses this is wrong, but the weights expect it.
-    u = (fx[:, None] * x + cx[:, None] * depth) / z
-    v = (fy[:, None] * y + cy[:, None] * depth) / z
-    return torch.stack([2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1], -1)
+    focal, principal = lens_N4[:, None, None, None].split(2, -1)
+    xy, depth = point.split((2, 1), -1)
+    # Only the divisor is bounded (released code): behind the camera the centre is scaled too.
+    pixel = (focal * xy + principal * depth) / depth.clamp_min(MIN_DEPTH)
+    return 2 * pixel / constant([width - 1, height - 1], pixel) - 1
 
 
 def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
