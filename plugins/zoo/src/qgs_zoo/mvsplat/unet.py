@@ -4,7 +4,6 @@ The U-Net is the one of latent diffusion, without the embedding of time.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
 from functools import partial
 from typing import Literal
 
@@ -17,6 +16,8 @@ HEAD_WIDTH = 32
 
 conv3 = partial(nn.Conv2d, kernel_size=3, padding=1)
 """Function that makes a 3 x 3 convolution, which keeps height and width at a stride of 1."""
+resized = partial(F.interpolate, mode="bilinear", align_corners=True)
+"""Function that resizes maps (N, C, h, w) bilinearly to a size (H, W)."""
 group_norm = partial(nn.GroupNorm, 8)
 """Function that makes a GroupNorm with 8 groups for a width that is a multiple of 8."""
 
@@ -34,11 +35,6 @@ def zeroed(module: nn.Module) -> nn.Module:
     for parameter in module.parameters():
         nn.init.zeros_(parameter)
     return module
-
-
-def resized(x_BCHW: Tensor, size: Sequence[int]) -> Tensor:
-    """Resize maps bilinearly to `size` (H, W), with `align_corners=True` of torch."""
-    return F.interpolate(x_BCHW, tuple(size), mode="bilinear", align_corners=True)
 
 
 class OverViews(nn.Sequential):
