@@ -33,7 +33,7 @@ from qgs_zoo.mvsplat.sweep import (
     evenly_spaced,
     nearest_neighbours,
 )
-from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, resized, two_convolutions
+from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, group_norm, resized, two_convolutions
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 from qgs_zoo.parts import Decaying
 
@@ -88,13 +88,18 @@ class DepthSplatConfig(ComponentConfig):
 
 
 class Pyramid(nn.Module):
-    """Network that returns its input, and a second map of twice the size with half the channels."""
+    """Network that returns its input and, for two scales, a map of twice the size.
 
-    def __init__(self, width: int) -> None:
+    The second map has half the channels.
+    """
+
+    def __init__(self, width: int, scales: int) -> None:
         super().__init__()
-        finer = (nn.ConvTranspose2d(width, width // 2, 2, 2), nn.GELU())
-        last = conv3(width // 2, width // 2)
-        self.stages = nn.ModuleList([nn.Identity(), nn.Sequential(*finer, last)])
+        self.stages = nn.ModuleList([nn.Identity()])
+        if scales > 1:
+            upsampling = nn.ConvTranspose2d(width, width // 2, 2, 2)
+            last = conv3(width // 2, width // 2)
+            self.stages.append(nn.Sequential(upsampling, nn.GELU(), last))
 
     def forward(self, x_NChw: Tensor) -> list[Tensor]:
         return [stage(x_NChw) for stage in self.stages]
@@ -129,9 +134,8 @@ class DepthPredictor(nn.Module):
         self.backbone = CNN(width, (sizes.stride // 4, 2), sizes.cnn)
         self.transformer = WindowTransformer(width)
         self.pretrained = DinoV2(vit.width, vit.depth, vit.heads)
-        if sizes.scales > 1:
-            self.mv_pyramid = Pyramid(width)
-            self.mono_pyramid = Pyramid(vit.width)
+        self.mv_pyramid = Pyramid(width, sizes.scales)
+        self.mono_pyramid = Pyramid(vit.width, sizes.scales)
         self.regressor = nn.ModuleList()
         self.regressor_residual = nn.ModuleList()
         self.depth_head = nn.ModuleList()
@@ -141,9 +145,9 @@ class DepthPredictor(nn.Module):
             cnn = width if scale == 0 else sizes.cnn[1]
             inputs = count + cnn + own + vit.width // 2**scale
             unet = UNet(own, 3 + scale, pre_norm=True)
-            norm = nn.GroupNorm(8, own)
             last = conv3(own, own)
-            self.regressor.append(OverViews(conv3(inputs, own), norm, nn.GELU(), unet, last))
+            first = (conv3(inputs, own), group_norm(own), nn.GELU())
+            self.regressor.append(OverViews(*first, unet, last))
             self.regressor_residual.append(nn.Conv2d(inputs, own, 1))
             self.depth_head.append(two_convolutions(own, 2 * own, count, "replicate"))
         self.upsampler = dpt_head(sizes, depth=True)
@@ -178,9 +182,8 @@ class DepthPredictor(nn.Module):
         # The ViT's maps are at 1/8; features for matching may be at 1/4.
         if self.sizes.stride == 4:
             mono_NChw = resized(mono_NChw, x_NChw.shape[-2:])
-        several = self.sizes.scales > 1
-        multi = self.mv_pyramid(x_NChw) if several else [x_NChw]
-        mono = self.mono_pyramid(mono_NChw) if several else [mono_NChw]
+        multi = self.mv_pyramid(x_NChw)
+        mono = self.mono_pyramid(mono_NChw)
         coarse, confidence_N1hw = self.match(cnn, multi, mono, sweep)
         # Inverse depth joins here; depth joins where Gaussians are predicted (released code).
         joined = self.beside(cnn, multi, coarse[-1])
