@@ -126,8 +126,9 @@ class UNet(nn.Module):
         down.append(block(width, lowest=True))
         for level in reversed(range(levels)):
             up += [block(2 * width, lowest=level == levels - 1) for _ in range(2)]
-            finer = OrderedDict(twice=nn.Upsample(scale_factor=2), conv=conv3(width, width))
-            up[-1] += [nn.Sequential(finer)] if level else []
+            finer = nn.Sequential(nn.Upsample(scale_factor=2))
+            finer.add_module("conv", conv3(width, width))
+            up[-1] += [finer] if level else []
         self.input_blocks = nn.ModuleList(OverViews(*modules) for modules in down)
         first = ResidualBlock(width, width, pre_norm)
         second = ResidualBlock(width, width, pre_norm)
