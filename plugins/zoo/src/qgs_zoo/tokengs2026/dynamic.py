@@ -89,8 +89,8 @@ class DynamicQueries(Queries):
         """
         config = self.config
         batch = len(memory.features)
-        parts: list[Tensor] = [self.features, *([self.dynamic] if config.dynamic else [])]
-        x_BND = torch.cat(parts).expand(batch, -1, -1)
+        moving = self.dynamic if config.dynamic else self.features[:0]
+        x_BND = torch.cat([self.features, moving]).expand(batch, -1, -1)
         # Dynamic queries come last, as in the released weights.
         first = len(self.features) if config.dynamic else 0
         moves_N = torch.arange(config.count, device=x_BND.device) >= first
