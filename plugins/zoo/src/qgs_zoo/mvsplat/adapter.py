@@ -39,18 +39,17 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
     for m in range(degree + 1):
         # Associated Legendre functions divided by sin^m, by their recurrence in l.
         legendre = [torch.zeros_like(y), torch.full_like(y, math.prod(range(1, 2 * m, 2)))]
-        for n in range(m + 1, degree + 1):
-            following = (2 * n - 1) * y * legendre[-1] - (n + m - 1) * legendre[-2]
-            legendre.append(following / (n - m))
         for n in range(m, degree + 1):
             ratio = math.factorial(n - m) / math.factorial(n + m)
             scale = math.sqrt((2 * n + 1) * ratio * (2 if m else 1))
-            values = scale * legendre[n - m + 1] * power
+            values = scale * legendre[-1] * power
             # For m = 0 both are one function, the real part.
             found[n, -m] = values.imag
             found[n, m] = values.real
+            following = (2 * n + 1) * y * legendre[-1] - (n + m) * legendre[-2]
+            legendre.append(following / (n - m + 1))
         power = power * step
-    return torch.stack([found[n, m] for n in range(degree + 1) for m in range(-n, n + 1)], -1)
+    return torch.stack([found[place] for place in sorted(found)], -1)
 
 
 def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -98,8 +97,8 @@ def band_mask(degree: int, like: Tensor) -> Tensor:
     and device the factors get.
     """
     # Higher degrees start small (pixelSplat): at first colours hardly depend on the direction.
-    each = [1.0, *(0.1 * 0.25**n for n in range(1, degree + 1))]
-    return constant([x for n, x in enumerate(each) for _ in range(2 * n + 1)], like)
+    each = [0.1 * 0.25**n if n else 1.0 for n in range(degree + 1) for _ in range(2 * n + 1)]
+    return constant(each, like)
 
 
 @full_precision
