@@ -224,14 +224,12 @@ class DepthPredictor(nn.Module):
 
     def beside(self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None) -> Joined:
         """Return maps that a DPT head concatenates with the ViT's maps."""
-        # The order of the release: CNN, ViT, transformer, depth. If its CNN ends at 1/4, nothing
-        # joins at 1/8.
-        found: Joined = [([], []) for _ in range(LEVELS)]
-        maps = [*cnn, *multi, depth]
-        for place, (x, level) in enumerate(zip(maps, self.sizes.levels, strict=True)):
+        # The order of the release: CNN, transformer, depth. If its CNN ends at 1/4, nothing joins
+        # at 1/8.
+        found: Joined = [[] for _ in range(LEVELS)]
+        for x, level in zip([*cnn, *multi, depth], self.sizes.levels, strict=True):
             if x is not None:
-                # At 1/2 the release puts the ViT's own map last instead.
-                found[level][place >= len(cnn) and level > 0].append(x)
+                found[level].append(x)
         return found
 
 

@@ -12,9 +12,8 @@ from torch import Tensor, nn
 
 from qgs_zoo.mvsplat.unet import conv3, resized, two_convolutions, zeroed
 
-Joined = list[tuple[list[Tensor], list[Tensor]]]
-"""Maps of other networks, two lists for each of the sizes 1/2, 1/4 and 1/8: maps to put before the
-ViT's channels, and maps to put after them."""
+Joined = list[list[Tensor]]
+"""Maps of other networks, a list for each of the sizes 1/2, 1/4 and 1/8."""
 LEVELS = 3
 """Number of resolutions (1/2, 1/4, 1/8) at which other networks' maps are appended to ViT maps."""
 
@@ -110,8 +109,11 @@ class DptHead(nn.Module):
             resize(project(x))
             for x, project, resize in zip(maps, self.projects, self.resize_layers, strict=True)
         ]
-        for level, (before, behind) in enumerate(joined):
-            own[level] = self.concat_projects[level](torch.cat([*before, own[level], *behind], 1))
+        for level, others in enumerate(joined):
+            # The ViT's map is the second one, after the CNN's, but the last one at 1/2 (release).
+            before = 1 if level else len(others)
+            seen = [*others[:before], own[level], *others[before:]]
+            own[level] = self.concat_projects[level](torch.cat(seen, 1))
         path = own[0].new_zeros(())
         full = [2 * side for side in own[0].shape[-2:]]
         sizes = [full, *(x.shape[-2:] for x in own)]
