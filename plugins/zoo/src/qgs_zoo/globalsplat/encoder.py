@@ -1,7 +1,7 @@
 """`globalsplat/patches`: encoder that embeds patches, rays and cameras, without attention."""
 
 import math
-from typing import Any
+from functools import partial
 
 import torch
 from einops import rearrange
@@ -50,9 +50,10 @@ class PosedPatches(PatchEncoder):
         rgb = config.rgb_width
         ray = config.ray_width
         # No biases, because a LayerNorm follows in every stream.
-        side: Any = {"kernel_size": config.patch_size, "stride": config.patch_size, "bias": False}
-        self.rgb_embedding = nn.Conv2d(3, rgb, **side)
-        self.ray_embedding = nn.Conv2d(6, ray, **side)
+        side = config.patch_size
+        embedding = partial(nn.Conv2d, kernel_size=side, stride=side, bias=False)
+        self.rgb_embedding = embedding(3, rgb)
+        self.ray_embedding = embedding(6, ray)
         self.lens_mlp = Mlp(4, config.lens_width, config.lens_width)
         self.camera_proj = nn.Linear(config.lens_width + 3 + 3 * 2 * config.bands, ray)
         registers = torch.randn(config.registers, rgb + ray) * REGISTER_STD
