@@ -262,8 +262,7 @@ def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int,
     # From the patch to the token.
     steps = (places - places[:, None]).flatten(0, 1)
     known, kind = steps.unique(dim=0, return_inverse=True)
-    mean = share.new_zeros(len(known)).index_add(0, kind, share[:, changed].flatten())
-    mean = mean / kind.bincount()
+    mean = kind.bincount(share[:, changed].flatten()) / kind.bincount()
     own = mean[(known == 0).all(-1)].item()
     most, at = mean.max(0)
     seen = f"{own:.0%} of what changes a token comes from its own patch"

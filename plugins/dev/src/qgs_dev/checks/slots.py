@@ -21,6 +21,7 @@ from qgs_dev.vocabulary import (
     expect_finite,
     expect_inside,
     expect_same,
+    leaves,
     scene,
 )
 
@@ -44,7 +45,7 @@ def _expect_gaussians(trial: Trial, factor: float, where: str) -> None:
     named = {name.removeprefix("gaussians.") for name in trial.case.writes}
     for mode, out in trial.in_each_mode({"state": state}):
         here = f"in {mode}, {where},"
-        given = {name for name in ("sh", "features") if getattr(out, name) is not None}
+        given = {"sh", "features"} & leaves(out).keys()
         expect(given == named, f"in {mode} the head gives {given or None}, not {named or None}")
         expect_inside(out.quats.norm(dim=-1), 1 - 1e-4, 1 + 1e-4, f"{here} lengths of quaternions")
         expect((out.scales > 0).all(), f"{here} a scale is {out.scales.min():.4g}")
