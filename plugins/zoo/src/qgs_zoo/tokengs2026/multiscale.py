@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 import torch
+import torch.nn.functional as F
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
@@ -70,9 +71,9 @@ class TimeEmbedding(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, times: Tensor) -> Tensor:
-        numbers = time_features(times, self.proj.in_channels).flatten(0, 1)
-        patches = numbers[..., None, None].expand(-1, -1, *self.proj.kernel_size)
-        return self.proj(patches)[..., 0, 0].unflatten(0, times.shape)
+        numbers = time_features(times, self.proj.in_channels)
+        # All pixels of a patch are equal.
+        return F.linear(numbers, self.proj.weight.sum((2, 3)), self.proj.bias)
 
 
 class MultiscaleReadout(PatchViT):
