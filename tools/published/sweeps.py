@@ -207,10 +207,10 @@ def of_sweep(found: Tensors, sweep: Sweep, counts: Sequence[int], step: int = 1)
     found["inverse_depth_candidates.0"] = coarsest
     low = found["cost_volume.0"].shape[-2:]
     found["warp_grid.0"] = warps(sweep.cameras, poses, low, coarsest[..., ::step])
-    for scale, count in enumerate(counts):
+    for scale in range(len(counts)):
         if scale:
             coarse = found["coarse_inverse_depth.0"].flatten(0, 1)
-            candidates = finer_candidates(coarse, sweep, counts[0], count)
+            candidates = finer_candidates(coarse, sweep, counts[0])
             found["inverse_depth_candidates.1"] = candidates.unflatten(0, shape)
         found[f"relative_pose.{scale}"] = poses
         logits = found[f"match_logits.{scale}"]

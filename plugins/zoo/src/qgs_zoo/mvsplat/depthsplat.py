@@ -106,12 +106,13 @@ class Pyramid(nn.Module):
 
 
 @full_precision
-def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) -> Tensor:
+def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int) -> Tensor:
     """Return inverse depths (B V, D, 2h, 2w) for a second sweep, around those of the first.
 
-    coarse: inverse depths from the first sweep. first: number of depths in the first sweep. count:
-    D, the number of depths in the second sweep.
+    coarse: inverse depths from the first sweep. first: number of depths in the first sweep, four
+    times as many as D.
     """
+    count = first // 4
     height, width = coarse_N1hw.shape[-2:]
     # No gradient: the first scale learns from its own depth.
     centre_N1hw = resized(coarse_N1hw.detach(), (2 * height, 2 * width))
@@ -178,10 +179,8 @@ class DepthPredictor(nn.Module):
         tokens = self.pretrained(small_N3hw, self.sizes.blocks)
         eighth = (size[0] // 8, size[1] // 8)
         maps = [resized(x_NPC.mT.unflatten(2, grid), eighth) for x_NPC in tokens]
-        mono_NChw = maps[-1]
         # The ViT's maps are at 1/8; features for matching may be at 1/4.
-        if self.sizes.stride == 4:
-            mono_NChw = resized(mono_NChw, x_NChw.shape[-2:])
+        mono_NChw = resized(maps[-1], x_NChw.shape[-2:])
         multi = self.mv_pyramid(x_NChw)
         mono = self.mono_pyramid(mono_NChw)
         coarse, confidence_N1hw = self.match(cnn, multi, mono, sweep)
@@ -207,12 +206,10 @@ class DepthPredictor(nn.Module):
         found: list[Tensor] = []
         views = sweep.near.shape[1]
         confidence = multi[0]
+        candidates = evenly_spaced(*bounds(sweep), self.candidates(0))
         for scale, (own, features) in enumerate(zip(multi, mono, strict=True)):
-            count = self.candidates(scale)
-            if scale == 0:
-                candidates = evenly_spaced(*bounds(sweep), count)
-            else:
-                candidates = finer_candidates(found[-1], sweep, self.candidates(0), count)
+            if scale:
+                candidates = finer_candidates(found[-1], sweep, self.candidates(0))
             cost_BVDhw = cost_volume(own.unflatten(0, sweep.near.shape), candidates, sweep)
             # Published weights expect this order.
             seen = [cost_BVDhw.flatten(0, 1), cnn.second if scale else cnn.features, own, features]
