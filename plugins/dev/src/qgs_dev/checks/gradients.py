@@ -371,7 +371,7 @@ class LearnedLayers(TorchFunctionMode):
         """Call `func`. If it is a learned layer, record its output or replay the recorded one."""
         given = func(*args, **(kwargs or {}))
         name = getattr(func, "__name__", "")
-        factors = [x for _, x in named_tensors([args, kwargs or {}])]
+        factors = [x for _, x in named_tensors([args, kwargs])]
         learned = [x.requires_grad for x in factors]
         product = name in NAMES["products"]
         if (product and all(learned)) or (name in NAMES["layers"] and any(learned)):
