@@ -15,6 +15,7 @@ import torch
 from commands import done, run_qgs
 from photo_formats import photo_set, synthetic, write_colmap, write_nerfstudio
 from PIL import Image
+from qgs_photos.poses.filming import open_film_scene
 from qgs_photos.refine import scene
 from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
@@ -102,6 +103,9 @@ def test_an_earlier_scene_is_optimised_further(photos, tmp_path):
     assert first["optimised"] == given.count
     stored = qgs.load_ply(earlier / "scene.ply").means[:, -first["optimised"] :]
     assert_close(first["factor"] * ours.means, stored)
+    film = open_film_scene(earlier, str(photos), None)
+    start, *_, end = film.cameras.c2w[0, :, :3, 3]
+    assert (end - start).norm() == pytest.approx(2.5 * float(film.world[1]))
     going_on = f"scene {photos} --from {earlier}"
     _, record = made(f"{going_on} {few}", tmp_path / "b")
     assert f" --from {earlier} --size 32x48 --gaussians {first['optimised']} " in record["command"]

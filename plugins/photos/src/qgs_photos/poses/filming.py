@@ -1,5 +1,6 @@
 """Render videos of Gaussians along a camera path, as mp4 or WebP."""
 
+import json
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -17,6 +18,7 @@ from qgs.data.images import CropResize
 from qgs.data.samples import in_world
 from qgs.drawing.images import rgb_picture
 from qgs.files import replacing
+from qgs.geometry.poses import scaled
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
@@ -165,6 +167,9 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
         raise ValueError(f"{file} holds no cameras: name the photos, `qgs video {source} PHOTOS`")
     gaussians = load_ply(file)
     cameras = photo_scene(photos, None, name).cameras.to(torch.float64)
+    if (record := file.with_name("metrics.json")).is_file():
+        factor = json.loads(record.read_bytes()).get("factor", 1.0)
+        cameras = cameras.replace(c2w=scaled(cameras.c2w, factor))
     # near of renderers is made for worlds in which what is seen is about 1 away
     w2c = torch.linalg.inv(cameras.c2w[0])
     depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
