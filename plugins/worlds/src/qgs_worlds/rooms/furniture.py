@@ -7,6 +7,7 @@ axis goes through the centre of the room. Shapes are upright and may be turned a
 import math
 import re
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from qgs_worlds.rooms.materials import Materials, between, kinds_beside
 WALLS = 6
 
 
-def solid(at: Point, size: Sequence[float], texture: int, kind: int = s.BLOCK) -> Shape:
+def solid(at: Sequence[float], size: Sequence[float], texture: int, kind: int = s.BLOCK) -> Shape:
     """Return an upright solid that is not turned. Lengths are in metres.
 
     at: centre of its bottom. size: width (along x), depth (along y) and height. texture: index of a
@@ -63,6 +64,8 @@ LOOSE = ("balls", "chair", "crates", "plant", "floor_lamp", "round_table")
 _LEVEL = 0.38
 
 
+# Rooms are drawn often.
+@cache
 def _terms(value: float | str) -> list[tuple[float, str]]:
     """Parse a sum of lengths such as "h-0.3r" into pairs (factor, name of a length).
 
@@ -73,17 +76,14 @@ def _terms(value: float | str) -> list[tuple[float, str]]:
 
 
 def _lengths(values: list[Any], sizes: Sizes) -> list[float]:
-    return [sum([factor * sizes.get(name, 1.0) for factor, name in terms]) for terms in values]
+    return [
+        sum([factor * sizes.get(name, 1.0) for factor, name in terms])
+        for terms in map(_terms, values)
+    ]
 
 
-# Sums are parsed once, because rooms are drawn often.
 _KINDS = kinds_beside(__file__)
 _SOLIDS = {"box": s.BLOCK, "cylinder": s.CYLINDER, "sphere": s.BALL}
-for _kind in _KINDS.values():
-    for _row in _kind.setdefault("parts", []):
-        _row[:3] = _SOLIDS[_row[0]], [*map(_terms, (*_row[1], *_row[2]))]
-    for _row in _kind.setdefault("tops", []):
-        _row[1:] = map(_terms, _row[1:])
 
 
 def _part(row: list[Any], sizes: Sizes) -> Shape:
@@ -91,9 +91,8 @@ def _part(row: list[Any], sizes: Sizes) -> Shape:
 
     sizes: values of the names in the row: lengths in metres, or indices of materials.
     """
-    kind, lengths, material, *turn = row
-    x, y, z, *size = _lengths(lengths, sizes)
-    part = solid((x, y, z), size, sizes[material], kind)
+    kind, at, size, material, *turn = row
+    part = solid(_lengths(at, sizes), _lengths(size, sizes), sizes[material], _SOLIDS[kind])
     return _turned(part, sizes[turn[0]]) if turn else part
 
 
@@ -109,13 +108,13 @@ class Furniture(Materials):
         for size, how in kind.get("draws", {}).items():
             if size not in sizes:
                 sizes[size] = self._drawn(how)
-        piece = [_part(row, sizes) for row in kind["parts"]]
+        piece = [_part(row, sizes) for row in kind.get("parts", [])]
         if "some" in kind:
             for _ in range(self.rng.choice(kind["some"]["count"])):
                 piece += self.piece(kind["some"]["piece"], **sizes)
         if name in _MORE:
             piece += _MORE[name](self, sizes)
-        for chance, *at in kind["tops"]:
+        for chance, *at in kind.get("tops", []):
             if chance == 1 or self.rng.random() < chance:
                 piece += self.ornament(*_lengths(at, sizes))
         return piece
