@@ -76,18 +76,17 @@ class Furnisher:
         Returns True if the piece was placed, False if it does not fit.
         """
         box = turned(*bounds(piece), to, turn)
-        if not self.free(box):
+        if not self.free(*box):
             return False
         self._taken = np.append(self._taken, [box], 0)
         self.shapes += [shape.moved(turn, to) for shape in piece]
         return True
 
-    def free(self, box: tuple[Point, Point]) -> bool:
+    def free(self, low: np.ndarray, high: np.ndarray) -> bool:
         """Return True if a box is inside the room and clear of all placed pieces and cameras.
 
-        box: its lowest and its highest corner.
+        low, high: its lowest and its highest corner.
         """
-        low, high = np.array(box)
         half = np.array(self.size[:2]) / 2
         inside = (low[:2] >= -half) & (high[:2] <= half)
         beside = np.maximum(low - self._taken[:, 1], self._taken[:, 0] - high)[:, :2].max(1)
@@ -105,18 +104,15 @@ def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
     return low, high
 
 
-def turned(low: Point, high: Point, to: Point, turn: float) -> tuple[Point, Point]:
+def turned(low: Point, high: Point, to: Point, turn: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounding box of a box after a turn by `turn` radians about z and a move by `to`.
 
-    low, high, and the result: lowest and highest corner of a box. Only x and y of `to` count.
+    low, high, and the result: lowest and highest corner of a box.
     """
-    x, y, _ = to
-    cos = math.cos(turn)
-    sin = math.sin(turn)
-    corners = [*product((low[0], high[0]), (low[1], high[1]))]
-    xs = [x + cos * a - sin * b for a, b in corners]
-    ys = [y + sin * a + cos * b for a, b in corners]
-    return (min(xs), min(ys), low[2]), (max(xs), max(ys), high[2])
+    way = about_z(turn)
+    corners = product(*zip(low, high, strict=True))
+    moved = np.add([rotated(way, corner) for corner in corners], to)
+    return moved.min(0), moved.max(0)
 
 
 def _centre(make: Furniture, furnisher: Furnisher) -> None:
@@ -144,7 +140,7 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
     while position < along / 2 - 0.4:
         # drawing a piece takes long, so first test if any piece would fit
         spot = turned(*_SMALLEST, _from_wall(side, across / 2 - 0.2, position + 0.2), turn)
-        if furnisher.free(spot):
+        if furnisher.free(*spot):
             piece = make.piece(rng.choice(AGAINST_WALLS))
             low, high = bounds(piece)
             # the skirting board sticks out by 2 cm
