@@ -203,9 +203,10 @@ def _orbit(rng: Generator, path: Path) -> Motion:
     angles = s * min(length / flat, 2.4)
     nearer = 1 + 0.2 * rng.normal() * s
     rise = 0.2 * length * rng.normal() * s
-    x, y = _turned(offset, angles)
-    eyes = target + np.stack([nearer * x, nearer * y, offset[2] + rise], 1)
-    return eyes, target
+    way = _turned(offset, angles)
+    way[:, :2] *= nearer[:, None]
+    way[:, 2] += rise
+    return target + way, target
 
 
 def _round(rng: Generator, path: Path) -> Motion:
@@ -215,7 +216,7 @@ def _round(rng: Generator, path: Path) -> Motion:
     """
     base, target, length, s, fov = path
     angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
-    way = np.stack([*_turned(target - base, angles), np.full(len(s), (target - base)[2])], 1)
+    way = _turned(target - base, angles)
     eyes = base + 0.3 * length * rng.normal(size=3) * s[:, None]
     return eyes, eyes + way
 
@@ -232,14 +233,12 @@ def _gather(rng: Generator, path: Path) -> Motion:
 _MOTIONS = {"walk": _walk, "orbit": _orbit, "round": _round, "gather": _gather}
 
 
-def _turned(way: np.ndarray, angles: np.ndarray) -> Motion:
-    """Turn the vector `way` about z by each of F angles (F,) in radians.
-
-    Returns x and y of the turned vectors, both (F,).
-    """
+def _turned(way: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Return the vectors (F, 3) that are `way`, turned about z by F angles (F,) in radians."""
+    x, y, z = way
     cos = np.cos(angles)
     sin = np.sin(angles)
-    return cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(angles, z)], 1)
 
 
 def _look_at(eyes: np.ndarray, targets: np.ndarray, roll: ArrayLike = 0.0) -> np.ndarray:
