@@ -164,9 +164,7 @@ class Things:
         angle = rng.choice((0.0, 0.0, rng.uniform(-0.5, 0.5)))
         grow = rng.choice((1.0, 1.0, rng.uniform(0.8, 1.2)))
         places = [k - (count - 1) / 2 for k in range(count)]
-        return [
-            first.moved(s * angle, (s * way[0], s * way[1], s * way[2]), grow**s) for s in places
-        ]
+        return [first.moved(s * angle, tuple(s * part for part in way), grow**s) for s in places]
 
     def _rods(self, points: list[Point], pairs: list[tuple[int, int]], radius: float) -> Thing:
         square = self.rng.random() < 0.5
