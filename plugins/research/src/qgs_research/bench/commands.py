@@ -1,7 +1,7 @@
 """Command `qgs bench`: size, latency and memory of models, as tables and a JSON report."""
 
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Literal
 
 import typer
 
@@ -11,6 +11,9 @@ app = typer.Typer(help="Measure speed, memory and size of models.")
 
 InputViews = Annotated[
     int | None, typer.Option(min=1, help="Number of input photos. Default: that of the recipe.")
+]
+Precision = Annotated[
+    Literal["float32", "bf16"], typer.Option(help="Use float32, or bf16 for autocast.")
 ]
 Memory = Annotated[
     bool, typer.Option("--memory", help="Measure peak memory too, each time in a new process.")
@@ -29,7 +32,7 @@ def bench(
     views: InputViews = None,
     size: Size = None,
     batch: Annotated[int, typer.Option(min=1, help="Scenes per batch.")] = 1,
-    precision: Annotated[str, typer.Option(help="Use float32, or bf16 for autocast.")] = "float32",
+    precision: Precision = "float32",
     step: Annotated[bool, typer.Option("--step", help="Also measure training steps.")] = False,
     memory: Memory = False,
     renderer: Annotated[bool, typer.Option("--renderer", help="Also measure rendering.")] = False,
@@ -47,14 +50,10 @@ def bench(
 
     from qgs.evaluate.results import as_json
     from qgs.files import refuse_existing, write_text
-    from qgs.precision import Precision
     from qgs.train.distributed import choose_device
     from qgs_research.bench.output import show
     from qgs_research.bench.run import measure_recipes
 
-    known = get_args(Precision)
-    if precision not in known:
-        raise ValueError(f"--precision must be {' or '.join(known)}, got {precision!r}")
     use_threads(threads)
     if json is not None:
         refuse_existing(json)
