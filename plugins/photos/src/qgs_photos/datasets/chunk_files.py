@@ -164,13 +164,11 @@ class Record:
             )
 
 
-def parse_record(file: str, data: Any) -> Record:
-    """Return the scene in an entry `data` of a chunk `file`. Raises ValueError if it is invalid."""
-    if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
-        raise ValueError(
-            f"{file} holds a value of type {type(data).__name__}, expected a mapping with 'key', "
-            "'cameras' and 'images': is it a chunk of RealEstate10K's format?"
-        )
+def parse_record(file: str, data: Mapping[str, Any]) -> Record:
+    """Return the scene in an entry `data` of a chunk `file`, which has a key.
+
+    Raises ValueError if it is invalid.
+    """
     where = f"{file}: scene {data['key']!r}"
     for name in ("cameras", "images", "sizes", "masks", "timestamps", "held_out", "times"):
         value = data.get(name)
@@ -286,12 +284,14 @@ class Chunk:
         for place, entry in enumerate(load_chunk(path)):
             key = entry.get("key") if isinstance(entry, dict) else None
             if not isinstance(key, str):
-                # raises
-                parse_record(f"{path}: entry {place}", entry)
-            elif key in entries:
+                raise ValueError(
+                    f"{path}: entry {place} holds a value of type {type(entry).__name__}, expected "
+                    "a mapping with 'key', 'cameras' and 'images': is it a chunk of "
+                    "RealEstate10K's format?"
+                )
+            if key in entries:
                 raise ValueError(f"{path} holds the scene {key!r} twice: pack the data set again")
-            else:
-                entries[key] = entry
+            entries[key] = entry
 
     def record(self, key: str) -> Record:
         """Return the scene `key`. Raises ValueError if it is invalid or not in this chunk."""
