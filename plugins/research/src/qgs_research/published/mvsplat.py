@@ -82,8 +82,8 @@ def _read_mvsplat(shapes: Shapes) -> Tree:
     )
 
 
-def depthsplat_encoder(shapes: Shapes) -> Tree:
-    """Return the options of DepthSplat's encoder that fit the shapes of published weights.
+def _read_depthsplat(shapes: Shapes) -> Tree:
+    """Return a recipe with the sizes of DepthSplat's weights: releases differ in nothing else.
 
     Raises LayoutError for a number of scales or blocks that no published model has.
     """
@@ -92,10 +92,15 @@ def depthsplat_encoder(shapes: Shapes) -> Tree:
     depth = layer_count(shapes, _VIT + "blocks.")
     if scales not in (1, 2) or depth not in _BLOCKS:
         raise LayoutError(f"no published model has {scales} scales and a ViT of {depth} blocks")
+    raw = size_at(shapes, _HEAD)
+    if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
+        raise LayoutError(
+            f"{_HEAD} has {raw} channels, expected 10 + 3 (degree + 1)^2 for a degree from 1 to 4"
+        )
     dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight") for n in range(4)]
     joined = size_at(shapes, _UPSAMPLER + "concat_projects.2.weight", 1)
-    # Sizes come from the weights, because releases differ only in sizes.
-    return {
+    two = scales == 2
+    encoder = {
         "type": "mvsplat/depthsplat",
         "near": 0.5,
         "far": 100.0,
@@ -114,18 +119,8 @@ def depthsplat_encoder(shapes: Shapes) -> Tree:
         "dpt": dpt,
         "full_features": size_at(shapes, _UPSAMPLER + "scratch.layer1_rn.weight"),
         "regressor": size_at(shapes, "encoder.gaussian_regressor.0.weight"),
-        "coarse_depth": scales == 2,
+        "coarse_depth": two,
     }
-
-
-def _read_depthsplat(shapes: Shapes) -> Tree:
-    encoder = depthsplat_encoder(shapes)
-    raw = size_at(shapes, _HEAD)
-    two = encoder["scales"] == 2
-    if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
-        raise LayoutError(
-            f"{_HEAD} has {raw} channels, expected 10 + 3 (degree + 1)^2 for a degree from 1 to 4"
-        )
     model = {
         # The depths come first.
         "width": raw + 1 + two,
