@@ -162,9 +162,9 @@ def test_a_metric_that_cannot_be_measured_here_is_refused_before_training(tmp_pa
 
 
 def test_hypotheses_are_sums_that_weigh_alike():
-    contrast = parsed("a@noisy - a > b@noisy - b", "ab", ["noisy"])
-    assert contrast.sign == 1
-    assert contrast.terms == {("a", "noisy"): 1, ("a", ""): -1, ("b", "noisy"): -1, ("b", ""): 1}
+    terms, sign = parsed("a@noisy - a > b@noisy - b", "ab", ["noisy"])
+    assert sign == 1
+    assert terms == {("a", "noisy"): 1, ("a", ""): -1, ("b", "noisy"): -1, ("b", ""): 1}
     for text in ("a", "a < b < c", "a - b < c", "a < a", "a b < c + c", "a@x < b", "< b"):
         with pytest.raises(OptionError):
             parsed(text, "abc", ["noisy"])

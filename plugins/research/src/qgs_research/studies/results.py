@@ -72,18 +72,18 @@ class Results(Scores):
 
     def _judgement(self, hypothesis: Hypothesis) -> Judgement:
         study = self.plan.study
-        contrast = parsed(hypothesis.claim, study.variants, study.evaluations)
+        terms, expected = parsed(hypothesis.claim, study.variants, study.evaluations)
         metric = hypothesis.metric or self.metric
-        found = self.estimate(contrast.terms, metric)
+        found = self.estimate(terms, metric)
         verdict = "undecided"
         reasons = [f"its runs share no seed and scene with a score `{metric}`"]
         if found:
             reasons = [found.too_small or "the interval contains 0"]
-            for sign, word in ((contrast.sign, "seen"), (-contrast.sign, "contradicted")):
+            for sign, word in ((expected, "seen"), (-expected, "contradicted")):
                 if found.clear(sign):
                     verdict = word
                     reasons = []
-            if self.unlike(contrast.terms):
+            if self.unlike(terms):
                 reasons.append("evaluated by different protocols")
         return Judgement(hypothesis, metric, found, verdict, ", ".join(reasons))
 

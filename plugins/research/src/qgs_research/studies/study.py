@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from pydantic import (
     AfterValidator,
@@ -165,21 +165,11 @@ Terms = Mapping[tuple[str, str], int]
 """Weighted sum of mean scores: the weight of each mean, by (variant, evaluation)."""
 
 
-class Contrast(NamedTuple):
-    """Hypothesis as a weighted sum of mean scores: left side minus right side.
+def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -> tuple[Terms, int]:
+    """Parse a hypothesis such as `A < B`; return the left side minus the right side, and a sign.
 
-    terms: coefficient of each mean, by (variant, evaluation). sign: sign that the sum has if the
-    hypothesis is true, 1 for `>` and -1 for `<`.
-    """
-
-    terms: Terms
-    sign: int
-
-
-def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -> Contrast:
-    """Parse a hypothesis such as `A < B`.
-
-    Raises OptionError for a text of another form, and for unknown variants or evaluations.
+    The sign is that of this sum if the hypothesis is true: 1 for `>` and -1 for `<`. Raises
+    OptionError for a text of another form, and for unknown variants or evaluations.
     """
     sides = re.split(r"\s*([<>])\s*", text.strip())
     if len(sides) != 3:
@@ -206,7 +196,7 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     terms = {term: coefficient for term, coefficient in sums.items() if coefficient}
     if not terms:
         raise OptionError(f"both sides of `{text}` are equal, so nothing is compared", _FORM)
-    return Contrast(terms, -1 if comparison == "<" else 1)
+    return terms, -1 if comparison == "<" else 1
 
 
 def _check_known(noun: str, name: str, known: Collection[str], where: str = "") -> None:
