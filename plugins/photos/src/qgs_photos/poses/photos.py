@@ -175,10 +175,9 @@ def _exif(image: Image.Image) -> tuple[bytes, str]:
 
 
 def _save(image: Image.Image, path: Path, exif: bytes) -> None:
-    if path.suffix.lower() == ".png":
-        image.save(path, "PNG", exif=exif)
-    else:
-        image.save(path, "JPEG", exif=exif, quality=95, subsampling=0)
+    kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    # PNG takes neither quality nor subsampling
+    image.save(path, kind, exif=exif, quality=95, subsampling=0)
 
 
 def _link(file: Path, path: Path) -> None:
