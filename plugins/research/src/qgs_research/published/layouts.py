@@ -66,12 +66,19 @@ def names_of(recipe: Recipe) -> Names:
     for layout in (one for one in LAYOUTS if one.plugin in recipe.releases):
         found = _unknown_components(recipe, layout)
         if not found:
-            return _names_in(recipe, layout)
+            break
         reasons += [f"\n  {layout.name}: {line}" for line in found]
-    raise PublishedError(
-        "the model of this recipe fits no published layout; use a recipe with the components of "
-        "one layout" + "".join(reasons)
-    )
+    else:
+        raise PublishedError(
+            "the model of this recipe fits no published layout; use a recipe with the components "
+            "of one layout" + "".join(reasons)
+        )
+    shapes = shapes_of(unique_tensors(recipe.build_model("meta")))
+    named = {name: layout.published_name(name) for name in shapes}
+    published = {ours: theirs for ours, theirs in named.items() if theirs}
+    # These are stored beside the used ones, but the published code never reads them.
+    beside = (renamed(name, *rule) for name in published.values() for rule in layout.unused)
+    return Names(layout, shapes, published, tuple(filter(None, beside)))
 
 
 def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
@@ -91,16 +98,6 @@ def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
         for slot, several in types.items()
         if len(several) > 1
     ]
-
-
-def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
-    model = recipe.build_model("meta")
-    shapes = shapes_of(unique_tensors(model))
-    named = {name: layout.published_name(name) for name in shapes}
-    published = {ours: theirs for ours, theirs in named.items() if theirs}
-    # These are stored beside the used ones, but the published code never reads them.
-    beside = (renamed(name, *rule) for name in published.values() for rule in layout.unused)
-    return Names(layout, shapes, published, tuple(filter(None, beside)))
 
 
 def recognise(shapes: Shapes) -> WeightLayout | None:
