@@ -104,12 +104,11 @@ class ChunkScene(Scene):
         record = self.record
         target = self.config.image_size
         record.require_usable()
-        intrinsics = record.cameras[:, :4].double()
         sizes = torch.tensor(record.image_sizes)
-        for height, width in set(record.image_sizes):
-            alike = (sizes == torch.tensor([height, width])).all(1)
-            pixels = intrinsics[alike] * torch.tensor([width, height, width, height])
-            intrinsics[alike] = CropResize((height, width), target).intrinsics(pixels)
+        intrinsics = record.cameras[:, :4].double() * sizes[:, [1, 0, 1, 0]]
+        for size in set(record.image_sizes):
+            alike = (sizes == torch.tensor(size)).all(1)
+            intrinsics[alike] = CropResize(size, target).intrinsics(intrinsics[alike])
         return Cameras(torch.linalg.inv(record.w2c), intrinsics, target)
 
     def frame_name(self, frame: int) -> str:
