@@ -114,9 +114,7 @@ def views(database: Any) -> Mapping[int, View]:
     found = dict[int, View]()
     for image in database.read_all_images():
         camera = database.read_camera(image.camera_id)
-        points = np.zeros((0, 2))
-        if database.num_keypoints_for_image(image.image_id):
-            points = database.read_keypoints(image.image_id)[:, :2]
+        points = database.read_keypoints(image.image_id)[:, :2]
         found[image.image_id] = View(
             points=points - [camera.principal_point_x, camera.principal_point_y],
             side=max(camera.width, camera.height),
