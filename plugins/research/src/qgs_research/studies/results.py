@@ -135,8 +135,6 @@ def _verdict(results: Results) -> str:
     no correction, because all n intervals must lie on the worse side of 0 (intersection-union
     test).
     """
-    if results.metric not in results.columns:
-        return "Not known yet: no run is finished."
     # The order is that of the study, so the recipes' own evaluation comes first.
     shared = [name for name in results.plan.evaluations if len(results.protocols(name)) == 1]
     if not shared:
@@ -208,7 +206,7 @@ def study_summary(results: Results) -> Summary:
 
 
 def _hypothesis_row(results: Results, judgement: Judgement) -> list[str]:
-    column = results.columns.get(judgement.metric, results.column)
+    column = results.columns[judgement.metric]
     estimate = judgement.estimate
     reason = f" ({judgement.reason})" if judgement.reason else ""
     return [
