@@ -86,16 +86,6 @@ _KINDS = kinds_beside(__file__)
 _SOLIDS = {"box": s.BLOCK, "cylinder": s.CYLINDER, "sphere": s.BALL}
 
 
-def _part(row: list[Any], sizes: Sizes) -> Shape:
-    """Return the shape that a row of `parts` in furniture.toml describes.
-
-    sizes: values of the names in the row: lengths in metres, or indices of materials.
-    """
-    kind, at, size, material, *turn = row
-    part = solid(_lengths(at, sizes), _lengths(size, sizes), sizes[material], _SOLIDS[kind])
-    return _turned(part, sizes[turn[0]]) if turn else part
-
-
 class Furniture(Materials):
     """Generator of random furniture for one room, of the kinds in furniture.toml."""
 
@@ -105,10 +95,14 @@ class Furniture(Materials):
         sizes: lengths and materials to use instead of random ones, by their names in the file.
         """
         kind = _KINDS[name]
-        for size, how in kind.get("draws", {}).items():
-            if size not in sizes:
-                sizes[size] = self._drawn(how)
-        piece = [_part(row, sizes) for row in kind.get("parts", [])]
+        for drawn, how in kind.get("draws", {}).items():
+            if drawn not in sizes:
+                sizes[drawn] = self._drawn(how)
+        piece: Piece = []
+        for shape, at, extent, material, *turn in kind.get("parts", []):
+            size = _lengths(extent, sizes)
+            part = solid(_lengths(at, sizes), size, sizes[material], _SOLIDS[shape])
+            piece.append(_turned(part, sizes[turn[0]]) if turn else part)
         if "some" in kind:
             for _ in range(self.rng.choice(kind["some"]["count"])):
                 piece += self.piece(kind["some"]["piece"], **sizes)
