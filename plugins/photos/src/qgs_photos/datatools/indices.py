@@ -1,6 +1,7 @@
 """Compare evaluation indices with the scenes of a data set."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 from upath import UPath
 
@@ -9,19 +10,15 @@ from qgs.paths import listing, read_json
 from qgs_photos.datatools.findings import Finding, SceneReport, spans
 
 
-def found_indices(path: UPath) -> list[UPath]:
-    """Return the JSON files in the folder `path` that have the form of an evaluation index."""
-    files = (file for file in listing(path) if file.suffix == ".json" and _is_index(file))
-    return sorted(files, key=str)
-
-
-def _is_index(file: UPath) -> bool:
-    try:
-        data = read_json(file, "")
-    except (OSError, ValueError):
-        return False
-    entries = data.values() if isinstance(data, dict) else ()
-    return any(isinstance(e, dict) and {"context", "target"} <= e.keys() for e in entries)
+def found_indices(path: UPath) -> Iterator[UPath]:
+    """Yield the JSON files in the folder `path` that have the form of an evaluation index."""
+    for file in sorted(listing(path), key=str):
+        # other JSON files may be anything
+        with suppress(OSError, ValueError):
+            data = read_json(file, "") if file.suffix == ".json" else ()
+            entries = data.values() if isinstance(data, dict) else ()
+            if any(isinstance(e, dict) and {"context", "target"} <= e.keys() for e in entries):
+                yield file
 
 
 def index_findings(file: UPath, scenes: Sequence[SceneReport]) -> Iterator[Finding]:
