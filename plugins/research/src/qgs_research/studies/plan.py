@@ -179,7 +179,13 @@ def composed(study: Study) -> dict[tuple[str, str], Recipe]:
     problems.raise_any()
     for name, recipe in recipes.items():
         try:
-            _build(recipe)
+            recipe.build_optimizer()
+            # On the meta device, because published models would not fit into a laptop's memory.
+            recipe.rate_factors(recipe.build_model("meta"))
+            recipe.build_losses()
+            recipe.build_objective()
+            if recipe.init_from:
+                checkpoint_path(recipe.init_from)
         except (ValueError, OSError) as error:
             # The error of a component does not name the variant.
             error.add_note(f"in the variant `{name}`, {study.variants[name].origin}")
@@ -200,17 +206,6 @@ def _collected(problems: Problems, place: str, origin: Origin) -> Iterator[None]
         for found in error.problems:
             at = Origin(found.file, found.line) if found.line else origin
             problems.add(at, f"{place}: {found.option}", found.reason, found.fix, found.cause)
-
-
-def _build(recipe: Recipe) -> None:
-    """Build model (on the meta device), losses and optimiser, to find errors."""
-    recipe.build_optimizer()
-    # Use the meta device, because published models would not fit into a laptop's memory.
-    recipe.rate_factors(recipe.build_model("meta"))
-    recipe.build_losses()
-    recipe.build_objective()
-    if recipe.init_from:
-        checkpoint_path(recipe.init_from)
 
 
 EQUAL = ("data", "views", "training", "evaluation", "metrics", "losses", "objective", "init_from")
