@@ -1,7 +1,9 @@
 """Random objects: composites of primitives, cut primitives, rows, frames, bars and wires."""
 
 import math
-from operator import add
+from collections.abc import Iterable
+from itertools import combinations, pairwise, product
+from operator import add, ne
 from random import Random
 from typing import NamedTuple
 
@@ -166,19 +168,19 @@ class Things:
         places = [k - (count - 1) / 2 for k in range(count)]
         return [first.moved(s * angle, tuple(s * part for part in way), grow**s) for s in places]
 
-    def _rods(self, points: list[Point], pairs: list[tuple[int, int]], radius: float) -> Thing:
+    def _rods(self, ends: Iterable[tuple[Point, Point]], radius: float) -> Thing:
         square = self.rng.random() < 0.5
-        skin = self.texture()
-        return [Shape(rod(points[a], points[b], radius, square), texture=skin[0]) for a, b in pairs]
+        texture, _ = self.texture()
+        return [Shape(rod(a, b, radius, square), texture=texture) for a, b in ends]
 
     def _frame(self) -> Thing:
         """Return the edges of a random box, as rods."""
         rng = self.rng
         a, b, c = (rng.uniform(0.4, 1) for _ in range(3))
-        points = [(x, y, z) for x in (-a, a) for y in (-b, b) for z in (-c, c)]
-        # corners that share an edge differ in one bit
-        pairs = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
-        return self._rods(points, pairs, spread(rng, 0.012, 0.08))
+        corners = product((-a, a), (-b, b), (-c, c))
+        # corners that share an edge differ in one coordinate
+        edges = [pair for pair in combinations(corners, 2) if sum(map(ne, *pair)) == 1]
+        return self._rods(edges, spread(rng, 0.012, 0.08))
 
     def _wire(self) -> Thing:
         """Return a chain of rods, along an arc or through random points."""
@@ -191,19 +193,17 @@ class Things:
             points = [(math.cos(t), math.sin(t), lift * t) for t in angles]
         else:
             points = [tuple(rng.uniform(-1, 1) for _ in range(3)) for _ in range(count)]
-        pairs = [(k, k + 1) for k in range(count - 1)]
-        return self._rods(points, pairs, spread(rng, 0.008, 0.05))
+        return self._rods(pairwise(points), spread(rng, 0.008, 0.05))
 
     def _bars(self) -> Thing:
         """Return parallel bars between two rails, like a fence or a ladder."""
         rng = self.rng
         count = rng.randint(3, 9)
         high = rng.uniform(0.4, 1)
-        ends = [(x, 0.0, s * high) for x in (-1.0, 1.0) for s in (-0.8, 0.8)]
+        rails = [((-1.0, 0.0, z), (1.0, 0.0, z)) for z in (-0.8 * high, 0.8 * high)]
         places = [2 * (k + 0.5) / count - 1 for k in range(count)]
-        points = ends + [(x, 0.0, s * high) for x in places for s in (-1, 1)]
-        pairs = [(0, 2), (1, 3)] + [(4 + 2 * k, 5 + 2 * k) for k in range(count)]
-        return self._rods(points, pairs, spread(rng, 0.012, 0.06))
+        bars = [((x, 0.0, -high), (x, 0.0, high)) for x in places]
+        return self._rods(rails + bars, spread(rng, 0.012, 0.06))
 
 
 def lowest(thing: Thing) -> float:
