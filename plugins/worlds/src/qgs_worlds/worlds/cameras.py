@@ -130,7 +130,7 @@ def _draw(rng: Generator, place: Place, count: int, varied: bool, shrink: float)
     base, distance = _stand(rng, place, target, varied)
     s = np.linspace(-0.5, 0.5, count)
     if not varied:
-        across = np.array([target[1] - base[1], base[0] - target[0], 0.0])
+        across = np.cross(target - base, (0.0, 0.0, 1.0))
         step = across / np.linalg.norm(across) * max(rng.uniform(*PLAIN_TRAVEL) * shrink, 0.05)
         target = np.array([*target[:2], base[2] - rng.uniform(0.1, 0.4)])
         c2w = _look_at(base + s[:, None] * step, target + 0.1 * s[:, None] * step)
