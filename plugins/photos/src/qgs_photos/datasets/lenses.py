@@ -88,9 +88,8 @@ class BendingLens(Lens):
         the crop has. Returns 1 if black pixels remain even at MOST_ZOOM.
         """
         side = torch.linspace(-1, 1, 65).double()
-        ends = torch.ones_like(side)
-        edges = [(side, ends), (side, -ends), (ends, side), (-ends, side)]
-        border = torch.cat([torch.stack(edge, -1) for edge in edges])
+        square = torch.cartesian_prod(side, side)
+        border = square[square.abs().amax(-1) == 1]
         middle = torch.tensor(size[::-1]).double() / 2
         half = torch.tensor(target[::-1]).double() / 2
         reach = max(target[0] / size[0], target[1] / size[1])
