@@ -51,10 +51,8 @@ def chosen_splits(
         wanted = {*[*places][every - 1 :: every]}
     else:
         wanted = places.keys() - train.keys()
-    return {
-        "train": {name: place for name, place in places.items() if name not in wanted},
-        "test": {name: place for name, place in places.items() if name in wanted},
-    }
+    chosen = {name: places.pop(name) for name in [*places] if name in wanted}
+    return {"train": places, "test": chosen}
 
 
 def _places(source: SceneSource, split: Split) -> dict[str, tuple[Split, int]]:
