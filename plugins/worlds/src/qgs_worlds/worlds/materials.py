@@ -19,7 +19,7 @@ _PLAIN_PATTERNS = (s.STRIPES, s.CHECKER, s.TILES, s.DOTS)
 # a name that is listed twice is drawn more often
 _PATTERNS = (*_PLAIN_PATTERNS, s.TILES, s.GLYPHS, s.GLYPHS, s.RINGS)
 
-Color = tuple[float, float, float]
+Color = tuple[float, ...]
 Texture = Mapping[str, ArrayLike]
 """Values of a row of the table TEXTURE, by field name."""
 
@@ -39,9 +39,9 @@ class Palette:
         rng = self.rng
         hue = rng.choice(self._hues) if rng.random() < 0.8 else rng.random()
         saturation = rng.random() ** self._grey
-        red, green, blue = colorsys.hsv_to_rgb(hue, saturation, 0.12 + 0.83 * rng.random())
+        shown = colorsys.hsv_to_rgb(hue, saturation, 0.12 + 0.83 * rng.random())
         # from display to light
-        return red**2.2, green**2.2, blue**2.2
+        return tuple(part**2.2 for part in shown)
 
     def near(self, color: Color, by: float) -> Color:
         """Return a random colour near `color`, with a slightly different hue.
@@ -49,8 +49,7 @@ class Palette:
         by: standard deviation of the brightness in stops (powers of 2).
         """
         tone = 2 ** self.rng.gauss(0, by)
-        red, green, blue = (min(tone * c * 2 ** self.rng.gauss(0, 0.25 * by), 0.9) for c in color)
-        return red, green, blue
+        return tuple(min(tone * c * 2 ** self.rng.gauss(0, 0.25 * by), 0.9) for c in color)
 
 
 def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
