@@ -124,7 +124,7 @@ class Bounded(ViewSampler):
             inside = [inside[int(rng.integers(len(inside)))]]
         return [frame for moment in inside for frame in moment]
 
-    def gaps(self, step: int) -> tuple[int, int]:
+    def gaps(self, step: int) -> tuple[int, ...]:
         """Return the least and the largest gap, in frames, after `step` training steps.
 
         During the warm-up both bounds change linearly.
@@ -135,8 +135,7 @@ class Bounded(ViewSampler):
             (options.initial_min_gap, options.min_gap),
             (options.initial_max_gap, options.max_gap),
         )
-        low, high = (start + int((end - start) * share) for start, end in bounds)
-        return low, high
+        return tuple(start + int((end - start) * share) for start, end in bounds)
 
 
 class Farthest(Bounded):
