@@ -167,7 +167,7 @@ def model(database: Any, images: tuple[int, int], pair: TwoViews) -> Any:
         if not built.exists_camera(camera.camera_id):
             built.add_camera_with_trivial_rig(camera)
         points = database.read_keypoints(image)[:, :2].astype(float)
-        photo.points2D = COLMAP.Point2DList([COLMAP.Point2D(point) for point in points])
+        photo.points2D = [COLMAP.Point2D(point) for point in points]
         built.add_image_with_trivial_frame(photo, COLMAP.Rigid3d(pose))
     for point, features in zip(scale * pair.points, pair.indices, strict=True):
         track = COLMAP.Track()
