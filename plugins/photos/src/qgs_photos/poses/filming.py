@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,13 +87,12 @@ def _write_mp4(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
     with av.open(str(path), "w", format="mp4", options=options) as container:
         stream = container.add_stream("libx264", rate=rate, options={"crf": _QUALITY})
         stream.pix_fmt = "yuv420p"
-        stream.time_base = Fraction(1, rate)
         for number, picture in enumerate(frames):
             # its colours have half the resolution
             even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
             if not number:
                 stream.height, stream.width = even.shape[:2]
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            frame = av.VideoFrame.from_ndarray(even, format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
