@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -149,15 +149,15 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
     most_photos: largest number of photos to match with each other to check the cameras; 0 matches
     none.
     """
-    report = SceneReport(candidate.name, candidate.kind, candidate.split)
+    report = partial(SceneReport, candidate.name, candidate.kind, candidate.split)
     try:
         photos, missing = candidate.photos()
     except Exception as error:
         # whatever a reader raises; the other scenes go on
-        return replace(report, findings=[_unreadable(candidate.name, error)])
+        return report(findings=[_unreadable(candidate.name, error)])
     absent = list(_absent(candidate.name, photos, missing))
     if not photos:
-        return replace(report, findings=absent)
+        return report(findings=absent)
     with ThreadPoolExecutor(options.threads) as pool:
         decoded = list(pool.map(partial(decode, headers_only=options.headers_only), photos))
     scene = DecodedScene(candidate.name, photos, decoded)
@@ -182,8 +182,7 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         if not explained:
             findings += geometry_findings(scene, geometry)
     c2w = np.array([photos[f].listed.c2w for f in placed if scene.numbers[f] is not None])
-    return replace(
-        report,
+    return report(
         listed=len(photos) + len(missing),
         decodable=sum(result.size is not None for result in decoded),
         missing=len(missing) + sum(not photo.exists for photo in photos),
