@@ -291,10 +291,10 @@ def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
     reference = scores.stored[scores.reference, MAIN]
     results = [*reference.values(), *runs.values()]
     unpaired = runs.keys() ^ reference.keys()
-    scenes = dict.fromkeys(scene for result in results for scene in result.scenes)
+    scenes = {scene for result in results for scene in result.scenes}
     return {
         "scenes without a score": results[-1].missing,
         "runs without a partner": [{**reference, **runs}[key].name for key in unpaired],
-        "scenes not in both": scenes.keys() - common_scenes(results),
+        "scenes not in both": scenes.difference(common_scenes(results)),
         "scenes with different frames": moved_scenes(results),
     }
