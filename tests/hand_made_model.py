@@ -25,7 +25,7 @@ def model():
 @pytest.fixture
 def cameras():
     """Two cameras (1, 2) of 32x32, the identity and one to its right."""
-    return pinhole(along_x([0.0, 0.3]), (32.0, 32.0, 16.0, 16.0), (32, 32))[None]
+    return pinhole(along_x([0.0, 0.3]), size=(32, 32))[None]
 
 
 @pytest.fixture

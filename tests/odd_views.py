@@ -1,8 +1,9 @@
 """Views whose cameras confuse nothing with anything, and tiles of their pixels."""
 
 import torch
+from walk import pinhole
 
-from qgs.types import Cameras, Views
+from qgs.types import Views
 
 
 def odd_views(count=2, height=16, width=16, scenes=2, seed=0):
@@ -12,9 +13,9 @@ def odd_views(count=2, height=16, width=16, scenes=2, seed=0):
     c2w = torch.eye(4).repeat(scenes, count, 1, 1)
     c2w[..., :3, :3] = torch.linalg.matrix_exp(turns - turns.mT)
     c2w[..., :3, 3] = 0.2 * torch.randn(scenes, count, 3, generator=generator)
-    lens = torch.tensor([0.9 * width, width, width / 2 - 0.5, height / 2 + 0.5])
+    lens = (0.9 * width, width, width / 2 - 0.5, height / 2 + 0.5)
     images = torch.rand(scenes, count, 3, height, width, generator=generator)
-    return Views(images, Cameras(c2w, lens.expand(scenes, count, 4), (height, width)))
+    return Views(images, pinhole(c2w, lens, (height, width)))
 
 
 def in_tiles(maps_BVHWC, rows, columns, in_turn=False):

@@ -22,9 +22,7 @@ class Tape(Scene):
 
     @property
     def cameras(self):
-        height, width = self._images.shape[1:3]
-        lens = width, width, width / 2, height / 2
-        return pinhole(torch.from_numpy(self._c2w), lens, (height, width))
+        return pinhole(torch.from_numpy(self._c2w), size=self._images.shape[1:3])
 
     def images(self, frames):
         return torch.from_numpy(self._images[list(frames)]).permute(0, 3, 1, 2).float() / 255

@@ -25,9 +25,11 @@ def along_x(places):
     return c2w
 
 
-def pinhole(c2w, lens=(64.0, 64.0, 32.0, 32.0), size=(SIDE, SIDE)):
-    """Cameras (V,)."""
-    return Cameras(c2w, torch.tensor(lens).to(c2w).expand(len(c2w), 4), size)
+def pinhole(c2w, lens=None, size=(SIDE, SIDE)):
+    """Cameras at poses (..., 4, 4), by default with the width as focal length, and centred."""
+    height, width = size
+    lens = lens or (width, width, width / 2, height / 2)
+    return Cameras(c2w, torch.tensor(lens).to(c2w).expand(*c2w.shape[:-2], 4), size)
 
 
 def assert_rigid(c2w):

@@ -7,14 +7,14 @@ from losses.judging import CAMERAS, GOLDEN, PREDICTED, TRUTH, judged
 from tables import assert_near, must_refuse
 from torch.testing import assert_close
 from training_runs import run, tiny
-from walk import pinhole
+from walk import along_x, pinhole
 
 from qgs.contracts import ViewsConfig
 from qgs.data.samples import make_sample, stack_views
 from qgs.losses import Mask, Photometric, view_visibility
 from qgs.losses.depth import DepthSurface
 from qgs.metrics.images import ssim
-from qgs.types import Cameras, Views
+from qgs.types import Views
 from qgs.wording import warn_once
 
 POINTS = GOLDEN["points"]
@@ -123,7 +123,7 @@ def test_a_centre_that_is_nan_gives_nan():
 
 def test_a_hidden_surface_is_not_drawn_to_what_hides_it():
     """A screen at z = 1 hides the wall at z = 2 from the first camera; the second is behind it."""
-    cameras = Cameras(torch.eye(4).repeat(1, 2, 1, 1), torch.full((1, 2, 4), 2.0), (4, 4))
+    cameras = pinhole(along_x([0.0, 0.0]), [2.0] * 4, (4, 4))[None]
     cameras.c2w[0, 1, 2, 3] = 1.0
     depths = torch.ones(1, 2, 1, 4, 4)
     views = Views(depths.expand(-1, -1, 3, -1, -1), cameras, depths=depths)

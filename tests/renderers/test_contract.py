@@ -52,7 +52,7 @@ def compared(renderer, scene, of_images=2e-5, of_gradients=2e-5, **options):
 
 
 def fixed_cameras(batch):
-    return pinhole(along_x([0.0] * batch), (40.0, 40.0, 20.0, 12.0), (24, 40))[:, None]
+    return pinhole(along_x([0.0] * batch), size=(24, 40))[:, None]
 
 
 def test_images_and_gradients_match_the_oracle(build):

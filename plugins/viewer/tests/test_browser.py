@@ -148,7 +148,7 @@ def test_a_page_has_the_colors_of_several_directions(page, tmp_path, monkeypatch
 def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     """Photos are negatives of what our renderer shows."""
     lens = (300.0, 300.0, 160.0, 100.0)
-    cameras = pinhole(arc([-40.0, 0, 40], 3, 0.3), lens, (200, 320))[None].to(torch.float32)
+    cameras = pinhole(arc([-40.0, 0, 40], 3, 0.3).float(), lens, (200, 320))[None]
     given = cloud(200)
     photos = AutoRenderer(AutoRenderer.Config(background=(0, 0, 0)))(given, cameras).rgb
     names = ["</script><b>left</b>", "middle", "right"]

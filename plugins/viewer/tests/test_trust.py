@@ -13,7 +13,7 @@ SIDE = 12
 
 def cameras(*places):
     """They look along z, the view of each as wide as what it sees is far away."""
-    return pinhole(along_x(places), (SIDE, SIDE, SIDE / 2, SIDE / 2), (SIDE, SIDE))[None]
+    return pinhole(along_x(places), size=(SIDE, SIDE))[None]
 
 
 def test_a_pixel_is_seen_if_its_point_at_the_rendered_depth_lies_in_an_input():

@@ -56,7 +56,7 @@ def test_the_round_trip(tmp_path, count):
 def test_cameras_see_what_ours_see(tmp_path):
     """In glTF, -Z is forward and +Y is up: that of the cameras, from the ground at 0."""
     lens = (60.0, 50.0, 32.0, 24.0)
-    cameras = pinhole(arc([-20, 0, 20], 3, 0.2), lens, (48, 64))[None].to(torch.float32)
+    cameras = pinhole(arc([-20, 0, 20], 3, 0.2).float(), lens, (48, 64))[None]
     given = cloud(20)
     named = {f"photo {view}": cameras[:, [view]] for view in range(3)}
     save_glb(given, tmp_path / "a.glb", named)

@@ -80,7 +80,7 @@ def test_splat_transform_and_three_read_our_files(tmp_path):
         # .spz gives harmonics of degree 2 four bits, .sog has a table of few
         assert_close_enough(found, given, 0.7 if name == "back.sog" else 0.07)
 
-    cameras = pinhole(arc([-20.0, 0, 20], 3)).to(torch.float32)[None]
+    cameras = pinhole(arc([-20.0, 0, 20], 3).float())[None]
     save_glb(given, tmp_path / "a.glb", {name: cameras[:, [i]] for i, name in enumerate("abc")})
     read = Path(__file__).with_name("read_glb.mjs").read_text()
     (tmp_path / "read.mjs").write_text(read)

@@ -28,7 +28,7 @@ SIZE = (36, 54)
 
 def cameras():
     """A row of cameras that looks along z."""
-    return pinhole(along_x(torch.linspace(-0.5, 0.5, 7)), (44.0, 44.0, 27.0, 18.0), SIZE)[None]
+    return pinhole(along_x(torch.linspace(-0.5, 0.5, 7)), size=SIZE)[None]
 
 
 def wall(depth):
