@@ -15,11 +15,10 @@ from qgs.geometry.transforms import moved
 from qgs.types import Gaussians, Views
 
 
-def seen(gaussians, degrees, side=48):
+def shots(gaussians, degrees, side=48, renderer=VIEWER):
     """Photos (1, V) of Gaussians from a circle of radius 2."""
-    lens = (side, side, side / 2, side / 2)
-    cameras = pinhole(arc(degrees, 2).float(), lens, (side, side))[None]
-    return Views(VIEWER(gaussians, cameras).rgb.clamp(0, 1), cameras)
+    cameras = pinhole(arc(degrees, 2).float(), size=(side, side))[None]
+    return Views(renderer(gaussians, cameras).rgb.clamp(0, 1), cameras)
 
 
 def ball(place=(0.0, 0.0, 0.0), size=0.2):
@@ -33,8 +32,8 @@ def ball(place=(0.0, 0.0, 0.0), size=0.2):
 
 def test_floaters_go_if_held_out_photos_do_not_show_them():
     given = cloud(60)
-    whole = seen(given, range(0, 90, 15))
-    held_out = seen(given, [5.0, 50.0])
+    whole = shots(given, range(0, 90, 15))
+    held_out = shots(given, [5.0, 50.0])
     # 0.4 in front of the first camera, on the side of the next
     near = moved(ball((0.1, 0.0, 0.4), 0.02), whole.cameras.c2w[0, 0], 1.0)
     both = concatenated([near, given], 1)
@@ -44,27 +43,27 @@ def test_floaters_go_if_held_out_photos_do_not_show_them():
     assert quality(cleaned.gaussians, held_out) > quality(both, held_out)
     # surroundings, which come first, stay, and so does what photos do show
     assert found.cleaned(held_out, 1).gaussians.count == 61
-    shown = evidence(both, seen(both, range(0, 90, 15)))
-    assert shown.cleaned(seen(both, [5.0, 50.0]), 0).gaussians.count == 61
+    shown = evidence(both, shots(both, range(0, 90, 15)))
+    assert shown.cleaned(shots(both, [5.0, 50.0]), 0).gaussians.count == 61
     # without held-out photos nothing tells
     assert found.cleaned(held_out.select([]), 0).gaussians.count == 61
 
 
 def center(found, degree):
-    camera = seen(found.gaussians, [degree]).cameras
+    camera = shots(found.gaussians, [degree]).cameras
     return float(found.error_map(camera)[24, 24])
 
 
 def test_errors_fall_with_photos_and_grow_with_the_angle():
     wrong = ball().replace(colors=torch.zeros(1, 1, 3), opacities=torch.ones(1, 1))
     two, eight = (
-        evidence(wrong, seen(wrong.replace(colors=wrong.colors + 0.1), range(count)))
+        evidence(wrong, shots(wrong.replace(colors=wrong.colors + 0.1), range(count)))
         for count in (2, 8)
     )
     assert center(two, 0.0) / center(eight, 0.0) == pytest.approx(math.sqrt(9 / 3), rel=0.02)
     assert center(two, 31.0) / center(two, 1.0) == pytest.approx(math.exp(math.pi / 12), rel=0.02)
     away = replace(two.gaussians, means=two.gaussians.means + 100)
-    nowhere = replace(two, gaussians=away).error_map(seen(away, [0]).cameras)
+    nowhere = replace(two, gaussians=away).error_map(shots(away, [0]).cameras)
     torch.testing.assert_close(nowhere, two.empty.expand(48, 48))
     # photos show that it is empty there
     assert 0 < two.empty < 0.01
@@ -74,10 +73,10 @@ def test_errors_are_larger_where_photos_differ_and_as_large_as_held_out_ones():
     given = cloud(60)
     left = given.means[..., :1] < 0
     wrong = given.replace(colors=given.colors + 0.3 * left)
-    found = evidence(wrong, seen(given, range(0, 90, 10)))
+    found = evidence(wrong, shots(given, range(0, 90, 10)))
     left = left[0, :, 0]
     assert found.errors[left].mean() > 1.5 * found.errors[~left].mean()
-    judged = seen(given, range(5, 90, 10))
+    judged = shots(given, range(5, 90, 10))
     truth = errors_of(VIEWER(wrong, judged.cameras).rgb, judged.images)[0]
     found = found.calibrated(judged)
     maps = [found.error_map(judged.cameras[:, [view]]) for view in range(9)]
@@ -87,7 +86,7 @@ def test_errors_are_larger_where_photos_differ_and_as_large_as_held_out_ones():
 def test_a_point_of_a_photo_lies_on_the_surface_there():
     """In the middle of the photo, at the front camera's distance; and the camera itself."""
     wide = ball(size=1e-3).replace(scales=torch.tensor([[[0.5, 0.5, 1e-3]]]))
-    cameras = seen(wide, [0.0, 90.0]).cameras
+    cameras = shots(wide, [0.0, 90.0]).cameras
     found = located(Point(0, (0.5, 0.75)), wide, cameras)
     axis = cameras.c2w[0, 0, :3, 1]
     torch.testing.assert_close(found, 0.5 * axis, atol=0.03, rtol=0)

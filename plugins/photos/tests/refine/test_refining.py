@@ -17,9 +17,10 @@ from qgs_photos.refine.surroundings import edge_color, surrounded
 from qgs_photos.refine.sweeping import swept
 from qgs_photos.viewing import VIEWER
 from tables import assert_equal, must_refuse
+from test_evidence import shots
 from textured_room import INTRINSICS, photos_of, walk
 from torch.testing import assert_close
-from walk import arc, cloud, pinhole
+from walk import assert_rigid, cloud
 
 from qgs.containers import map_tensors
 from qgs.data.samples import shrunk
@@ -47,16 +48,9 @@ def clock(monkeypatch):
     return hooks.append
 
 
-def ring(views, side=24):
-    """Cameras (1, views) on a quarter of a circle of radius 2 about the origin."""
-    c2w = arc(torch.linspace(0, 90, views), 2).float()
-    return pinhole(c2w, (side, side, side / 2, side / 2), (side, side))[None]
-
-
 def photos(views, side=24, number=60):
-    """Photos of a cloud."""
-    cameras = ring(views, side)
-    return Views(RENDERER(cloud(number), cameras).rgb.clamp(0, 1), cameras)
+    """Photos (1, views) of a cloud, from a quarter of a circle."""
+    return shots(cloud(number), torch.linspace(0, 90, views), side, RENDERER)
 
 
 @torch.no_grad()
@@ -180,8 +174,7 @@ def test_growth_leaves_the_rendering_as_it_is():
     """
     fog = 0.01 + 0.05 * torch.rand(1, 200)
     given = free(cloud(200).replace(opacities=fog))
-    cameras = ring(7)
-    before = Views(RENDERER(given.gaussians(), cameras).rgb.detach(), cameras)
+    before = shots(given.gaussians(), range(0, 91, 15), 24, RENDERER)
     given.grow(400, generator())
     assert mean_psnr(given.gaussians(), before) > 35
     means = given.values["means"]
@@ -210,8 +203,7 @@ def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay():
     before, after = (mean_psnr(cloud(60), posed(c2w).select([2])) for c2w in (wrong, better))
     assert after > before + 3
     assert 0 < (better - wrong)[0, [0, 1, 3, 4], :3, 3].norm(dim=-1).max() < 0.01
-    turns = better[0, :, :3, :3]
-    assert torch.allclose(turns @ turns.mT, torch.eye(3), 0, 1e-5)
+    assert_rigid(better)
 
 
 def test_exposures_of_photos_have_the_mean_0():
@@ -225,7 +217,7 @@ def test_exposures_of_photos_have_the_mean_0():
 
 def test_exposures_of_photos_leave_the_mean_to_the_gaussians():
     """A black background is as bright in all photos."""
-    cameras = ring(3, 24)
+    cameras = photos(3).cameras
     gains = torch.tensor([1.0, 0.6, 1])
     true = VIEWER(cloud(60), cameras).rgb
     dark = Views(true * gains[:, None, None, None], cameras)
