@@ -18,11 +18,17 @@ def pytest_collection_finish():
 
 @pytest.fixture(autouse=True)
 def _seeded_on_one_thread():
-    """Use one thread: the models are so small that a second one only waits."""
+    """Use one thread: the models are so small that a second one only waits.
+
+    What is told once is told again in each test.
+    """
     import torch  # the controller of several processes needs none
+
+    from qgs.wording import warn_once
 
     torch.set_num_threads(1)
     torch.manual_seed(0)
+    warn_once.cache_clear()
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -6,8 +6,6 @@ from photo_formats import scene as read
 from PIL import Image
 from tables import must_not_find, must_refuse, rows, write_json
 
-from qgs.wording import warn_once
-
 FOUND = """
 images/N.png: images/N.png:
 ./train/N: train/N.png:
@@ -47,7 +45,6 @@ may be any of: images/N.webp: images/N.jpg images/N.png
 @pytest.fixture
 def spoon(tmp_path):
     """Three photos of the names `files`, which are listed as `listed`."""
-    warn_once.cache_clear()
 
     def made(name, listed, *files, **more):
         folder = tmp_path / name

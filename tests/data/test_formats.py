@@ -26,12 +26,6 @@ from upath import UPath
 from qgs.data import PhotosSource
 from qgs.data import photos as formats
 from qgs.data.photos.reader import GROUP
-from qgs.wording import warn_once
-
-
-@pytest.fixture(autouse=True)
-def _warnings_are_told_again():
-    warn_once.cache_clear()
 
 
 def assert_same(read, photos):

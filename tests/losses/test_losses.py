@@ -15,7 +15,6 @@ from qgs.losses import Mask, Photometric, view_visibility
 from qgs.losses.depth import DepthSurface
 from qgs.metrics.images import ssim
 from qgs.types import Views
-from qgs.wording import warn_once
 
 POINTS = GOLDEN["points"]
 
@@ -107,7 +106,6 @@ def test_depth_by_hand():
 
 
 def test_a_batch_without_depth_maps_adds_nothing_and_is_logged_once(caplog):
-    warn_once.cache_clear()
     for _ in range(2):
         value, slope = differentiated(OF_DEPTH, WALL.replace(depths=None))
         assert value == 0
