@@ -9,7 +9,7 @@ from renderers.scenes import make_scene
 from tables import assert_equal, must_refuse
 from torch.testing import assert_close
 
-from qgs.containers import concatenated, named_tensors
+from qgs.containers import concatenated
 from qgs.contracts import RendererConfig
 from qgs.renderers import AutoRenderer, CpuRenderer, GsplatRenderer, TorchRenderer
 from qgs.renderers.gsplat import _check_supported
@@ -43,7 +43,7 @@ def test_images_are_those_of_the_function_that_gsplat_documents(monkeypatch):
     for more in ({"harmonics": 8, "features": 2}, {}, {"count": 0}):
         scene = make_scene(2, 3, size=(12, 20), scale=0.2, **more)
         found, expected = (kind(config)(*scene) for kind in (GsplatRenderer, TorchRenderer))
-        assert_close(*(dict(named_tensors(images)) for images in (found, expected)))
+        assert_close(vars(found), vars(expected))
 
 
 def test_options_that_the_kernels_fix_are_refused():
