@@ -1,9 +1,11 @@
 """Cameras on arcs, what they may look at, and a scene that a camera walks past."""
 
 import torch
+from tables import assert_equal
 
 from qgs.contracts import Scene
 from qgs.geometry.poses import look_at
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras, Gaussians
 
 FRAMES = 6
@@ -48,6 +50,20 @@ def cloud(number, seed=0):
     scales = 0.05 + 0.1 * even[..., :3]
     opacities = 0.3 + 0.6 * even[..., 3]
     return Gaussians(0.3 * normal[..., :3], scales, quats, opacities, even[..., 4:])
+
+
+def covariances(gaussians):
+    axes = quat_to_matrix(gaussians.quats) * gaussians.scales[..., None, :]
+    return axes @ axes.mT
+
+
+def assert_alike(found, given):
+    """Gaussians (1, G) are the given ones but for rounding and an order, which is undone: (G,)."""
+    found = found[0][torch.cdist(given.means[0], found.means[0]).argmin(1)]
+    for part in ("means", "opacities", "colors"):
+        assert_equal(getattr(found, part), getattr(given, part)[0], atol=0.01)
+    assert_equal(covariances(found), covariances(given)[0], atol=4e-3)
+    return found
 
 
 class Walk(Scene):

@@ -13,10 +13,10 @@ from qgs_zoo.mvsplat import sweep
 from qgs_zoo.mvsplat.sweep import nearest_neighbours
 from torch import nn
 from torch.testing import assert_close
+from walk import covariances
 
 import qgs
 from qgs.geometry.harmonics import SH_C0, harmonics
-from qgs.geometry.transforms import quat_to_matrix
 
 FILES = """
 mvsplat_a mvsplat_views3_a mvsplat_cases_a depthsplat_a depthsplat_base_a depthsplat_base_eighth_a
@@ -58,14 +58,13 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     assert torch.equal(done.sample.inputs.cameras.c2w, views.cameras.c2w)
     ours = done.gaussians
     theirs = golden.tensors
-    factors = quat_to_matrix(ours.quats) * ours.scales[..., None, :]
     # Colours in 50 directions in place of harmonics: the family's rasteriser reads directions as
     # z, x, y, and never degree 4.
     seen = F.normalize(torch.randn(50, 3), dim=-1)
     sh = theirs["harmonics"][..., :16]
     turned = harmonics(seen[:, [2, 0, 1]], sh.shape[-1] - 1) @ sh[..., 1:].mT
     colours = ours.colors[..., None, :] + harmonics(seen, ours.sh.shape[-2]) @ ours.sh
-    found = (ours.means, factors @ factors.mT, ours.opacities, colours)
+    found = (ours.means, covariances(ours), ours.opacities, colours)
     wanted = [theirs[name] for name in ("means", "covariances", "opacities")]
     wanted.append(0.5 + SH_C0 * sh[..., None, :, 0] + turned)
     assert_close(found, (*wanted,), rtol=parity.RTOL, atol=parity.ATOL)
