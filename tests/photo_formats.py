@@ -154,8 +154,7 @@ def cut(path, part):
 
 def uploaded(folder, place):
     """Copy the files in `folder` to a place of another file system."""
-    for file in filter(Path.is_file, folder.rglob("*")):
-        put(place / file.relative_to(folder).as_posix(), file.read_bytes())
+    place.fs.put(f"{folder}/", place.path, recursive=True)
 
 
 def opengl(c2w):
