@@ -11,6 +11,7 @@ from photo_formats import noisy_photos, row_of_frames
 from PIL import Image, ImageSequence
 from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, seen_depth, write_film
 from qgs_photos.poses.paths import path_of, read_path, walk
+from qgs_photos.viewing import VIEWER
 from tables import assert_near, must_refuse, write_json
 from training_runs import tiny
 from walk import along_x, assert_rigid, cloud, pinhole
@@ -21,7 +22,6 @@ from qgs.cli.options import scale_settings
 from qgs.geometry.transforms import moved
 from qgs.reconstruction.reconstruct import reconstruct
 from qgs.reconstruction.scene_formats import save_ply
-from qgs.renderers import AutoRenderer
 
 SIZE = (36, 54)
 
@@ -88,7 +88,7 @@ def test_a_file_that_is_no_path_is_refused(tmp_path):
 
 def test_size_length_and_angle_of_view():
     world = torch.eye(4).double(), 1.0
-    scene = FilmScene(wall(3.0), cameras(), AutoRenderer(AutoRenderer.Config()), world)
+    scene = FilmScene(wall(3.0), cameras(), VIEWER, world)
     assert seen_depth(scene) == pytest.approx(3.0, rel=0.02)
     path = cameras_of(scene, "orbit", None, 5, None)
     assert path.shape == (1, 5)
@@ -119,9 +119,8 @@ def test_a_scene_of_photos_is_filmed_from_their_cameras(made, tmp_path):
     gaussians = moved(wall(1.5), views.cameras.c2w[0, 0], 1.0)
     save_ply(gaussians, tmp_path / "scene.ply")
     opened = open_film_scene(tmp_path / "scene.ply", str(made[0]), None)
-    renderer = AutoRenderer(AutoRenderer.Config())
-    found = renderer(opened.gaussians, opened.cameras[:, 2:3]).rgb
-    expected = renderer(gaussians, views.cameras.to(torch.float32)[:, 2:3]).rgb
+    found = VIEWER(opened.gaussians, opened.cameras[:, 2:3]).rgb
+    expected = VIEWER(gaussians, views.cameras.to(torch.float32)[:, 2:3]).rgb
     assert torch.allclose(found, expected, 0, 0.02)
 
 
