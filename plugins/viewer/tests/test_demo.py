@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from commands import done, record_of
+from commands import done, record_of, saved
 from photo_formats import noisy_photos, photo_set, write_nerfstudio
 from qgs_viewer import report
 from qgs_viewer.commands import new_folder
@@ -131,11 +131,9 @@ def test_two_photos_are_compared_with_themselves(models, tmp_path, small_picture
 
 def test_a_model_tuned_on_the_photos_is_compared_on_those_it_never_saw(models, tmp_path):
     photos = str(noisy_photos(tmp_path / "mine", 20))
-    data = f"data={{type: qgs/photos, path: {photos}, image_size: [16, 16], holdout: 5}}"
-    tuned = str(tmp_path / "tuned.safetensors")
-    qgs.save(qgs.compose(RECIPE, [data, "views.gap=[1, 3]", "views.scale=auto"]), tuned)
-    results = opened([models[0], tuned], photos)
-    assert [result.recipe.views.scale for result in results] == ["search", "auto"]
+    tuned = saved(tmp_path / "tuned.safetensors", "qgs/photos", path=photos, holdout=5)
+    results = opened([models[0], str(tuned)], photos)
+    assert [result.recipe.views.scale for result in results] == ["search", "constant"]
     before, after = ([score.views for score in r.evaluation.scores] for r in results)
     assert before == after
     assert {frame for views in before for _, frames in views for frame in frames} <= {2, 7, 12, 17}
