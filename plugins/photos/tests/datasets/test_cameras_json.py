@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from photo_formats import copied, scene, synthetic
+from photo_formats import copied, opengl, scene, synthetic
 from tables import must_refuse, write_json
 from torch.testing import assert_close
 
@@ -43,7 +43,6 @@ def forms(names, poses):
     padded = np.vstack([np.c_[K, [0] * 3], [0, 0, 0, 1]]).tolist()
     doubled = rows({"c2w": c2w}, K=[2 * number for number in LENS])
     w2c = np.linalg.inv(poses)
-    opengl = (poses * [1, -1, -1, 1]).tolist()
     splats = {
         "img_name": [Path(name).stem for name in names],
         "position": poses[:, :3, 3].tolist(),
@@ -62,7 +61,7 @@ def forms(names, poses):
         "cam2world": rows({"image": names, "cam2world": c2w}, K=K),
         "w2c": rows({"image": names, "w2c": w2c.tolist()}, K=K),
         "w2c of each": {"world_to_camera": w2c[:, :3].tolist(), "intrinsics": LENS},
-        "OpenGL": rows({"image": names, "transform_matrix": opengl}, K=K),
+        "OpenGL": rows({"image": names, "transform_matrix": opengl(poses)}, K=K),
         "parts": rows(plain, K=(np.array(K) / [[40], [30], [1]]).tolist()),
         "numbers by name": rows(plain, fl_x=50.0, fl_y=52.0, **CENTRE),
         "3DGS": rows(splats, id=0, width=40, height=30, fx=50.0, fy=52.0, **CENTRE),
