@@ -64,12 +64,6 @@ def test_the_published_axes(tmp_path):
     assert scene.cameras.intrinsics[0].tolist() == [50, 50, 20, 15]
 
 
-def test_rows_and_images_must_agree(tmp_path, photos):
-    write_llff(tmp_path, photos)
-    (tmp_path / "images/view_003.png").unlink()
-    must_refuse(r"6 poses, but .*images has 5 images", read, tmp_path)
-
-
 def test_files_that_are_no_rows_are_told(tmp_path, photos):
     file = write_llff(tmp_path, photos) / "poses_bounds.npy"
     objects = [[None] * 17]

@@ -102,7 +102,7 @@ def test_scenes_split_by_folder(tmp_path):
     source = opened(tmp_path)
     assert [len(source.scenes(split)) for split in ("train", "test")] == [2, 1]
     assert source.scenes("test")[0].name == "c"
-    must_refuse("5 images", source.scenes("train").__getitem__, 1)
+    must_refuse("6 poses, but .*images has 5 images", source.scenes("train").__getitem__, 1)
 
 
 CSV = """
