@@ -54,7 +54,7 @@ def test_names_that_are_taken_as_they_are() -> None:
     values = ("no", "on", "yes", "off", "n", "inf", "nan")  # for other readers of YAML
     for name in ("a", "wide", "far-sighted", "far_sighted", "view2d", *values):
         check_name(name)
-        (text,) = [text for path, text in rendered(name) if path.name == "recipe.yaml"]
+        text = dict(rendered(name))[Path("recipe.yaml")]
         assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name
 
 
@@ -72,7 +72,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 
 
 def test_its_component_computes_its_formula() -> None:
-    (source,) = [text for path, text in rendered("mine") if path.name == "abstaining.py"]
+    source = dict(rendered("mine"))[Path("src/qgs_mine/abstaining.py")]
     names: dict = {}
     exec(source, names)
     attention = names["AbstainingAttention"]
