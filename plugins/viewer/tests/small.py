@@ -3,12 +3,12 @@
 from copy import deepcopy
 from functools import cache
 
-import torch
 import yaml
 from commands import ONE_LAYER
 from qgs_dev.case import seeded
 from qgs_viewer.opening import ModelSource
 from qgs_viewer.scenes import scenes_of
+from small_parts import shaken
 from walk import Walk
 
 import qgs
@@ -58,8 +58,7 @@ def model_scenes_of(kind):
     """The walk by the small model, with refinements that move anchors, as trained ones do."""
     model = deepcopy(model_of(kind))
     with seeded(2):
-        for parameter in model.refinements.parameters():
-            parameter.data += 0.03 * torch.randn(parameter.shape)
+        shaken(model.refinements, 0.03).float()
     return scenes_of(kind, model, [sample_of(), sample_of((0, 5))])
 
 

@@ -12,6 +12,7 @@ from PIL import Image, ImageSequence
 from qgs_photos.poses.filming import FilmScene, cameras_of, open_film_scene, seen_depth, write_film
 from qgs_photos.poses.paths import path_of, read_path, walk
 from qgs_photos.viewing import VIEWER
+from small_parts import shaken
 from tables import assert_near, must_refuse, write_json
 from training_runs import tiny
 from walk import along_x, assert_rigid, cloud, pinhole
@@ -150,10 +151,8 @@ def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path):
 
 def test_a_film_shows_what_the_reconstruction_renders_of_the_photos_world(here):
     model = tiny("tokengs", "model.renderer.background=[0, 0, 0]").build_model()
-    for weights in model.parameters():  # a fresh one draws all Gaussians alike
-        weights.data += 0.02 * torch.randn_like(weights)
     checkpoint = "checkpoint.safetensors"
-    qgs.save(model, checkpoint)
+    qgs.save(shaken(model, 0.02).float(), checkpoint)  # a fresh one draws all Gaussians alike
     photos = noisy_photos(here / "row")
     path = here / "path.json"  # what is seen lies small before the photos' cameras
     listed = row_of_frames(2, 0.2, fl_x=20, w=24, h=20)
