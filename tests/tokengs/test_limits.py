@@ -28,17 +28,14 @@ def outcome(*overrides):
 
 
 def test_limits_are_published_by_default_and_matter():
-    wrong = []
     for row in TABLE["components"]:
         beside = row.get("beside", [])
         options, made = outcome(*beside)
         for option, (published, other) in row["limits"].items():
             paths = [f"{place}.{option}" for place in row["at"]]
-            wrong += [path for path in paths if options[path] != published]
+            assert [options[path] for path in paths] == [published] * len(paths), paths
             changed = [f"{path}={other!r}" for path in paths]
-            if torch.equal(outcome(*beside, *changed)[1], made):
-                wrong += changed
-    assert wrong == []
+            assert not torch.equal(outcome(*beside, *changed)[1], made), changed
 
 
 def test_limits_of_losses_are_published_by_default_and_matter():
@@ -48,7 +45,6 @@ def test_limits_of_losses_are_published_by_default_and_matter():
     means = GOLDEN["points"]
     opacities = GOLDEN["opacity"][..., 0]
     losses = {loss.name: loss for loss in (*LOSSES, *plugin.components)}
-    wrong = []
     for row in TABLE["losses"]:
         options = dict(row)
         loss = losses[options.pop("loss")]
@@ -56,9 +52,8 @@ def test_limits_of_losses_are_published_by_default_and_matter():
         for option, (published, other) in options.items():
             configs = [loss.Config(**beside), loss.Config(**{**beside, option: other})]
             terms = [judged(loss(config), views, means, opacities)[loss.name] for config in configs]
-            if getattr(configs[0], option) != published or terms[0] == terms[1]:
-                wrong.append((loss.name, option))
-    assert wrong == []
+            assert getattr(configs[0], option) == published, (loss.name, option)
+            assert terms[0] != terms[1], (loss.name, option)
 
 
 def test_the_recipes_have_the_limits_of_their_releases():
