@@ -1,6 +1,4 @@
-"""A plugin whose components depend on each other, and recipes in the working directory."""
-
-from pathlib import Path
+"""Plugins whose components depend on each other."""
 
 import pytest
 
@@ -117,16 +115,3 @@ def installed(install):
     """Sound plugins: `spatial` and `mine`, whose components depend on each other, and `second`."""
     for name, source in (("spatial", SPATIAL), ("mine", MINE), ("second", SECOND)):
         install(f"qgs-{name}", name, source)
-
-
-@pytest.fixture
-def write(here):
-    """Write a recipe into the working directory: write(text)."""
-
-    file = Path("recipe.yaml")
-
-    def write(text):
-        file.write_text(text)
-        return file
-
-    return write

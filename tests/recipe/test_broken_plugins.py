@@ -4,6 +4,7 @@ Those that are refused with a recipe are cases/plugins.txt.
 """
 
 import traceback
+from pathlib import Path
 
 from commands import done
 from refusals import refused
@@ -50,14 +51,20 @@ plugin = Plugin("faulty", 1, (Strict, Silent, Closed, AbstractLoss))
 """
 
 
-def test_one_name_of_two_distributions(write, install):
+def write(text):
+    """Write a recipe into the working directory."""
+    Path("recipe.yaml").write_text(text)
+    return "recipe.yaml"
+
+
+def test_one_name_of_two_distributions(here, install):
     for name in ("first-twin", "second-twin"):
         install(name, "twin", EMPTY.format("twin"))
     problem = refused(write("recipe: 1\nplugins: [twin]\n"))
     assert "first-twin 1.2, second-twin 1.2" in problem.reason
 
 
-def test_broken_plugins_and_impostors_hide_no_other_plugin(write, install, monkeypatch):
+def test_broken_plugins_and_impostors_hide_no_other_plugin(here, install, monkeypatch):
     install("impostor", "qgs", EMPTY.format("qgs"))
     install("qgs-raises", "raises", "raise RuntimeError('no luck')")
     registry, broken = load_usable_plugins()
@@ -84,7 +91,7 @@ def test_a_plugin_that_comes_to_a_folder_or_leaves_it_is_noticed(tmp_path, monke
     assert "late" not in available_plugins().names
 
 
-def test_the_tracebacks_of_plugins_and_components_are_all_shown(write, install):
+def test_the_tracebacks_of_plugins_and_components_are_all_shown(here, install):
     install("qgs-faulty", "faulty", FAULTY)
     for name in ("first", "second"):
         install(f"qgs-{name}", name, "{}['x']\n")
@@ -101,7 +108,7 @@ def test_the_tracebacks_of_plugins_and_components_are_all_shown(write, install):
         assert word in shown
 
 
-def test_what_fails_when_it_is_built_names_its_distribution_but_missing_data(write, install):
+def test_what_fails_when_it_is_built_names_its_distribution_but_missing_data(here, install):
     install("qgs-faulty", "faulty", FAULTY)
     text = "losses: {x: {type: faulty/abstract}}\ndata: {type: faulty/closed}\n"
     recipe = resolve(write(f"recipe: 1\nplugins: [faulty]\n{text}"))
