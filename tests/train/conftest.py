@@ -1,7 +1,6 @@
 """A run that is trained once."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 from training_runs import trained_run
@@ -17,4 +16,4 @@ def _in_an_empty_folder(here):
 @pytest.fixture
 def copied(trained_run, tmp_path):
     """A copy of the folder of `trained_run`."""
-    return Path(shutil.copytree(trained_run.folder.path, tmp_path / "copied"))
+    return shutil.copytree(trained_run.folder.path, tmp_path / "copied")

@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -102,7 +101,7 @@ def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog
     files = copied / "history.jsonl", copied / "evaluations.jsonl"
     for file in files:
         file.write_text(f'{{"step": 2, "lo\n[1]\n{file.read_text()}{{"step": 4}}\n')
-    in_halves = Path(shutil.copytree(copied, copied.with_name("halves")))
+    in_halves = shutil.copytree(copied, copied.with_name("halves"))
     longer = ("training.steps=4", "training.evaluate_every=4", "evaluation.scenes=1")
     assert resumed(copied, *longer, "training.save_every=7").steps == 4
     history, evaluations = (read_jsonl(file) for file in files)
