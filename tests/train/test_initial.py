@@ -22,19 +22,14 @@ def started(recipe):
     return model, initialise(model, recipe)
 
 
-@pytest.fixture
-def learned():
-    """`learned("locus", "a.b=c")`: that tiny model, from a checkpoint of another seed."""
-
-    def make(name, *options):
-        path = f"{name}.safetensors"
-        save(tiny(name, "seed=7").build_model(), path)
-        return tiny(name, f"init_from={path}", *options)
-
-    return make
+def learned(name, *options):
+    """A tiny recipe that starts from a checkpoint of another seed."""
+    path = f"{name}.safetensors"
+    save(tiny(name, "seed=7").build_model(), path)
+    return tiny(name, f"init_from={path}", *options)
 
 
-def test_old_queries_stay_and_new_ones_are_noisy_copies(learned):
+def test_old_queries_stay_and_new_ones_are_noisy_copies():
     for count in (10, 25, 96):
         recipe = learned("locus", f"model.queries.count={count}")
         model, told = started(recipe)
@@ -58,13 +53,13 @@ def test_old_queries_stay_and_new_ones_are_noisy_copies(learned):
                     assert noise.mean() == pytest.approx(0, abs=0.1)
 
 
-def test_weights_that_do_not_fit_are_refused(learned):
+def test_weights_that_do_not_fit_are_refused():
     recipe = learned("tokengs", "model.head.gaussians_per_query=2")
     with pytest.raises(CheckpointError, match=r"model\.head\.gaussians_per_query: 4 \(here 2\)"):
         started(recipe)
 
 
-def test_the_recipes_seed_decides_the_noise(learned):
+def test_the_recipes_seed_decides_the_noise():
     def features(seed):
         torch.rand(seed)  # the global random state plays no part
         model, _ = started(learned("tokengs", "model.queries.count=30", f"seed={seed}"))
@@ -74,7 +69,7 @@ def test_the_recipes_seed_decides_the_noise(learned):
     assert not torch.equal(features(1), features(2))
 
 
-def test_larger_patches_give_the_tokens_of_coarser_images(learned):
+def test_larger_patches_give_the_tokens_of_coarser_images():
     recipe = learned("tokengs", "model.encoder.patch_size=16", "data.image_size=[64, 64]")
     model, told = started(recipe)
     coarse, _ = started(
