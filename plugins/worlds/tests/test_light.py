@@ -22,13 +22,18 @@ THING = Shape(Primitive(s.BOX, (0.0, 0.0, 0.1), (0.2, 0.2, 0.1)))
 LIGHT = 1.5
 
 
+def texture_of(*fields):
+    """One whose fields of these names are 1, and the others 0."""
+    textures = np.zeros(1, s.TEXTURE)
+    textures[[*fields]] = 1.0
+    return textures
+
+
 def seen_from_above(shapes, points, sun=(), ambient=0.0):
     """Light that comes from white shapes below points, to a camera 1 m high."""
     heights = np.zeros((1, 9, 9), np.float32)
     heights[0, 0, 0] = 1.0  # a peak far away
-    textures = np.zeros(1, s.TEXTURE)
-    for field in ("period", "stretch", "colors"):
-        textures[field] = 1.0
+    textures = texture_of("period", "stretch", "colors")
     air = np.zeros(1, s.AIR)
     air["above"] = air["below"] = ambient
     air["occlusion"] = 1.0
@@ -78,9 +83,7 @@ def mean(textures, footprint):
 
 def test_patterns_keep_their_mean_from_afar():
     for kind, width in product(range(s.STRIPES, s.RINGS + 1), (0.15, 0.4, 0.7)):
-        texture = np.zeros(1, s.TEXTURE)
-        for field in ("period", "stretch", "pattern_period", "aspect", "strength"):
-            texture[field] = 1.0
+        texture = texture_of("period", "stretch", "pattern_period", "aspect", "strength")
         texture["pattern"] = kind
         texture["width"] = width
         texture["colors"][0, 3, 0] = 1.0
