@@ -1,6 +1,5 @@
 """What trackers are told, and what a person reads while a model trains."""
 
-import json
 import sys
 import time
 from importlib.machinery import ModuleSpec
@@ -10,7 +9,7 @@ from unittest.mock import MagicMock
 import pytest
 from accelerate import PartialState
 from tables import must_refuse, text_console
-from training_runs import TRAINED, resume, run, tiny
+from training_runs import TRAINED, read_jsonl, resume, run, tiny
 
 from qgs.contracts import MissingExtraError
 from qgs.recipe.recipe import flat
@@ -54,7 +53,7 @@ def test_distributions_offer_trackers_and_one_that_fails_is_left_out(install, ca
     for name in ("opens", "logs"):
         install(f"qgs-{name}", name, f"FAILS = {name!r}\n{FAILING_TRACKER}", **group)
     result = run(tiny("tokengs", "training.trackers=[opens, logs, lines]"))
-    first, *lines = map(json.loads, Path("run/lines.jsonl").read_text().splitlines())
+    first, *lines = read_jsonl(Path("run/lines.jsonl"))
     assert first == [0, {"width": 32}]
     assert lines == [[record["step"], record] for record in result.folder.history()]
     opens, logs = (record.message for record in caplog.records)
