@@ -6,7 +6,7 @@ import numpy as np
 import photo_formats
 import pytest
 import tape_source
-from commands import run_qgs
+from commands import done, run_qgs
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools.candidates import sources
 from tape_source import Tape
@@ -24,8 +24,7 @@ def tapes(tmp_path, install):
 
 def test_check(tapes):
     commands = [f"data check {tapes} --quick --format {kind}" for kind in ("auto", "tapes/tape")]
-    for good in map(run_qgs, commands):
-        assert good.exit_code == 0, good.output
+    for good in map(done, commands):
         assert "2 scenes, 0 errors" in good.output
     refused = str(run_qgs(f"data check {tapes} --format rooms/procedural").exception)
     assert refused.startswith("there is no format 'rooms/procedural': use one of auto, nerfstudio")
@@ -67,8 +66,7 @@ def test_a_source_that_fails_is_told_and_the_others_go_on(tapes, monkeypatch):
 
 
 def test_pack(tapes):
-    packed = run_qgs(f"data pack {tapes} --out {tapes}/chunks --set image_size=[16,16]")
-    assert packed.exception is None, packed.output
+    done(f"data pack {tapes} --out {tapes}/chunks --set image_size=[16,16]")
     scenes = photo_formats.opened(tapes / "chunks", (16, 16), ChunksSource).scenes("train")
     told = [(scene.name, len(scene), scene.held_out) for scene in scenes]
     assert told == [("a", 6, (1, 4)), ("b", 6, (1, 4))]
