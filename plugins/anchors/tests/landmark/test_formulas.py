@@ -17,7 +17,7 @@ from torch.testing import assert_close
 from walk import arc
 
 from qgs.geometry.rays import camera_rays
-from qgs.geometry.transforms import to_camera
+from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.recipe import resolve
 from qgs.tokengs.blocks import split_heads
 from qgs.train.initial import initialise
@@ -57,8 +57,7 @@ def started(**options):
 def in_photos(state, view_N):
     """Depths (B, N, 1) of anchors in these photos, and their pixels there."""
     local = to_camera(state[CENTER], VIEWS.cameras)[:, view_N, torch.arange(len(view_N))]
-    z = local[..., 2:]
-    return z, LENS[:2] * local[..., :2] / z + LENS[2:]
+    return local[..., 2:], to_pixels(local, LENS)
 
 
 def test_anchors_of_all_tokens_stand_on_the_rays_of_their_patches():
