@@ -5,6 +5,7 @@ from random import Random
 
 import numpy as np
 import pytest
+import torch
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.caster.raycast import trace
@@ -12,17 +13,19 @@ from qgs_worlds.caster.shapes import Primitive, Shape, any_turn, packed, rod
 from qgs_worlds.worlds.materials import height_maps
 from scipy.ndimage import map_coordinates
 
+from qgs.geometry.poses import look_at
+
 MAPS = height_maps(3, 2)
 T = np.linspace(0, 6, 6000)
+DOWN = (0.1, 0.2, -1.0)
+"""No way of the tests goes there."""
 
 
 def met(rows, maps, origin, way):
     """t at which a ray o + t d meets a shape, by the one pixel of an image, or inf."""
-    length = np.linalg.norm(way)
-    c2w = np.eye(4)
-    right = np.linalg.svd(np.array([way]))[2][1]
-    c2w[:3] = np.stack([right, np.cross(way, right) / length, way / length, origin], 1)
-    return trace(1, 1, 0, 1, rows, maps, c2w, np.array([100.0, 100.0, 0.5, 0.5]))[0][0, 0] / length
+    c2w = look_at(*torch.tensor(np.stack([origin, way, DOWN]))).numpy()
+    met = trace(1, 1, 0, 1, rows, maps, c2w, np.array([100.0, 100.0, 0.5, 0.5]))
+    return met[0][0, 0] / np.linalg.norm(way)
 
 
 def inside(primitive, points):
