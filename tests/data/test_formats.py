@@ -26,6 +26,7 @@ from upath import UPath
 from qgs.data import PhotosSource
 from qgs.data import photos as formats
 from qgs.data.photos.reader import GROUP
+from qgs.drawing.images import rgb_picture
 
 
 def assert_same(read, photos):
@@ -35,7 +36,7 @@ def assert_same(read, photos):
     assert_allclose(read.cameras.intrinsics, expected, rtol=0, atol=1e-9)
     for i, file in enumerate(photos.files):
         assert Path(read.frame_name(i)).stem == file.stem
-        pixels = read.images([i])[0].mul(255).round().byte().permute(1, 2, 0)
+        pixels = rgb_picture(read.images([i])[0])
         assert np.array_equal(pixels, Image.open(file))
 
 
