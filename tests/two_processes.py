@@ -20,9 +20,8 @@ def train_as(rank, port, tree, folder, *spoiled):
     """What one of the processes does; it ends, and with it the other, at any other error."""
     signal.alarm(240)  # after which processes that wait for each other are ended
     torch.set_num_threads(1)
-    group = {"MASTER_ADDR": "localhost", "MASTER_PORT": port, "WORLD_SIZE": 2}
-    for name, value in {**group, "RANK": rank, "LOCAL_RANK": rank}.items():
-        os.environ[name] = str(value)
+    os.environ |= {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
     AcceleratorState._reset_state(reset_partial_state=True)
     if spoiled:
         spoil(pytest.MonkeyPatch(), *spoiled)
