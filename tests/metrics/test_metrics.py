@@ -58,7 +58,7 @@ def cameras(x, turn=(0.0,)):
     """Cameras along the x axis, turned by radians about y."""
     c2w = along_x(x)
     c2w[: len(turn), :3, :3] = torch.tensor(Rotation.from_euler("y", np.c_[turn]).as_matrix())
-    return pinhole(c2w, [4.0] * 4, (8, 8))[None]
+    return pinhole(c2w, size=(8, 8))[None]
 
 
 def views(x, turn=(0.0,)):

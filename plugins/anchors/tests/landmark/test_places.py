@@ -12,7 +12,7 @@ from qgs_anchors.landmark.sweep import mismatch
 from qgs_locus.fields import CENTER
 from small_parts import made
 from torch.testing import assert_close
-from walk import arc, pinhole
+from walk import along_x, arc, pinhole
 
 from qgs.geometry.rays import camera_rays, pixel_directions
 from qgs.types import ImageMemory, Views
@@ -120,8 +120,7 @@ def photos(count=2):
 
 def test_differences_are_those_of_each_sample_alone():
     """Of ramps that cameras side by side see, by the number of pixels that depths shift them."""
-    c2w = torch.eye(4).double().repeat(1, 2, 1, 1)
-    c2w[0, 1, 0, 3] = 0.2
+    c2w = along_x([0.0, 0.2]).double()[None]
     ramps = torch.tensor([0.01, 0.02])[:, None, None, None] * (torch.arange(32) + 0.5)
     given = Views(ramps.double().expand(1, 2, 3, *WALL_SIZE), photos().cameras.replace(c2w=c2w))
     place = torch.full((2, 2), 0.5).double()
