@@ -18,7 +18,7 @@ model:
   head: {type: qgs/gaussian_head, gaussians_per_query: 4}
   supervision: {type: qgs/layers, layers: [1]}
 """)
-SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
+SMALL = ("model={width: 16, heads: 2, queries: {count: 8}}",)
 
 
 def run_qgs(line, *words, **options):

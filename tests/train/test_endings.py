@@ -69,7 +69,7 @@ def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, monkeypatch):
 
 @pytest.mark.slow
 def test_a_killed_worker_leaves_a_run_that_goes_on():
-    recipe = tiny("tokengs", "training.steps=100", "training.workers=1", "training.save_every=0")
+    recipe = tiny("tokengs", "training={steps: 100, workers: 1, save_every: 0}")
 
     def kill(trainer, stop):
         for child in multiprocessing.active_children():

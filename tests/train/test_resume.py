@@ -118,8 +118,7 @@ def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog
 
 def test_the_clock_goes_on(copied):
     change_counters(copied, seconds=1.0)
-    budget = ("training.steps=200", "training.seconds=1.02", "training.evaluate_every=0")
-    result = resumed(copied, *budget)
+    result = resumed(copied, "training={steps: 200, seconds: 1.02, evaluate_every: 0}")
     seconds = column(result.folder.history(), "seconds")
     assert seconds[3] == 1.0
     assert seconds[4] > 1.0

@@ -31,12 +31,10 @@ from qgs.train.guard import NonFiniteError
 def test_training_lowers_the_loss():
     recipe = tiny(
         "locus",
-        "training.steps=20",
-        "optimizer.warmup=4",
+        "training={steps: 20, collapse_window: 10}",
+        "optimizer={warmup: 4, learning_rate: 4.0e-3}",
         "data.scenes=1",
         "views.mirror=0.0",
-        "optimizer.learning_rate=4e-3",
-        "training.collapse_window=10",
     )
     run(recipe, device="auto")
     falling = losses()

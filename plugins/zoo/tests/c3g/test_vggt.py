@@ -86,9 +86,7 @@ def small(weights):
     """The tiny recipe with VGGT's encoder, as C3G has it."""
     overrides = [
         f"model.encoder={{type: c3g/vggt_features, weights: {weights}}}",
-        "model.width=8",
-        "model.heads=2",
-        "model.queries.count=6",
+        "model={width: 8, heads: 2, queries: {count: 6}}",
         "data.image_size=[28, 42]",
         "optimizer.parts={encoder: 0.01, queries: 0.01}",
     ]
