@@ -9,11 +9,8 @@ import qgs
 from qgs.types import Views
 
 OVERRIDES = [
-    "model.queries.count=12",
-    "model.decoder={depth: 3, layer_scale: 0.1}",
-    "model.head={init_std: 0.3, scale_cap: 0.2}",
-    "model.supervision.layers=[3]",
-    "model.renderer.type=qgs/torch",
+    "model={queries: {count: 12}, decoder: {depth: 3, layer_scale: 0.1}, head: "
+    "{init_std: 0.3, scale_cap: 0.2}, supervision: {layers: [3]}, renderer: {type: qgs/torch}}"
 ]
 
 

@@ -15,9 +15,7 @@ from qgs.contracts import ViewsConfig
 from qgs.data.stream import SampleError, SampleStream, scenes_fingerprint, training_batches
 from qgs.recipe import resolve
 
-ROOMS = resolve(
-    "tiny/tokengs.yaml", ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"]
-)
+ROOMS = resolve("tiny/tokengs.yaml", ["data={image_size: [16, 16], scenes: 5, samples: 1}"])
 SAMPLES = stream_of(ROOMS)
 
 

@@ -83,9 +83,9 @@ def test_larger_patches_give_the_tokens_of_coarser_images():
 
 def test_training_starts_from_a_run(trained_run):
     start = f"init_from={trained_run.folder.path}"
-    still = ("optimizer.learning_rate=1e-9", "optimizer.weight_decay=0.0")
+    still = "optimizer={learning_rate: 1.0e-9, weight_decay: 0.0}"
     console = text_console()
-    grown = tiny("locus", "model.queries.count=32", start, *still)
+    grown = tiny("locus", "model.queries.count=32", start, still)
     result = train(grown, "run", device="cpu", console=console)
     before, after = (r.model.queries.center for r in (trained_run, result))
     assert_equal(after[:COUNT], before, atol=1e-6)

@@ -137,9 +137,9 @@ def test_terms_and_gradients_do_not_depend_on_how_many_views_are_rendered_at_onc
 
 def test_two_passes_have_the_terms_and_gradients_of_the_definition():
     """As one graph, in which the two passes and both comparisons stand written out."""
-    weights = ("objective.alpha_weight=0.1", "objective.depth_weight=0.2")
+    weights = "objective={alpha_weight: 0.1, depth_weight: 0.2}"
     frustum = "losses.frustum={type: globalsplat/frustum, weight: 1}"  # of each pass's own cameras
-    recipe = tiny("locus", *TWO, *weights, frustum)
+    recipe = tiny("locus", *TWO, weights, frustum)
     step, batch = begun(recipe)
     parts = [batch.inputs.select(views) for views in ([0, 1, 3, 4], [0, 2, 4])]
     first, second = (written_out(step, part, batch.targets) for part in parts)
@@ -223,10 +223,8 @@ def test_memory_does_not_grow_with_target_views(monkeypatch):
     # glibc gives freed buffers back, so that the resident set is what the step needs.
     monkeypatch.setenv("MALLOC_MMAP_THRESHOLD_", "65536")
     large = (
-        "model.queries.count=512",
-        "model.head.gaussians_per_query=64",
+        "model={queries: {count: 512}, head: {gaussians_per_query: 64}, encoder: {patch_size: 16}}",
         "data.image_size=[256, 256]",
-        "model.encoder.patch_size=16",
         "training.render_views=2",
     )
     steps = []

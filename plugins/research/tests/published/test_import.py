@@ -103,9 +103,9 @@ def test_a_latent_checkpoint_gives_the_recipe_of_its_preset():
 def test_every_ablation_has_a_published_name_for_each_parameter():
     recipes = [*RECIPES.glob("ablations/*.yaml")]
     assert len(recipes) == 11
-    shallow = "model.encoder.depth=2", "model.decoder.depth=2", "model.supervision.layers=[2]"
+    shallow = "model={encoder: {depth: 2}, decoder: {depth: 2}, supervision: {layers: [2]}}"
     for recipe in recipes:
-        known = names_of(resolve(recipe, shallow))
+        known = names_of(resolve(recipe, [shallow]))
         assert known.published.keys() == known.shapes.keys()
         assert not {*known.unused} & {*known.published.values()}
 

@@ -26,9 +26,10 @@ model:
   centers: {type: locus/radius_scaled}
   supervision: {layers: [2, 3]}
 """)
-FIXED_CENTERS = ("model.queries.radius=false", "model.decoder.refinement.radius=false",
-                 "model.decoder.cross_attention.bandwidth=fixed",
-                 "model.centers={type: locus/anchor_offset}")  # fmt: skip
+FIXED_CENTERS = (
+    "model={queries: {radius: false}, centers: {type: locus/anchor_offset}, "
+    "decoder: {refinement: {radius: false}, cross_attention: {bandwidth: fixed}}}",
+)
 
 
 def published(*overrides):
