@@ -23,7 +23,7 @@ data.image_size=[16,16] views.targets=2 evaluation.scenes=2
 training.steps=3 training.seconds=null optimizer.warmup=2
 """
 QUIET = Console(quiet=True)
-TRAINED = ("training.ema=0.5", "training.evaluate_every=2")
+TRAINED = "training={ema: 0.5, evaluate_every: 2}"
 TWO = (
     "plugins=[rooms, locus, globalsplat]",
     "objective.type=globalsplat/two_passes",
@@ -46,9 +46,9 @@ resume = partial(run, resume=True)
 
 @pytest.fixture(scope="session")
 def trained_run(tmp_path_factory):
-    """A finished run of `tiny("locus", *TRAINED)`, 3 steps; a test that changes it takes a copy."""
+    """A finished run of `tiny("locus", TRAINED)`, 3 steps; a test that changes it takes a copy."""
     torch.set_num_threads(1)
-    return run(tiny("locus", *TRAINED), tmp_path_factory.mktemp("trained") / "run")
+    return run(tiny("locus", TRAINED), tmp_path_factory.mktemp("trained") / "run")
 
 
 def run_calling(after_step, recipe, folder="run", resume=False):

@@ -71,7 +71,7 @@ def test_good_weights_are_the_older_of_two_copies_made_before_the_images_got_wor
 
 
 def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights():
-    recipe = tiny("tokengs", "training.steps=40", "training.collapse_window=10")
+    recipe = tiny("tokengs", "training={steps: 40, collapse_window: 10}")
     after = {}
 
     def die(trainer, stop):
@@ -90,9 +90,9 @@ def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights():
 
 
 def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end():
-    options = ("training.collapse_window=10", "training.save_every=1")
+    options = "training={collapse_window: 10, save_every: 1}"
     for steps, dead in ((400, 10), (3, 3)):
-        recipe = tiny("tokengs", INVISIBLE, f"training.steps={steps}", *options)
+        recipe = tiny("tokengs", INVISIBLE, f"training.steps={steps}", options)
         folder = RunFolder(str(steps))
         words = f"for the last {dead} steps the renderings are empty"
         must_refuse(words, run, recipe, folder.path, kind=CollapseError)

@@ -44,7 +44,7 @@ def test_two_processes_continue_what_one_began():
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("locus", (*TWO, "training.batch_size=4", "training.accumulate=2")),
+        ("locus", (*TWO, "training={batch_size: 4, accumulate: 2}")),
         ("tokengs", NO_LAYERS),  # keys that nothing reads
     ],
 )

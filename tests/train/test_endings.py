@@ -31,7 +31,7 @@ from qgs.train.folder import RunFolder
 from qgs.train.guard import OutOfMemoryError
 from qgs.train.tracking import TrainingProgress
 
-LONGER = tiny("locus", *TRAINED, "training.steps=4")
+LONGER = tiny("locus", TRAINED, "training.steps=4")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -57,10 +57,10 @@ def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, monkeypatch):
 
     with monkeypatch.context() as patch:
         change_samples(patch, broken)
-        recipe = tiny("locus", *TRAINED, "training.evaluate_every=0")
+        recipe = tiny("locus", TRAINED, "training.evaluate_every=0")
         error = must_refuse("the disk is gone", run, recipe, kind=OSError)
     assert error.__notes__ == ["The run is saved at step 2; continue with --resume"]
-    assert resume(tiny("locus", *TRAINED)).resumed_at == 2
+    assert resume(tiny("locus", TRAINED)).resumed_at == 2
     whole = trained_run.folder.path
     assert_equal_runs("run", whole)
     first, second = (read_jsonl(folder / "evaluations.jsonl") for folder in (Path("run"), whole))
@@ -178,5 +178,5 @@ def test_a_start_that_fails_leaves_no_folder(here):
     nowhere = "data={type: qgs/photos, path: nowhere, image_size: [32, 32]}"
     must_not_find("nowhere", run, tiny("tokengs", nowhere))
     must_refuse(r"optimizer\.warmup", run, tiny("tokengs", "optimizer.warmup=3"))
-    must_refuse(r"views\.gap", run, tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"))
+    must_refuse(r"views\.gap", run, tiny("tokengs", "views={inputs: 9, gap: [2, 3]}"))
     assert not [*here.iterdir()]

@@ -42,7 +42,7 @@ class Killed(BaseException):
 
 def resumed(folder, *options):
     """Continue a copy of `trained_run`."""
-    return resume(tiny("locus", *TRAINED, *options), folder)
+    return resume(tiny("locus", TRAINED, *options), folder)
 
 
 def change_counters(folder, **values):
@@ -102,7 +102,7 @@ def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog
     for file in files:
         file.write_text(f'{{"step": 2, "lo\n[1]\n{file.read_text()}{{"step": 4}}\n')
     in_halves = shutil.copytree(copied, copied.with_name("halves"))
-    longer = ("training.steps=4", "training.evaluate_every=4", "evaluation.scenes=1")
+    longer = ("training={steps: 4, evaluate_every: 4}", "evaluation.scenes=1")
     assert resumed(copied, *longer, "training.save_every=7").steps == 4
     history, evaluations = (read_jsonl(file) for file in files)
     assert column(history, "step") == [1, 2, 3, 4]

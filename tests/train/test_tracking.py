@@ -74,7 +74,7 @@ def test_tensorboard_gets_what_the_history_gets_and_drops_what_was_lost(copied):
     """Of a resumed run: as if it had been told of steps that came after the last save."""
     name = "tensorboard.backend.event_processing.event_accumulator"
     module = pytest.importorskip(name, reason="the extra `tensorboard` is not installed")
-    recipe = tiny("locus", *TRAINED, "training.trackers=[tensorboard]", "training.steps=4")
+    recipe = tiny("locus", TRAINED, "training={trackers: [tensorboard], steps: 4}")
     lost = Trackers(("tensorboard",))
     lost.open(copied, flat(recipe.tree), 0)
     for step in range(1, 6):

@@ -43,7 +43,7 @@ def test_training_lowers_the_loss():
 
 def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
     folder = trained_run.folder
-    assert resolve(folder.recipe).tree == tiny("locus", *TRAINED).tree
+    assert resolve(folder.recipe).tree == tiny("locus", TRAINED).tree
     history = folder.history()
     assert column(history, "step") == [1, 2, 3]
     assert {"psnr", "lr", "seconds", "gradient"} <= history[0].keys()
@@ -69,7 +69,7 @@ def test_averages_and_evaluations_leave_the_training_alone(trained_run):
 
 def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run):
     folder = trained_run.folder
-    recipe = tiny("locus", *TRAINED)
+    recipe = tiny("locus", TRAINED)
     records = read_jsonl(folder.path / "evaluations.jsonl")
     told = [(r["step"], r["weights"], r["scenes"]) for r in records]
     assert told == [(step, weights, 2) for step in (2, 3) for weights in ("raw", "ema")]
@@ -95,7 +95,7 @@ def test_bf16_trains_with_finite_numbers():
 
 
 def test_a_time_budget_ends_the_run():
-    recipe = tiny("tokengs", "training.steps=200", "training.seconds=0.1")
+    recipe = tiny("tokengs", "training={steps: 200, seconds: 0.1}")
     result = run(recipe)
     assert 0.1 <= result.seconds < 10.0
     history = result.folder.history()
@@ -110,8 +110,8 @@ def test_a_time_budget_ends_the_run():
 def test_bad_steps_are_skipped_on_demand(monkeypatch, caplog):
     """By a run from its start, and by one that a bad step ended."""
     spoil(monkeypatch, {2, 6}, nan=True)
-    options = ("training.steps=4", "training.ema=0.9")
-    skipping = tiny("locus", *options, "training.on_nonfinite=skip")
+    options = "training={steps: 4, ema: 0.9}"
+    skipping = tiny("locus", options, "training.on_nonfinite=skip")
     through = Path("through")
     run(skipping, through)
     told = [r.message.split(" is ")[0] for r in caplog.records if "is skipped" in r.message]
@@ -121,7 +121,7 @@ def test_bad_steps_are_skipped_on_demand(monkeypatch, caplog):
     assert ["skipped" in r for r in records] == [False, True, False, True]
     assert column(curves_of(through / "checkpoint.safetensors"), "step") == [1, 3]
     assert parts_of(through)["guard"]["skipped"] == 1  # a good step lies between the two
-    recipe = tiny("locus", *options)
+    recipe = tiny("locus", options)
     for begin in (run, resume):
         place = r"targets\.images \(1 of"
         told = str(must_refuse(place, begin, recipe, kind=NonFiniteError))
@@ -147,6 +147,6 @@ def test_a_bad_gradient_ends_the_run_too(monkeypatch):
 def test_skipping_comes_to_an_end(monkeypatch):
     spoil(monkeypatch, range(2, 100), nan=True)
     monkeypatch.setattr("qgs.train.guard.MAX_SKIPPED", 2)
-    recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
+    recipe = tiny("tokengs", "training={on_nonfinite: skip, steps: 50}")
     must_refuse("most 2 steps in a row", run, recipe, kind=NonFiniteError)
     assert len(read_jsonl(Path("run/history.jsonl"))) == 3
