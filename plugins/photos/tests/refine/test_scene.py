@@ -201,8 +201,8 @@ SENSELESS = """
 --scale-by 0.png 9.png 1 | no photo 9
 --scale-by 0.png 0.png 1 | needs two points
 --scale-by 0.png 8.png 0 | needs two points
---scale-by 0.png 8.png:48,3 1 | 48 x 32 pixels
---scale-by 0.png:a 8.png 1 | not NAME:X,Y
+--scale-by 0.png 8.png:48,3 1 | outside of 48 x 32 pixels
+--scale-by 0.png:a 8.png 1 | no photo 0.png:a
 """
 
 

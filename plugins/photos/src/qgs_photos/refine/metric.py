@@ -1,6 +1,7 @@
 """Real size of a scene, from a distance that the user has measured."""
 
 import math
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,9 @@ from qgs_photos.viewing import VIEWER
 Distance = tuple[str, str, float]
 """Two points and their distance in metres. A point is the name of a photo, which stands for its
 camera, or NAME:X,Y for what the photo shows X pixels from its left and Y from its upper edge."""
+
+
+_POINT = re.compile(r"^(.*?)(?::(\d+),(\d+))?$")
 
 
 class Point(NamedTuple):
@@ -40,21 +44,18 @@ def points_of(distance: Distance, photos: Scene) -> tuple[Point, Point]:
 
 
 def _point(text: str, photos: Scene) -> Point:
-    name, _, pixel = text.partition(":")
+    name, x, y = _POINT.findall(text)[0]
     frames = {Path(photos.frame_name(frame)).name: frame for frame in range(len(photos))}
     if name not in frames:
         raise ValueError(f"--scale-by: no photo {name}; {did_you_mean(name, frames, 'photos')}")
     frame = frames[name]
-    if not pixel:
+    if not x:
         return Point(frame, None)
     height, width = photos.stored_size(frame) or photos.cameras.size
-    try:
-        x, y = map(float, pixel.split(","))
-    except ValueError:
-        x = y = math.nan
-    if not (0 <= x < width and 0 <= y < height):
-        raise ValueError(f"--scale-by: {text} is not NAME:X,Y in {width} x {height} pixels")
-    return Point(frame, (x / width, y / height))
+    place = int(x) / width, int(y) / height
+    if max(place) >= 1:
+        raise ValueError(f"--scale-by: {text} is outside of {width} x {height} pixels")
+    return Point(frame, place)
 
 
 def metres(distance: Distance, gaussians: Gaussians, cameras: Cameras, photos: Scene) -> float:

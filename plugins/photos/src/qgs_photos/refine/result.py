@@ -121,10 +121,7 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
         lines.append(
             f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
             f"{mean['ssim']:.3f}, alpha {mean['alpha']:.3f}; a copy of the nearest photo: PSNR "
-            f"{mean['nearest_input']:.2f} dB"
-        )
-        lines.append(
-            f"mean error of their colours {mean['error']:.3f}, expected "
+            f"{mean['nearest_input']:.2f} dB; mean error of colours {mean['error']:.3f}, expected "
             f"{mean['expected_error']:.3f}"
         )
         if " --adjust exposure" in result.command:
@@ -178,8 +175,8 @@ def page_of(result: Result, record: Mapping[str, Any]) -> str:
     if mean := record["mean"]:
         note += f"; held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}"
     title = Path(result.photos.path).resolve().name
-    evidence = result.evidence
-    errors = [error_picture(evidence.error_map(stop.cameras)) for stop in each_view(stops)]
+    maps = (result.evidence.error_map(stop.cameras) for stop in each_view(stops))
+    errors = [*map(error_picture, maps)]
     tour = Tour(title, note, stops, names, len(best), refined.cameras, errors)
     return gaussians_html(refined.gaussians, tour)
 
@@ -257,12 +254,12 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
     every = -(-len(rows) // _SHOWN)
     views = result.judged.select(slice(None, None, every))
     renders = result.render(views).rgb[0]
-    errors = [result.evidence.error_map(view.cameras) for view in each_view(views)]
+    expected = (result.evidence.error_map(view.cameras) for view in each_view(views))
     pictures = {
         "photo": [rgb_picture(image) for image in views.images[0]],
         "render": [rgb_picture(image) for image in renders],
-        "error": [error_picture(error) for error in errors_of(renders, views.images[0])],
-        "expected error": [error_picture(error) for error in errors],
+        "error": [*map(error_picture, errors_of(renders, views.images[0]))],
+        "expected error": [*map(error_picture, expected)],
     }
     titles = [f"{Path(row['photo']).name}\n{row['psnr']:.2f} dB" for row in rows[::every]]
     return figure_picture(grid_figure(pictures, titles), 120)
