@@ -14,6 +14,7 @@ from qgs.domain import WORDS, shown
 from qgs.files import AnyPath
 from qgs.model import QueryGaussianModel
 from qgs.recipe.yaml_text import dump
+from qgs.terminal import without_secrets
 
 SCORES = Path("evaluation", "table.md")
 """Table of scores, relative to the folder of a checkpoint, as `qgs eval` writes it."""
@@ -42,6 +43,9 @@ class HubCheckpoint(ModelHubMixin):
         with CheckpointFile(name) as file:
             self._facts = "\n".join(_facts(file))
             self._file = file.path
+            text = dump(file.recipe.tree)
+            if without_secrets(text) != text:
+                raise ValueError(f"{name} is not uploaded: its recipe has a URL with a password")
             # what config.json gets; else the mixin writes the arguments, with a path
             self._hub_mixin_config = dict(file.recipe.tree)
         self._license = license
@@ -59,10 +63,16 @@ class HubCheckpoint(ModelHubMixin):
         return ModelCard(f"---\n{data.to_yaml()}\n---\n\n{facts}\n")
 
     @classmethod
-    def _from_pretrained(cls, *, model_id: str, **options: Any) -> QueryGaussianModel:
-        if os.path.isdir(model_id):
-            return load(Path(model_id, CHECKPOINT))
-        return load(hf_hub_download(model_id, CHECKPOINT, **options))
+    def _from_pretrained(
+        cls, *, model_id: str, device: Any, gaussians: int | None, **options: Any
+    ) -> QueryGaussianModel:
+        folder = os.path.isdir(model_id)
+        file = (
+            Path(model_id, CHECKPOINT)
+            if folder
+            else hf_hub_download(model_id, CHECKPOINT, **options)
+        )
+        return load(file, device, gaussians=gaussians)
 
 
 def _facts(file: CheckpointFile) -> Iterator[str]:
@@ -82,21 +92,24 @@ def _facts(file: CheckpointFile) -> Iterator[str]:
 
 
 def push_to_hub(name: AnyPath, repo_id: str, *, license: str, **options: Any) -> str:
-    """Upload a checkpoint, its recipe and its card to a repository of the Hub; return the URL.
+    """Upload a checkpoint, its recipe and its card to the Hub; return the URL of the commit.
 
     name: as for `qgs.load`. license: identifier of the licence, such as "apache-2.0". options: as
-    for `ModelHubMixin.push_to_hub`, such as private=True. Raises the errors of `CheckpointFile` and
-    of huggingface_hub.
+    for `ModelHubMixin.push_to_hub`, such as private=True. Raises ValueError for a recipe with a
+    password, and the errors of `CheckpointFile` and huggingface_hub.
     """
     return HubCheckpoint(name, license).push_to_hub(
         repo_id, model_card_kwargs={"repo_id": repo_id}, **options
     )
 
 
-def from_pretrained(repo_id: str, **options: Any) -> QueryGaussianModel:
+def from_pretrained(
+    repo_id: str, device: Any = None, *, gaussians: int | None = None, **options: Any
+) -> QueryGaussianModel:
     """Load the model in a repository of the Hub, or in a folder with the files of one.
 
-    options: as for `ModelHubMixin.from_pretrained`, such as revision="v1". Raises the errors of
-    `qgs.load` and of huggingface_hub.
+    device, gaussians: as for `qgs.load`. options: as for `ModelHubMixin.from_pretrained`, such as
+    revision="v1". Raises the errors of `qgs.load` and of huggingface_hub.
     """
-    return cast(Any, HubCheckpoint).from_pretrained(repo_id, **options)
+    hub = cast(Any, HubCheckpoint)
+    return hub.from_pretrained(repo_id, device=device, gaussians=gaussians, **options)

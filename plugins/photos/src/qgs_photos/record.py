@@ -90,3 +90,12 @@ def _parsed(folder: Path, data: dict[str, Any]) -> Record:
         ),
         renderer=AutoRenderer.Config.model_validate(options),
     )
+
+
+def factor_of(file: Path) -> float:
+    """Return by how much positions in a scene's file are larger than in its photos' world.
+
+    `qgs scene` notes this in metrics.json beside the file; it is 1 for other files.
+    """
+    record = file.with_name("metrics.json")
+    return json.loads(record.read_bytes()).get("factor", 1.0) if record.is_file() else 1.0

@@ -39,15 +39,17 @@ def test_floaters_go_if_held_out_photos_do_not_show_them():
     near = moved(ball((0.1, 0.0, 0.4), 0.02), whole.cameras.c2w[0, 0], 1.0)
     both = concatenated([near, given], 1)
     found = evidence(both, whole)
-    cleaned = found.cleaned(held_out, 0)
+    cleaned = found.cleaned(held_out)
     assert torch.equal(cleaned.gaussians.means, given.means)
     assert quality(cleaned.gaussians, held_out) > quality(both, held_out)
     # surroundings, which come first, stay, and so does what photos do show
-    assert found.cleaned(held_out, 1).gaussians.count == 61
+    assert evidence(both, whole, 1).cleaned(held_out).gaussians.count == 61
     shown = evidence(both, shots(both, range(0, 90, 15)))
-    assert shown.cleaned(shots(both, [5.0, 50.0]), 0).gaussians.count == 61
-    # without held-out photos nothing tells
-    assert found.cleaned(held_out.select([]), 0).gaussians.count == 61
+    assert shown.cleaned(shots(both, [5.0, 50.0])).gaussians.count == 61
+    # nor do four photos of them tell, or none that is held out
+    few = evidence(both, whole.select([0, 1, 2, 3]))
+    assert few.cleaned(held_out).gaussians.count == 61
+    assert found.cleaned(held_out.select([])).gaussians.count == 61
 
 
 def center(found, degree):
@@ -85,10 +87,12 @@ def test_errors_are_larger_where_photos_differ_and_as_large_as_held_out_ones():
 
 
 def test_a_point_of_a_photo_lies_on_the_surface_there():
-    """In the middle of the photo, at the front camera's distance; and the camera itself."""
-    wide = ball(size=1e-3).replace(scales=torch.tensor([[[0.5, 0.5, 1e-3]]]))
+    """Below the middle of the photo, before what is far behind it; and the camera itself."""
+    scales = torch.tensor([[[0.5, 0.5, 1e-3]]])
+    wide = ball().replace(scales=scales, opacities=torch.ones(1, 1))
     cameras = shots(wide, [0.0, 90.0]).cameras
     found = located(Point(0, (0.5, 0.75)), wide, cameras)
     axis = cameras.c2w[0, 0, :3, 1]
     assert_equal(found, 0.5 * axis, atol=0.03)
     assert torch.equal(located(Point(1, None), wide, cameras), cameras.c2w[0, 1, :3, 3])
+    assert located(Point(0, (0.0, 0.0)), ball(), cameras).isnan().all()

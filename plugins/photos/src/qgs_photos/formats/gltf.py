@@ -35,7 +35,7 @@ UPRIGHT = "upright"
 """Extra of the asset: the pose (4, 4) from the world of the Gaussians to that of the file."""
 FLIGHT = "flight"
 """Name of the camera that moves, and of its animation."""
-FEATURE = "_FEATURE_"
+FEATURE = "_QGS_FEATURE_"
 """Name of an attribute for a channel of features, before the channel's index."""
 NEAREST = 0.01
 """Distance of the near plane, as a fraction of the cameras' distance from the scene's middle."""
@@ -167,7 +167,7 @@ def _ground(gaussians: Gaussians, c2w: Tensor, upright: Tensor) -> float:
     eyes = c2w[:, :3, 3].mean(0)
     away = (points - eyes).norm(dim=-1)
     heights = points[away < _AROUND * away.median(), 1]
-    return float(heights.quantile(_LOWEST))
+    return float(np.quantile(heights, _LOWEST))
 
 
 def _lens(camera: Cameras, near: float) -> dict[str, Any]:

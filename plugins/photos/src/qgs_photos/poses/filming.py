@@ -1,6 +1,5 @@
 """Render videos of Gaussians along a camera path, as mp4 or WebP."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +22,7 @@ from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Size, World
 from qgs_photos.poses.paths import KINDS, focal_length, path_of, read_path
-from qgs_photos.record import GAUSSIANS, has_record, read_record
+from qgs_photos.record import GAUSSIANS, factor_of, has_record, read_record
 from qgs_photos.viewing import VIEWER, in_own_world
 
 SUFFIXES = (".mp4", ".webp")
@@ -165,9 +164,7 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
         raise ValueError(f"{file} holds no cameras: name the photos, `qgs video {source} PHOTOS`")
     gaussians = load_ply(file)
     cameras = photo_scene(photos, None, name).cameras.to(torch.float64)
-    if (record := file.with_name("metrics.json")).is_file():
-        factor = json.loads(record.read_bytes()).get("factor", 1.0)
-        cameras = cameras.replace(c2w=scaled(cameras.c2w, factor))
+    cameras = cameras.replace(c2w=scaled(cameras.c2w, factor_of(file)))
     # near of renderers is made for worlds in which what is seen is about 1 away
     w2c = torch.linalg.inv(cameras.c2w[0])
     depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]

@@ -27,7 +27,8 @@ _LARGEST_ANGLE = 1.0
 # Least error in photos, and error where no Gaussian is if photos show no such place.
 _LEAST = 0.003
 _EMPTY = 0.3
-# Floaters: their depth over the median depth of a photo, at most, and photos that show them.
+# Floaters: their depth over the median depth of Gaussians that a photo shows, at most, and the
+# number of photos that show them.
 _NEAR = 0.3
 _FEW = 2
 
@@ -39,7 +40,7 @@ class Evidence:
     gaussians: (1, G). eyes: centres of the photos' cameras (P, 3). shown: which photos show which
     Gaussians (P, G). floating: Gaussians near a camera that few photos show (G,). errors: errors to
     expect in views from the directions of the photos (G,). empty: the error to expect where no
-    Gaussian is.
+    Gaussian is. scale: factor of these errors that `calibrated` has found.
     """
 
     gaussians: Gaussians
@@ -48,6 +49,7 @@ class Evidence:
     floating: Tensor
     errors: Tensor
     empty: Tensor
+    scale: float = 1.0
 
     def error_map(self, cameras: Cameras) -> Tensor:
         """Return the error to expect in each pixel of the render from a camera (1, 1): (H, W).
@@ -76,16 +78,14 @@ class Evidence:
             found += float(errors_of(rgb, view.images).mean())
         count = judged.images.shape[1]
         scale = (found / expected) ** (count / (count + 0.5)) if count else 1.0
-        return replace(self, errors=scale * self.errors, empty=scale * self.empty)
+        return replace(self, errors=scale * self.errors, empty=scale * self.empty, scale=scale)
 
-    def cleaned(self, judged: Views, surroundings: int) -> "Evidence":
+    def cleaned(self, judged: Views) -> "Evidence":
         """Return a copy without floating Gaussians, unless photos that were left out get worse.
 
         judged: these photos, (1, H); without any, or if their mean PSNR falls, nothing changes.
-        surroundings: number of the first Gaussians, which stay.
         """
         keep = ~self.floating
-        keep[:surroundings] = True
         kept = replace(
             self,
             gaussians=self.gaussians[:, keep],
@@ -108,25 +108,37 @@ def errors_of(rgb: Tensor, images: Tensor) -> Tensor:
     return (rgb.clamp(0, 1) - images).abs().mean(-3)
 
 
-def evidence(gaussians: Gaussians, views: Views) -> Evidence:
-    """Gather the evidence on Gaussians (1, G) from photos (1, V), at most MOST of them."""
+def evidence(gaussians: Gaussians, views: Views, surroundings: int = 0) -> Evidence:
+    """Gather the evidence on Gaussians (1, G) from photos (1, V), at most MOST of them.
+
+    surroundings: number of the first Gaussians, which stand for what is far behind all others; they
+    never float.
+    """
     photos = views.images.shape[1]
     compared = evenly(range(photos), MOST)
-    shares = [_shares(gaussians, views.select([photo])) for photo in compared]
-    weights, sums, depths = torch.stack([share for share, _ in shares]).unbind(1)
-    holes, missed = torch.stack([hole for _, hole in shares]).sum(0)
-    shown = weights > _SHOWN
+    sums = gaussians.means.new_zeros(2, gaussians.count)
+    shown = sums.new_zeros(len(compared), gaussians.count).bool()
+    near = sums[0].bool()
+    holes = sums.new_zeros(2)
+    for place, photo in enumerate(compared):
+        view = views.select([photo])
+        weights, empty = _weights(gaussians, view)
+        shown[place] = weights[0] > _SHOWN
+        depths = to_camera(gaussians.means, view.cameras)[0, 0, surroundings:, 2]
+        seen = shown[place, surroundings:]
+        near[surroundings:] |= seen & (depths < _NEAR * depths[seen].median())
+        sums += weights
+        holes += empty
+    weights, errors = sums
     # as if one more pixel had the usual error
-    errors = (sums.sum(0) + sums.sum() / weights.sum().clamp_min(1)) / (weights.sum(0) + 1)
+    errors = (errors + errors.sum() / weights.sum().clamp_min(1)) / (weights + 1)
     count = shown.sum(0) * photos / len(compared)
-    return Evidence(
-        gaussians,
-        views.cameras.c2w[0, compared, :3, 3],
-        shown,
-        (shown & (depths < _NEAR)).any(0) & (shown.sum(0) <= _FEW),
-        _FACTOR * (errors + _LEAST) * (1 + count) ** _OF_COUNT,
-        (missed + _EMPTY) / (holes + 1),
-    )
+    # where hardly more photos exist, they say nothing
+    floating = near & (count <= _FEW) & (photos > 2 * _FEW)
+    errors = _FACTOR * (errors + _LEAST) * (1 + count) ** _OF_COUNT
+    eyes = views.cameras.c2w[0, compared, :3, 3]
+    holes, missed = holes
+    return Evidence(gaussians, eyes, shown, floating, errors, (missed + _EMPTY) / (holes + 1))
 
 
 def each_view(views: Views) -> Iterator[Views]:
@@ -134,22 +146,17 @@ def each_view(views: Views) -> Iterator[Views]:
     return (views.select([view]) for view in range(views.images.shape[1]))
 
 
-def _shares(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor]:
-    """Return what a photo (1, 1) shows of each of G Gaussians, (3, G), and of empty places, (2,).
+def _weights(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor]:
+    """Return sums over the pixels of a photo (1, 1), of each of G Gaussians and of empty places.
 
-    The rows are the sums over pixels of a Gaussian's weight, and of the weight times the error of
-    the render; and its depth in units of the photo's median depth. The first two are given for
-    empty places, too.
+    The sums are those of the weight, and of the weight times the error of the render: (2, G), (2,).
     """
     with torch.enable_grad():
         features = gaussians.means.new_zeros(1, gaussians.count, 2).requires_grad_()
         render = VIEWER(replace(gaussians, features=features), view.cameras)
         errors = errors_of(render.rgb.detach(), view.images)[0, 0]
-        sums = (render.features[0, 0] * torch.stack([torch.ones_like(errors), errors])).sum()
+        factors = torch.stack([torch.ones_like(errors), errors])
         # the derivatives by features are weights
-        (weights,) = torch.autograd.grad(sums, features)
-    depths = to_camera(gaussians.means, view.cameras)[0, 0, :, 2]
-    usual = render.depth.detach()[render.alpha > 0.5].median()
-    empty = 1 - render.alpha.detach()[0, 0, 0]
-    shares = torch.stack([*weights[0].T, depths / usual])
-    return shares, torch.stack([empty.sum(), (empty * errors).sum()])
+        (weights,) = torch.autograd.grad((render.features[0, 0] * factors).sum(), features)
+    empty = (1 - render.alpha.detach())[0, 0]
+    return weights[0].T, (empty * factors).sum((1, 2))

@@ -56,6 +56,8 @@ class FreeGaussians:
                 {"params": [value], "name": name, "lr": rates[name]}
                 for name, value in self.values.items()
             ],
+            # what other photos asked for is soon forgotten
+            betas=(0.9, 0.97),
             eps=1e-15,
             fused=True,
         )

@@ -5,9 +5,11 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from qgs.contracts import Scene
+from qgs.data.images import CropResize
 from qgs.geometry.poses import scaled
 from qgs.types import Cameras, Gaussians, World
 from qgs.wording import did_you_mean, warn_once
@@ -25,7 +27,8 @@ _POINT = re.compile(r"^(.*?)(?::(\d+),(\d+))?$")
 class Point(NamedTuple):
     """A point of a distance: the camera of a photo, or what is at a pixel (x, y) of the photo.
 
-    frame: index of the photo. place: x and y from 0 to 1, from the photo's left upper corner.
+    frame: index of the photo. place: x and y from 0 to 1, from the left upper corner of the part of
+    the photo that is used.
     """
 
     frame: int
@@ -45,44 +48,57 @@ def points_of(distance: Distance, photos: Scene) -> tuple[Point, Point]:
 
 def _point(text: str, photos: Scene) -> Point:
     name, x, y = _POINT.findall(text)[0]
-    frames = {Path(photos.frame_name(frame)).name: frame for frame in range(len(photos))}
-    if name not in frames:
-        raise ValueError(f"--scale-by: no photo {name}; {did_you_mean(name, frames, 'photos')}")
-    frame = frames[name]
+    names = [photos.frame_name(frame) for frame in range(len(photos))]
+    found = [frame for frame, own in enumerate(names) if name in (own, Path(own).name)]
+    if len(found) != 1:
+        hint = did_you_mean(name, names, "photos")
+        raise ValueError(f"--scale-by: {len(found)} photos are named {name}; {hint}")
+    frame = found[0]
     if not x:
         return Point(frame, None)
-    height, width = photos.stored_size(frame) or photos.cameras.size
-    place = int(x) / width, int(y) / height
-    if max(place) >= 1:
-        raise ValueError(f"--scale-by: {text} is outside of {width} x {height} pixels")
+    size = photos.cameras.size
+    left, top, right, bottom = CropResize(photos.stored_size(frame) or size, size).box
+    place = (float(x) - left) / (right - left), (float(y) - top) / (bottom - top)
+    if not all(0 <= part < 1 for part in place):
+        raise ValueError(
+            f"--scale-by: {text} is outside of what is used of the photo: x from {left:.0f} to "
+            f"{right:.0f}, y from {top:.0f} to {bottom:.0f}"
+        )
     return Point(frame, place)
 
 
-def metres(distance: Distance, gaussians: Gaussians, cameras: Cameras, photos: Scene) -> float:
+def metres(
+    points: tuple[Point, Point], length: float, gaussians: Gaussians, cameras: Cameras
+) -> float:
     """Return how many metres a unit of the world of Gaussians (1, G) is.
 
-    cameras: of all photos in this world, (1, F). If both points are at one place, warns and returns
-    1. Raises the errors of `points_of`.
+    length: metres between the points. cameras: of all photos in this world, (1, F). If a point
+    shows nothing, or both are at one place, warns and returns 1.
     """
-    start, end = (located(point, gaussians, cameras) for point in points_of(distance, photos))
-    apart = float((start - end).norm())
-    if not apart:
-        warn_once("--scale-by has no effect: both points are at the same place")
+    start, end = (located(point, gaussians, cameras) for point in points)
+    apart = float((end - start).norm())
+    if not apart > 0:
+        warn_once("--scale-by has no effect: a point shows nothing, or both are at one place")
         return 1.0
-    return distance[-1] / apart
+    return length / apart
 
 
 def located(point: Point, gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return a point in the world of Gaussians (1, G) and all photos' cameras (1, F): (3,)."""
+    """Return a point in the world of Gaussians (1, G) and all photos' cameras (1, F): (3,).
+
+    NaN for a pixel in which the Gaussians are mostly transparent.
+    """
     camera = cameras[:, [point.frame]]
     centre = camera.c2w[0, 0, :3, 3]
     if point.place is None:
         return centre
     pixel = centre.new_tensor(point.place) * centre.new_tensor(camera.size).flip(0)
     column, row = pixel.long().tolist()
-    depth = VIEWER(gaussians, camera).depth[0, 0, 0, row, column]
+    render = VIEWER(gaussians, camera)
+    depth, alpha = torch.cat([render.depth, render.alpha], 2)[0, 0, :, row, column]
     x, y = pixel - 0.5
-    return centre + depth * pixel_rays(camera, 0, y, x)
+    place = centre + depth * pixel_rays(camera, 0, y, x)
+    return place.where(alpha > 0.5, math.nan)
 
 
 def in_metres(world: World, factor: float) -> World:

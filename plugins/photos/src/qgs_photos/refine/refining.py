@@ -29,21 +29,22 @@ from qgs_photos.refine.sweeping import swept
 
 _RATES = {
     # Of the scene's size.
-    "means": 3.5e-3,
-    "log_scales": 2e-2,
-    "quats": 5e-3,
-    "opacity_logits": 0.05,
-    "color_logits": 2.5e-2,
+    "means": 6e-3,
+    "log_scales": 3.4e-2,
+    "quats": 8.5e-3,
+    "opacity_logits": 0.085,
+    "color_logits": 4.25e-2,
     # Beside `sh`: as the logits move a colour of one half.
-    "colors": 6e-3,
+    "colors": 1e-2,
     # A twentieth of the logits', as 3DGS has it.
-    "sh": 1.25e-3,
+    "sh": 2.1e-3,
     # Features are kept as they are.
     "features": 0.0,
 }
-# Final learning rates over the first.
-_LAST = 0.1
-_LAST_OF_MEANS = 0.01
+# Final learning rates over the first. Rates begin with half, until this part of the budget.
+_LAST = 0.28
+_LAST_OF_MEANS = 0.028
+_WARM = 0.15
 # Weight of SSIM beside the mean squared error.
 _SSIM = 0.25
 # Weight of mean opacity and mean scale: at least the first, else the second over the number of
@@ -222,9 +223,10 @@ class _Run:
         Returns the loss and the PSNR before the step.
         """
         used = min(self.begin + (1 - self.begin) * self.spent / self.seconds, 1.0)
+        warm = min(0.5 + 0.5 * used / _WARM, 1.0)
         for group in self.free.optimizer.param_groups:
             last = _LAST_OF_MEANS if group["name"] == "means" else _LAST
-            group["lr"] = self.rates[group["name"]] * last**used
+            group["lr"] = self.rates[group["name"]] * warm * last**used
         views = next(views for views, end in self.levels if used < end or end == 1)
         if not self.order:
             # each photo once before any comes again

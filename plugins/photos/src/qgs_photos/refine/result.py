@@ -79,7 +79,7 @@ class Result:
 
     def read_back(self, file: Path) -> "Result":
         """Return a copy of this result with the Gaussians in `file`, so as to score the file."""
-        gaussians = in_own_world(self.world, load_ply(file).to(self.world[0].device))
+        gaussians = in_own_world(self.world, load_ply(file).to(self.views.images.device))
         return replace(self, refined=replace(self.refined, gaussians=gaussians))
 
     def render(self, views: Views) -> Rendering:
@@ -218,6 +218,7 @@ def scores(result: Result) -> dict[str, Any]:
         "factor": result.factor,
         "scale_by": result.scale_by,
         "mean": mean,
+        "error_scale": result.evidence.scale,
         "expected_and_error": groups(torch.cat(errors, 1)) if errors else [],
         "held_out": [
             {"frame": frame, "photo": name_of(frame), **row}

@@ -24,7 +24,7 @@ from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.evidence import MOST, evidence
 from qgs_photos.refine.initial import photos_start
-from qgs_photos.refine.metric import Distance, in_metres, metres
+from qgs_photos.refine.metric import Distance, in_metres, metres, points_of
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import RefinedScene, refine, seconds_of_step
 from qgs_photos.refine.result import Result, has_viewer, write_scene
@@ -127,16 +127,19 @@ def finished(
     around = whole.count - optimised.count
     views = every.select(slice(len(photos.frames)))
     judged = every.select(slice(len(photos.frames), None))
-    found = evidence(whole, replace(views, cameras=refined.cameras))
-    found = found.cleaned(judged, around).calibrated(judged)
+    found = evidence(whole, replace(views, cameras=refined.cameras), around)
+    found = found.cleaned(judged).calibrated(judged)
     refined = replace(refined, gaussians=found.gaussians)
     count = found.gaussians.count - around
     factor = 1.0
     if distance:
+        # an earlier scene may have brought the distance
+        points = photos.points or points_of(distance, photos.at(every.cameras.size))
         cameras = concatenated([refined.cameras, judged.cameras], 1)
         # in the order of the photos
         frames = torch.tensor([*photos.frames, *photos.held_out]).argsort()
-        units = metres(distance, found.gaussians, cameras[:, frames], photos.small)
+        near = found.gaussians[:, around:]
+        units = metres(points, distance[-1], near, cameras[:, frames])
         factor = units * float(world[1])
         world = in_metres(world, factor)
     return Result(command, count, world, refined, photos, views, judged, found, factor, distance)

@@ -14,7 +14,8 @@ class ScenePhotos:
     """The photos of `qgs scene`, at any size.
 
     path: folder, URL or video. small: the scene with small photos. held_out: indices of photos that
-    are held out for scores. frames: indices of the other photos, for the optimisation.
+    are held out for scores. frames: indices of the other photos, for the optimisation. points: of
+    the measured distance; None without one.
     """
 
     def __init__(self, path: str, options: Options) -> None:
@@ -22,9 +23,8 @@ class ScenePhotos:
         self.name = options.scene
         found = self.at(None)
         self.small = self.at(sized(found, SMALL))
-        if options.scale_by:
-            # what is wrong shows before the optimisation
-            points_of(options.scale_by, self.small)
+        used = self.at(options.size) if options.size else self.small
+        self.points = points_of(options.scale_by, used) if options.scale_by else None
         self.held_out = judged_frames(found, options.holdout)
         self.frames = tuple(frame for frame in range(len(found)) if frame not in self.held_out)
         # a model's inputs are chosen among the others
