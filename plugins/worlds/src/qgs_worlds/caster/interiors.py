@@ -51,12 +51,12 @@ def _darken(darkness, body, size, lamp):
     # high or flat things cast no visible shadow
     if bottom > 1.2 or top < 0.03 or top > lamp[2] - 0.2:
         return
-    ex = abs(body.axes[0, 0]) * body.extent[0] + abs(body.axes[0, 1]) * body.extent[1]
-    ey = abs(body.axes[0, 1]) * body.extent[0] + abs(body.axes[0, 0]) * body.extent[1]
+    # half of the diagonal, which bounds a shape turned by any angle
+    wide = math.hypot(body.extent[0], body.extent[1])
     # how far the shadow of the shape's top edge reaches on the floor
     reach = lamp[2] / (lamp[2] - top)
-    i0, i1 = _range(x - ex, x + ex, lamp[0], reach, size[0], cells)
-    j0, j1 = _range(y - ey, y + ey, lamp[1], reach, size[1], cells)
+    i0, i1 = _range(x - wide, x + wide, lamp[0], reach, size[0], cells)
+    j0, j1 = _range(y - wide, y + wide, lamp[1], reach, size[1], cells)
     source = narrow(lamp)
     below = 0.55 * math.exp(-3 * bottom)
     for i in range(i0, i1):
