@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from qgs.terminal import print_lines, print_table
 from qgs.wording import counted
@@ -157,15 +157,8 @@ def pack(
     source = opened_source(path, options or [], image_size)
     test = None if test_scenes is None else read_scene_list(opened_path(test_scenes))
     splits = packing.chosen_splits(source, test, test_every)
-    with Progress(
-        MofNCompleteColumn(),
-        BarColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    ) as bar:
+    hidden = not console.is_terminal
+    with Progress(console=console, transient=True, disable=hidden) as bar:
         task = bar.add_task("", total=sum(map(len, splits.values())))
         packed = packing.pack(
             source,

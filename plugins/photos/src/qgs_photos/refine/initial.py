@@ -25,6 +25,7 @@ from qgs_photos.refine.budget import TIMED
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.scene_photos import ScenePhotos
 from qgs_photos.refine.sweeping import balls, swept
+from qgs_photos.viewing import in_own_world
 
 ENOUGH = 4
 """Least number of photos for which Gaussians at pixels are as good a start of the optimisation as
@@ -171,10 +172,8 @@ def from_points(points: tuple[Tensor, Tensor], world: World, most: int) -> Gauss
     random subset is used.
     """
     means, colors = points
-    reference, scale = world
     drawn = torch.randperm(len(means), generator=torch.Generator().manual_seed(0))[:most]
-    w2c = torch.linalg.inv(reference.double())
-    means = ((means[drawn] @ w2c[:3, :3].T + w2c[:3, 3]) * scale.double()).float()
+    means = means[drawn]
     # the nearest is the point itself
     near, _ = KDTree(means.numpy()).query(means.numpy(), _NEIGHBOURS + 1)
     gaps = torch.from_numpy(near).float()[:, 1:].mean(1)
@@ -183,4 +182,4 @@ def from_points(points: tuple[Tensor, Tensor], world: World, most: int) -> Gauss
     middle = gaps.nanmedian().nan_to_num(1.0)
     gaps = gaps.nan_to_num(float(middle)).clamp(0.1 * middle, 5 * middle).clamp_min(1e-6)
     scales = gaps[:, None].expand(-1, 3)
-    return balls(means, scales, _OPACITY, colors[drawn].float())
+    return in_own_world(world, balls(means, scales, _OPACITY, colors[drawn].float()))

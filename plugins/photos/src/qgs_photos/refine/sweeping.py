@@ -56,8 +56,8 @@ def swept(views: Views, count: int, size: float, generator: torch.Generator) -> 
 
 def balls(means: Tensor, scales: Tensor, opacity: float, colors: Tensor) -> Gaussians:
     """Return unrotated Gaussians (1, G) of one opacity. means, scales, colors: (G, 3)."""
-    quats = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
-    return Gaussians(means, scales, quats, torch.full_like(means[:, 0], opacity), colors)[None]
+    quats = colors.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
+    return Gaussians(means, scales, quats, torch.full_like(colors[:, 0], opacity), colors)[None]
 
 
 def _on_photo(views: Views, photo: int, pixels: Tensor, size: float) -> Gaussians:
