@@ -162,9 +162,9 @@ class DepthPredictor(nn.Module):
     ) -> tuple[list[Tensor], Tensor, list[Tensor], Joined]:
         """Return depths of all pixels, confidences, maps of the ViT, and maps to join with these.
 
-        Depths are camera-frame z (B, V, H, W) in world units, one tensor for each sweep; a DPT head
-        corrects only the last tensor. The confidence of a pixel is the largest probability of a
-        depth in the last sweep, (B V, 1, H, W). The maps of the ViT are (B V, C, H/8, W/8). A DPT
+        Depths are camera-frame z (B V, 1, H, W) in world units, one tensor for each sweep; a DPT
+        head corrects only the last tensor. The confidence of a pixel is the largest probability of
+        a depth in the last sweep, (B V, 1, H, W). The maps of the ViT are (B V, C, H/8, W/8). A DPT
         head reads them together with the maps of other networks.
         """
         size = images_BV3HW.shape[-2:]
@@ -190,7 +190,7 @@ class DepthPredictor(nn.Module):
         correction_N1HW = at_least_float32(self.upsampler(maps, joined))
         full = [resized(x, size) for x in coarse]
         full[-1] = (full[-1] + correction_N1HW).clamp(*bounds(sweep))
-        depths = [(1 / x[:, 0]).unflatten(0, shape) for x in full]
+        depths = [1 / x for x in full]
         confidence_N1HW = F.interpolate(confidence_N1hw, size, mode="nearest")
         return depths, confidence_N1HW, maps, self.beside(cnn, multi)
 
@@ -319,8 +319,7 @@ class DepthSplatEncoder(Decaying, SweepEncoder):
         features_NFHW = self.network.feature_upsampler(maps, joined)
         images_N3HW = views.images.flatten(0, 1)
         # Depth, up to `far`, not its inverse (released code).
-        depth_N1HW = depths[-1].flatten(0, 1)[:, None]
-        seen = torch.cat([images_N3HW, depth_N1HW, confidence, features_NFHW], 1)
+        seen = torch.cat([images_N3HW, depths[-1], confidence, features_NFHW], 1)
         hidden = self.network.gaussian_regressor(seen)
         seen = torch.cat([hidden, images_N3HW, features_NFHW, confidence], 1)
         raw_NCHW = at_least_float32(self.network.gaussian_head(seen))
@@ -331,7 +330,7 @@ class DepthSplatEncoder(Decaying, SweepEncoder):
         constant = raw_BVCHW[:, :, first::step] + (views.images - 0.5) / SH_C0
         raw_BVCHW = raw_BVCHW.slice_scatter(constant, 2, first, step=step)
         # Logarithms of depths have about the range of features.
-        logs = [depth[:, :, None].log() for depth in depths]
+        logs = [depth.log().unflatten(0, near_BV.shape) for depth in depths]
         numbers = torch.cat([logs[-1], raw_BVCHW], 2)
         # It is the last number, where `mvsplat/exchange` expects it.
         coarse = logs[:1] if self.config.coarse_depth else []
