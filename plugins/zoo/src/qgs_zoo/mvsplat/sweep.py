@@ -60,6 +60,12 @@ def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
     return order_BVV[..., 1 : count + 1]
 
 
+def at_neighbours(x: Tensor, neighbours_BVJ: Tensor) -> Tensor:
+    """Return the values (B, V, J, ...) of each view's neighbours. x: values (B, V, ...)."""
+    scenes = torch.arange(len(x), device=x.device)[:, None, None]
+    return x[scenes, neighbours_BVJ]
+
+
 class Sweep(NamedTuple):
     """Inputs of a plane sweep: cameras, views to compare, and depths.
 
@@ -90,8 +96,7 @@ def evenly_spaced(low_N1hw: Tensor, high_N1hw: Tensor, count: int) -> Tensor:
 @full_precision
 def relative_poses(c2w_BV44: Tensor, neighbours_BVJ: Tensor) -> Tensor:
     """Return poses (B, V, J, 4, 4) from each view's camera to the cameras of its neighbours."""
-    scenes = torch.arange(len(c2w_BV44), device=c2w_BV44.device)[:, None, None]
-    return c2w_BV44[scenes, neighbours_BVJ].inverse() @ c2w_BV44[:, :, None]
+    return at_neighbours(c2w_BV44, neighbours_BVJ).inverse() @ c2w_BV44[:, :, None]
 
 
 @full_precision
@@ -148,12 +153,12 @@ def cost_volume(features_BVChw: Tensor, inverse_depth_NDhw: Tensor, sweep: Sweep
     neighbours_BVJ = sweep.neighbours
     lens_N4 = feature_lenses(sweep.cameras, (height, width)).flatten(0, 1)
     poses_BVJ44 = relative_poses(sweep.cameras.c2w, neighbours_BVJ)
-    batch = torch.arange(scenes, device=features_BVChw.device)[:, None]
     # Two ways with the same result; the faster one depends on pixels and candidates.
     correlate = _of_all_pairs if height * width <= PAIRS * depth_NDhw.shape[1] else _of_warped
     total_NDhw = depth_NDhw.new_zeros(())
     for index in range(neighbours_BVJ.shape[-1]):
-        other_NChw = features_BVChw[batch, neighbours_BVJ[..., index]].flatten(0, 1)
+        neighbour_BV1 = neighbours_BVJ[..., index, None]
+        other_NChw = at_neighbours(features_BVChw, neighbour_BV1).flatten(0, 2)
         pose_N44 = poses_BVJ44[:, :, index].flatten(0, 1)
         # Cameras and depths get no gradient: only the features learn from the sweep.
         total_NDhw = total_NDhw + correlate(

@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
+from qgs_zoo.mvsplat.sweep import at_neighbours
+
 LAYERS = 6
 SPLIT = 2
 """Number of windows along each side of a map. Windows grow with the map."""
@@ -124,9 +126,8 @@ class Attention(nn.Module):
         v = self.v_proj(source_BVWLC)
         if neighbours_BVJ is not None:
             # Pixels are ordered by position in the window, then by neighbour.
-            scenes = torch.arange(len(x_BVWLC), device=x_BVWLC.device)[:, None, None]
             order = "n v j w l c -> n v w (l j) c"
-            k, v = (rearrange(x[scenes, neighbours_BVJ], order) for x in (k, v))
+            k, v = (rearrange(at_neighbours(x, neighbours_BVJ), order) for x in (k, v))
             # Published weights expect this order. Keys are ordered by pixels, then views, but the
             # mask is repeated view by view: with three or more views it applies to other keys.
             mask = None if mask is None else mask.repeat(1, 1, neighbours_BVJ.shape[-1])
