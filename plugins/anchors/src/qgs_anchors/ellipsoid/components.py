@@ -77,7 +77,7 @@ def turned(quats: Tensor, turn: Tensor) -> Tensor:
     radians; 180 degrees are never reached. So turn / 2 is the Gibbs vector of the rotation (Cayley
     transform).
     """
-    small = torch.cat([torch.ones_like(turn[..., :1]), turn / 2], -1)
+    small = F.pad(turn / 2, (1, 0), value=1.0)
     return F.normalize(quat_product(F.normalize(small, dim=-1), quats), dim=-1)
 
 
