@@ -79,7 +79,7 @@ def posed_photos(batch: int, count: int, size: Size, seed: int) -> Views:
     # Cameras are ten degrees apart, like neighbouring photos of a walk.
     angle = torch.deg2rad(10.0 * torch.arange(count))
     forward = torch.stack([angle.sin(), torch.zeros(count), angle.cos()], -1)
-    down = torch.tensor([0.0, 1.0, 0.0]).expand_as(forward)
+    down = torch.tensor([0.0, 1.0, 0.0])
     centre = torch.tensor([0.0, 0.0, 1.0])
     c2w = look_at(centre - forward, forward, down).repeat(batch, 1, 1, 1)
     height, width = size
