@@ -132,21 +132,17 @@ def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     rotations are missing, so load the result with `strict=False`. Raises KeyError if the weights
     have no radii.
     """
-    converted = {name: _tripled(name, values) for name, values in weights.items()}
-    converted["queries.raw_radii"] = converted.pop("queries.raw_radius")
-    # A ball has no orientation, so any rotation is right: the identity has w = 1.
-    w_N1 = torch.ones_like(weights["queries.raw_radius"])
-    converted["queries.rotation"] = F.pad(w_N1, (0, 3))
-    return converted
-
-
-def _tripled(name: str, values: Tensor) -> Tensor:
-    if name == "queries.raw_radius":
-        return values.repeat(1, 3)
     # Rows of the last layer are the radii: with equal rows they get equal steps.
-    if name.startswith("refinements.0.radius_mlp.fc2."):
-        return torch.cat([values] * 3)
-    return values.clone()
+    last = "refinements.0.radius_mlp.fc2."
+    converted = {
+        name: torch.cat([values] * 3) if name.startswith(last) else values.clone()
+        for name, values in weights.items()
+    }
+    raw_N1 = converted.pop("queries.raw_radius")
+    converted["queries.raw_radii"] = raw_N1.repeat(1, 3)
+    # A ball has no orientation, so any rotation is right: the identity has w = 1.
+    converted["queries.rotation"] = F.pad(torch.ones_like(raw_N1), (0, 3))
+    return converted
 
 
 class EllipsoidCrossAttention(RayBiasedCrossAttention):
