@@ -44,7 +44,6 @@ PIXEL_FIELDS: Fields = {
     TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
 }
 """Query fields: the rays through the pixel of a query, and the rotation of the pixel's camera."""
-RAY_FIELD: Fields = {PIXEL: PIXEL_FIELDS[PIXEL]}
 
 CHANNELS = (1, 1, 2, 3, 4)
 """Numbers per pixel: log of the depth in world units, opacity logit, raw position in the pixel, raw
@@ -131,7 +130,7 @@ class OnRays(Centers):
     """
 
     name = "on_rays"
-    reads = RAY_FIELD
+    reads: ClassVar[Fields] = {PIXEL: PIXEL_RAYS}
 
     class Config(ComponentConfig):
         measure: Literal["distance", "depth"] = "distance"
