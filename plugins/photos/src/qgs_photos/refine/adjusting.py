@@ -4,6 +4,7 @@ from collections.abc import Collection
 
 import torch
 import torch.nn.functional as F
+from kornia.geometry.conversions import Rt_to_matrix4x4
 from torch import Tensor
 
 from qgs.geometry.transforms import depths_in_view, quat_to_matrix, to_camera, to_pixels
@@ -51,8 +52,7 @@ class Adjustments:
         turn, shift = self._poses[photo].split(3)
         # small turns: half the axis is the quaternion's vector
         quat = F.normalize(torch.cat([turn.new_ones(1), turn]), dim=0)
-        rows = torch.cat([quat_to_matrix(quat), self.size * shift[:, None]], 1)
-        move = torch.cat([rows, rows.new_tensor([[0.0, 0, 0, 1]])])
+        move = Rt_to_matrix4x4(quat_to_matrix(quat)[None], self.size * shift[None, :, None])
         return cameras.replace(c2w=cameras.c2w @ move)
 
     def every_camera(self, cameras: Cameras) -> Cameras:
