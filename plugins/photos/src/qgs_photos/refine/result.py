@@ -11,7 +11,6 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from qgs.containers import concatenated
 from qgs.data.samples import in_photos_world
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
@@ -168,7 +167,7 @@ def page_of(result: Result, record: Mapping[str, Any]) -> str:
     rows = record["held_out"]
     best = sorted(range(len(rows)), key=lambda row: -rows[row]["psnr"])[:_JUDGED_ON_PAGE]
     every = max(len(record["refined_on"]) // _ON_PAGE, 1)
-    stops = concatenated([result.judged.select(best), views.select(slice(None, None, every))], 1)
+    stops = result.judged.select(best).joined(views.select(slice(None, None, every)))
     names = [f"{Path(rows[row]['photo']).name}, held out" for row in best]
     names += [Path(name).name for name in record["refined_on"][::every]]
     note = f"{refined.gaussians.count:,} Gaussians"
