@@ -110,7 +110,7 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
         # all files or none: a scene without its scores is none
         with replacing_entries(out, "scene.ply") as fresh:
             record = _write_files(result, fresh, page, began)
-            written = [out / name for name in sorted(entry.name for entry in fresh.iterdir())]
+            written = sorted(out / entry.name for entry in fresh.iterdir())
     ended = f", ended by {refined.stopped_by}" if refined.stopped_by else ""
     lines = [
         f"{refined.gaussians.count:,} Gaussians after {refined.steps:,} steps in "
