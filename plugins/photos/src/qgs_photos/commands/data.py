@@ -104,11 +104,12 @@ def check(
     options = Options(geometry, quick, threads, format, images)
     indices = [*map(opened_path, index or [])]
     with console.status("listing scenes") as status:
-
-        def progress(done: int, total: int, name: str) -> None:
-            status.update(f"{done} of {total} scenes, now {name}")
-
-        result = check(opened_path(path), options, indices, progress)
+        result = check(
+            opened_path(path),
+            options,
+            indices,
+            lambda done, total, name: status.update(f"{done} of {total} scenes, now {name}"),
+        )
     if result.scenes:
         print_table(console, "", result.table, box=None, pad_edge=False)
     print_lines(console, map(str, result.findings))
