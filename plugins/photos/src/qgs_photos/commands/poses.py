@@ -1,6 +1,5 @@
 """The command `qgs poses`."""
 
-import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -76,7 +75,7 @@ def poses(
     if frames is not None and not source.is_file():
         raise ValueError("--frames is for a video: leave --frames out for photos")
     console = Console()
-    options = Options(frames, side, matching, features, threads or os.cpu_count() or 1, seed)
+    options = Options(frames, side, matching, features, threads or Options.threads, seed)
     folder = out or beside(source)
     found = make_poses(source, folder, options, console)
     print_lines(console, found.summary)

@@ -78,7 +78,7 @@ def _duration(source: Path) -> str:
     """Return text with the estimated time to compute poses of photos; "" for a video."""
     if source.is_file():
         return ""
-    seconds = SECONDS_OF_PHOTO * len(photo_files(source)) / Options().threads
+    seconds = SECONDS_OF_PHOTO * len(photo_files(source)) / Options.threads
     return f", in about {max(seconds, 5):.0f} s"
 
 
