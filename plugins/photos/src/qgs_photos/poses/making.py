@@ -101,7 +101,7 @@ def fingerprint(source: Path) -> dict[str, Any]:
     Poses belong to `source` as long as its fingerprint stays the same.
     """
     files = [source] if source.is_file() else photo_files(source)
-    stats = [file.stat() for file in files]
+    stats = map(Path.stat, files)
     times = ([stat.st_size, stat.st_mtime_ns] for stat in stats)
     return dict(zip(names_of(files), times, strict=True))
 
