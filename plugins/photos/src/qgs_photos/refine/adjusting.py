@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from kornia.geometry.conversions import Rt_to_matrix4x4
 from torch import Tensor
 
+from qgs.containers import concatenated
 from qgs.geometry.transforms import depths_in_view, quat_to_matrix, to_camera, to_pixels
 from qgs.types import Cameras, Gaussians, Views
 
@@ -58,8 +59,8 @@ class Adjustments:
     def every_camera(self, cameras: Cameras) -> Cameras:
         """Return the corrected cameras (1, V) of all photos, without gradients."""
         with torch.no_grad():
-            each = [self.cameras(v, cameras[:, [v]]).c2w for v in range(cameras.shape[1])]
-        return cameras.replace(c2w=torch.cat(each, 1))
+            each = [self.cameras(v, cameras[:, [v]]) for v in range(cameras.shape[1])]
+        return concatenated(each, 1)
 
     def seen(self, photo: int, rgb: Tensor, image: Tensor) -> Tensor:
         """Correct the exposure of rendered `rgb` (1, 1, 3, H, W) to that of a photo, and fit it.
