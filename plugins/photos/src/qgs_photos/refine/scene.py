@@ -155,11 +155,12 @@ def with_exposure(
     if options.extras.adjust is not None:
         return options
     spread = float(brightness(gaussians, views).nan_to_num().std(correction=0))
+    adjust = "nothing"
     if spread > DIFFER:
+        adjust = "exposure"
         differs = f"the brightness of photos differs by {spread:.0%}"
         print_lines(console, [f"{differs}: the exposure of each is optimised"])
-    adjust = ("exposure",) if spread > DIFFER else ("nothing",)
-    return replace(options, extras=replace(options.extras, adjust=adjust))
+    return replace(options, extras=replace(options.extras, adjust=[adjust]))
 
 
 def faults_of_given_poses(photos: ScenePhotos) -> Sequence[Finding]:
