@@ -3,7 +3,7 @@
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -263,7 +263,7 @@ def open_made(folder: Path) -> Source:
         # qgs scene PHOTOS
         views = read_photos(words[2], size=size, frames=evenly(record["refined_on"], PHOTOS))
         c2w = scaled(views.cameras.c2w, record.get("factor", 1.0))
-        views = replace(views, cameras=views.cameras.replace(c2w=c2w))
+        views = views.replace(cameras=views.cameras.replace(c2w=c2w))
     except (OSError, ValueError, LookupError) as error:
         notes.append(f"The photos of the scene are not shown: {one_line(error)}")
     shown = QueryScene(gaussians, views, background=(0.0, 0.0, 0.0))

@@ -7,7 +7,7 @@ short steps of gradient descent cannot repair.
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from timeit import repeat
 
@@ -192,7 +192,7 @@ class _Run:
         self.grows = bool(extras.degree) and gaussians.sh is None
         if self.grows:
             shape = (1, gaussians.count, SH_COUNTS[extras.degree - 1], 3)
-            gaussians = replace(gaussians, sh=gaussians.means.new_zeros(shape))
+            gaussians = gaussians.replace(sh=gaussians.means.new_zeros(shape))
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
         self.free = FreeGaussians(gaussians, self.rates)
         self.photos = views.images.shape[1]
@@ -238,7 +238,7 @@ class _Run:
             self.free.active = (0, *SH_COUNTS)[degrees]
         gaussians = self.free.gaussians()
         cameras = self.adjustments.cameras(place, photo.cameras)
-        rgb = self.renderer(replace(gaussians, features=None), cameras).rgb
+        rgb = self.renderer(gaussians.replace(features=None), cameras).rgb
         rgb = self.adjustments.seen(place, rgb, photo.images)
         error = mean_squared_error(rgb, photo.images)
         spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
@@ -287,7 +287,7 @@ def joined(gaussians: Gaussians, others: Gaussians) -> Gaussians:
         given = getattr(gaussians, name)
         if given is not None:
             zeros = given.new_zeros(1, others.count, *given.shape[2:])
-            others = replace(others, **{name: zeros})
+            others = others.replace(**{name: zeros})
     return concatenated([gaussians, others], 1)
 
 
