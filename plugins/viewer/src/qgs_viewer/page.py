@@ -181,36 +181,32 @@ class Tour:
 
         distance: distance from the cameras to the points about which the reader turns the scene.
         """
-        stops = _stations(self.stops.cameras, distance)
+        stops = [*_stations(self.stops.cameras, distance)]
         for index, (stop, name) in enumerate(zip(stops, self.names, strict=True)):
             stop["name"] = name
             stop["errors"] = data_uri(self.errors[index], photo=True)
             if index < self.photos:
                 stop["photo"] = data_uri(rgb_picture(self.stops.images[0, index]), photo=True)
-        path = _stations(self.path, distance)
+        path = [*_stations(self.path, distance)]
         content = {"title": self.title, "note": self.note, "stops": stops, "path": path}
         # names of files must not end the script
         text = json.dumps(content).replace("<", r"\u003c")
         return f"<script>window.tour = {text};</script>{template('tour.html')}"
 
 
-def _stations(cameras: Cameras, distance: float) -> list[dict[str, Any]]:
-    """Return positions, targets, up directions and lenses of cameras (1, V), for the script."""
+def _stations(cameras: Cameras, distance: float) -> Iterator[dict[str, Any]]:
+    """Yield positions, targets, up directions and lenses of cameras (1, V), for the script."""
     height, width = cameras.size
-    stations = list[dict[str, Any]]()
     for c2w, lens in zip(cameras.c2w[0].cpu().double(), cameras.intrinsics[0], strict=True):
         _, down, forward, eye = c2w[:3].unbind(-1)
         fx, fy, _, _ = lens.tolist()
-        stations.append(
-            {
-                "eye": eye.tolist(),
-                "target": (eye + distance * forward).tolist(),
-                "up": (-down).tolist(),
-                "tangent": height / (2 * fy),
-                "ratio": width / fx * fy / height,
-            }
-        )
-    return stations
+        yield {
+            "eye": eye.tolist(),
+            "target": (eye + distance * forward).tolist(),
+            "up": (-down).tolist(),
+            "tangent": height / (2 * fy),
+            "ratio": width / fx * fy / height,
+        }
 
 
 def scene_html(scene: QueryScene, choice: Choice | None = None, tour: Tour | None = None) -> str:
