@@ -255,5 +255,4 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
 
 
 def _photos(photos: Tensor, captions: Sequence[str]) -> list[Tile]:
-    pairs = zip(photos, captions, strict=True)
-    return [Tile(rgb_picture(photo), caption) for photo, caption in pairs]
+    return [*map(Tile, map(rgb_picture, photos), captions)]
