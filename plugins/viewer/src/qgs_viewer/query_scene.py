@@ -86,6 +86,7 @@ class QueryScene:
         each = self.gaussians.count // self.queries
         return slice(query * each, (query + 1) * each)
 
+    @torch.no_grad()
     def support(self, layer: int) -> SpatialSupport | None:
         """Return the support ellipsoids of all N queries in the viewer's world, (1, N), float64.
 
@@ -99,8 +100,8 @@ class QueryScene:
             return None
         pose, factor = self.inside.placement
         rotation = factor * pose[:3, :3]
-        centers, axes = (part.detach().cpu().double() for part in (found.centers, found.axes))
-        return SpatialSupport(centers @ rotation.T + pose[:3, 3], rotation @ axes)
+        found = found.to("cpu", torch.float64)
+        return SpatialSupport(found.centers @ rotation.T + pose[:3, 3], rotation @ found.axes)
 
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
         """Return the cross-attention of a query in a layer to all patches of `grid`: (1, h, 1, M).
