@@ -173,7 +173,7 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
     cameras: the views to render, (B, V).
     """
     # it is the gradient of a render's sum by the colours
-    colors = gaussians.colors.detach().clone().requires_grad_()
+    colors = gaussians.colors.detach().requires_grad_()
     with torch.enable_grad():
         painted = gaussians.replace(colors=colors, sh=None, features=None)
         rgb = model.render(painted, cameras).rgb
