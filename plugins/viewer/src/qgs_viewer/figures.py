@@ -71,9 +71,8 @@ def grid(section: Section) -> Figure:
     with figure_style(), rc_context({"font.size": 8, "axes.titlesize": 7}):
         layout = ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)
         figure = Figure(figsize=(WIDTH, row * len(section.rows)), layout=layout)
-        axes = figure.subplots(len(section.rows), columns, squeeze=False)
-        for axis in axes.flat:
-            axis.set(xticks=[], yticks=[], frame_on=False)
+        bare = {"xticks": [], "yticks": [], "frame_on": False}
+        axes = figure.subplots(len(section.rows), columns, squeeze=False, subplot_kw=bare)
         for line, (label, row_tiles) in zip(axes, section.rows.items(), strict=True):
             # labels are turned by a right angle, where a long line has no room
             line[0].set_ylabel(label.replace(", ", "\n"))
