@@ -232,8 +232,10 @@ def description(scene: QueryScene, query: int, layer: int) -> str:
     If the query's attention cannot be shown, the text says why.
     """
     members = scene.members(query)
-    lines = [f"**query {query}**, layer {layer}"]
-    lines.append(f"Gaussians {members.start} to {members.stop - 1}")
+    lines = [
+        f"**query {query}**, layer {layer}",
+        f"Gaussians {members.start} to {members.stop - 1}",
+    ]
     found = scene.support(layer)
     if found is not None:
         place = ", ".join(f"{x:.3f}" for x in found.centers[0, query].tolist())
