@@ -10,11 +10,11 @@ TEXTS = ("qgs", "plugins", "tests", "tools", "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 489_720},
-    "qgs": {"tokens": 99_670, "parallel": 1, "why": 3},
-    "plugins": {"tokens": 203_930, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 163_810, "parallel": 1},
-    "tools": {"tokens": 17_970, "parallel": 1},
+    "all": {"tokens": 488_950},
+    "qgs": {"tokens": 99_640, "parallel": 1, "why": 3},
+    "plugins": {"tokens": 203_900, "parallel": 1, "why": 3.5},
+    "tests": {"tokens": 163_140, "parallel": 1},
+    "tools": {"tokens": 17_920, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,
 comments that say why at least. They only get stricter: a change that adds removes as much."""
