@@ -151,7 +151,8 @@ def _upright(c2w: Tensor) -> Tensor:
     """Return the rotation (4, 4) that turns the mean up direction of cameras (V, 4, 4) to +Y."""
     # The first counts a little more: cameras that are turned over would have no mean.
     down = c2w[:, :3, 1].sum(0) + 1e-3 * c2w[0, :3, 1]
-    aside = torch.eye(3).double()[down.abs().argmin()]
+    # z if it may be, else x or y; rounded, so that noise does not choose
+    aside = torch.eye(3).double()[2 - down.flip(0).abs().round(decimals=2).argmin()]
     left, back, down = look_at(torch.zeros_like(down), down, aside)[:3, :3].unbind(-1)
     pose = torch.eye(4).double()
     pose[:3, :3] = -torch.stack([left, down, back])
