@@ -27,8 +27,7 @@ _LARGEST_ANGLE = 1.0
 # Least error in photos, and error where no Gaussian is if photos show no such place.
 _LEAST = 0.003
 _EMPTY = 0.3
-# Floaters: their depth over the median depth of Gaussians that a photo shows, at most, and the
-# number of photos that show them.
+# Floaters: their depth over the median depth of a photo, at most, and photos that show them.
 _NEAR = 0.3
 _FEW = 2
 
@@ -122,17 +121,17 @@ def evidence(gaussians: Gaussians, views: Views, surroundings: int = 0) -> Evide
     holes = sums.new_zeros(2)
     for place, photo in enumerate(compared):
         view = views.select([photo])
-        weights, empty = _weights(gaussians, view)
+        weights, empty, depth = _weights(gaussians, view)
         shown[place] = weights[0] > _SHOWN
-        depths = to_camera(gaussians.means, view.cameras)[0, 0, surroundings:, 2]
-        seen = shown[place, surroundings:]
-        near[surroundings:] |= seen & (depths < _NEAR * depths[seen].median())
+        depths = to_camera(gaussians.means, view.cameras)[0, 0, :, 2]
+        near |= shown[place] & (depths < _NEAR * depth)
         sums += weights
         holes += empty
     weights, errors = sums
     # as if one more pixel had the usual error
     errors = (errors + errors.sum() / weights.sum().clamp_min(1)) / (weights + 1)
     count = shown.sum(0) * photos / len(compared)
+    near[:surroundings] = False
     # where hardly more photos exist, they say nothing
     floating = near & (count <= _FEW) & (photos > 2 * _FEW)
     errors = _FACTOR * (errors + _LEAST) * (1 + count) ** _OF_COUNT
@@ -146,10 +145,11 @@ def each_view(views: Views) -> Iterator[Views]:
     return (views.select([view]) for view in range(views.images.shape[1]))
 
 
-def _weights(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor]:
+def _weights(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor, Tensor]:
     """Return sums over the pixels of a photo (1, 1), of each of G Gaussians and of empty places.
 
     The sums are those of the weight, and of the weight times the error of the render: (2, G), (2,).
+    The median of rendered depths comes with them.
     """
     with torch.enable_grad():
         features = gaussians.means.new_zeros(1, gaussians.count, 2).requires_grad_()
@@ -159,4 +159,5 @@ def _weights(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor]:
         # the derivatives by features are weights
         (weights,) = torch.autograd.grad((render.features[0, 0] * factors).sum(), features)
     empty = (1 - render.alpha.detach())[0, 0]
-    return weights[0].T, (empty * factors).sum((1, 2))
+    depth = render.depth.detach()[render.alpha > 0.5].median()
+    return weights[0].T, (empty * factors).sum((1, 2)), depth
