@@ -4,6 +4,7 @@ import re
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -44,7 +45,9 @@ def test_photos_get_the_poses_they_were_taken_with(made, shots):
     assert frames[0].intrinsics[0] == pytest.approx(145 * SCALE, rel=0.05)
 
 
-def test_a_video_gets_poses_of_its_frames_where_it_is_read(shots, images, tmp_path):
+def test_a_video_gets_poses_of_its_frames_where_it_is_read(shots, images, tmp_path, monkeypatch):
+    # poses by several threads differ from run to run
+    monkeypatch.setattr(door, "Options", partial(Options, threads=1))
     views = qgs.read_photos(write_video(tmp_path / "phone.mp4", images), size=(36, 54))
     assert views.images.shape == (1, PHOTOS, 3, 36, 54)
     assert read_json(tmp_path / "phone_poses/poses.json")["made_by"] == "qgs poses"
