@@ -64,11 +64,11 @@ def save_glb(gaussians: Gaussians, path: str | Path, cameras: Mapping[str, Camer
     ground gets height 0; without cameras, -y becomes +Y. Warns and raises errors as `save_ply`
     does.
     """
-    poses = [camera.c2w[0].double().cpu() for camera in cameras.values()]
     upright = TURN.clone()
-    if poses:
-        upright = _upright(torch.cat(poses))
-        upright[1, 3] = -_ground(gaussians, upright @ torch.cat(poses), upright)
+    if cameras:
+        c2w = torch.cat([camera.c2w[0].double().cpu() for camera in cameras.values()])
+        upright = _upright(c2w)
+        upright[1, 3] = -_ground(gaussians.means, c2w, upright[1, :3])
     scene, origin = one_scene(moved(gaussians, upright, 1.0), ".glb")
     if origin:
         upright[:3, 3] -= torch.tensor([*map(float, origin.split())], dtype=torch.float64)
@@ -159,15 +159,14 @@ def _upright(c2w: Tensor) -> Tensor:
     return pose
 
 
-def _ground(gaussians: Gaussians, c2w: Tensor, upright: Tensor) -> float:
-    """Return the height of the lowest Gaussians that are not far behind what cameras look at.
+def _ground(means: Tensor, c2w: Tensor, up: Tensor) -> float:
+    """Return the height of the lowest means that are not far behind what cameras look at.
 
-    c2w: upright poses of the cameras (V, 4, 4). upright: pose (4, 4) of the Gaussians' world.
+    means: (..., G, 3). c2w: poses of the cameras (V, 4, 4). up: direction (3,).
     """
-    points = moved(gaussians, upright, 1.0).means.flatten(0, -2).double().cpu()
-    eyes = c2w[:, :3, 3].mean(0)
-    away = (points - eyes).norm(dim=-1)
-    heights = points[away < _AROUND * away.median(), 1]
+    points = means.flatten(0, -2).double().cpu()
+    away = (points - c2w[:, :3, 3].mean(0)).norm(dim=-1)
+    heights = points[away < _AROUND * away.median()] @ up
     return float(np.quantile(heights, _LOWEST))
 
 
