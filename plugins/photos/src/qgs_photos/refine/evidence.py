@@ -85,6 +85,9 @@ class Evidence:
         judged: these photos, (1, H); without any, or if their mean PSNR falls, nothing changes.
         """
         keep = ~self.floating
+        # nothing to judge by renders
+        if keep.all():
+            return self
         kept = replace(
             self,
             gaussians=self.gaussians[:, keep],

@@ -22,9 +22,11 @@ class ScenePhotos:
         self.path = path
         self.name = options.scene
         found = self.at(None)
-        self.small = self.at(sized(found, SMALL))
-        used = self.at(options.size) if options.size else self.small
-        self.points = points_of(options.scale_by, used) if options.scale_by else None
+        small = sized(found, SMALL)
+        self.small = self.at(small)
+        self.points = None
+        if options.scale_by:
+            self.points = points_of(options.scale_by, self.at(options.size or small))
         self.held_out = judged_frames(found, options.holdout)
         self.frames = tuple(frame for frame in range(len(found)) if frame not in self.held_out)
         # a model's inputs are chosen among the others
