@@ -43,9 +43,11 @@ class HubCheckpoint(ModelHubMixin):
         with CheckpointFile(name) as file:
             self._facts = "\n".join(_facts(file))
             self._file = file.path
-            text = dump(file.recipe.tree)
-            if without_secrets(text) != text:
-                raise ValueError(f"{name} is not uploaded: its recipe has a URL with a password")
+            # the recipe is part of them
+            if without_secrets(self._facts) != self._facts:
+                raise ValueError(
+                    f"{name} is not uploaded: its recipe or card has a URL with a password"
+                )
             # what config.json gets; else the mixin writes the arguments, with a path
             self._hub_mixin_config = dict(file.recipe.tree)
         self._license = license
@@ -95,8 +97,8 @@ def push_to_hub(name: AnyPath, repo_id: str, *, license: str, **options: Any) ->
     """Upload a checkpoint, its recipe and its card to the Hub; return the URL of the commit.
 
     name: as for `qgs.load`. license: identifier of the licence, such as "apache-2.0". options: as
-    for `ModelHubMixin.push_to_hub`, such as private=True. Raises ValueError for a recipe with a
-    password, and the errors of `CheckpointFile` and huggingface_hub.
+    for `ModelHubMixin.push_to_hub`, such as private=True. Raises ValueError for a recipe or card
+    with a password, and the errors of `CheckpointFile` and huggingface_hub.
     """
     return HubCheckpoint(name, license).push_to_hub(
         repo_id, model_card_kwargs={"repo_id": repo_id}, **options

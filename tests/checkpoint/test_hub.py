@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import yaml
 from huggingface_hub import HfApi
-from tables import assert_equal, contents, names_in
+from tables import assert_equal, contents, must_refuse, names_in
 from training_runs import tiny
 
 import qgs
@@ -17,7 +17,7 @@ from qgs.domain import KEY, Domain
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """The folder to which uploads go, each into a folder of the repository's name."""
+    """Uploads go into folders of the repositories' names."""
 
     def upload_folder(_, repo_id, folder_path, **told):
         assert told["revision"] == "v1"
@@ -27,7 +27,6 @@ def hub(tmp_path, monkeypatch):
         HfApi, "create_repo", lambda _, repo_id, **told: SimpleNamespace(repo_id=repo_id)
     )
     monkeypatch.setattr(HfApi, "upload_folder", upload_folder)
-    return tmp_path / "hub"
 
 
 def test_a_model_comes_back_and_its_card_says_what_the_checkpoint_knows(hub, tmp_path):
@@ -55,6 +54,8 @@ def test_a_model_comes_back_and_its_card_says_what_the_checkpoint_knows(hub, tmp
         assert told in text
     # nobody else needs to know where the run lies
     assert not any(str(tmp_path).encode() in file for file, _ in contents(Path(url)).values())
+    (run / SCORES).write_text("of https://me:secret@host/model")
+    must_refuse("a password", qgs.push_to_hub, run, "me/locus", license="apache-2.0")
 
 
 def test_a_model_that_ships_keeps_its_card(hub):
