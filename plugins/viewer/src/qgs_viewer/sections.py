@@ -255,4 +255,6 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
 
 
 def _photos(photos: Tensor, captions: Sequence[str]) -> list[Tile]:
-    return [*map(Tile, map(rgb_picture, photos), captions)]
+    return [
+        Tile(rgb_picture(photo), caption) for photo, caption in zip(photos, captions, strict=True)
+    ]
