@@ -6,8 +6,8 @@
     python tools/peers.py tools/peers.yaml SECONDS SCENE ...
 
 The YAML file has the programs' commands. Programs get neither the poses of held-out photos (every
-eighth) nor points that only these show. A program that counts steps runs three times: 200 steps,
-then as many as take SECONDS at the pace of the run before. The last run counts. `qgs` renders the
+eighth) nor points that only these show. A program that counts steps starts with 200 of them, and
+runs again at the pace of the run before until it takes SECONDS, 5 % more or less. `qgs` renders the
 PLY file that it wrote, over black, and scores it on the held-out photos. Rows are printed as
 Markdown, and appended to peers.jsonl. `taskset` before the command limits all programs to the same
 cores. Run it once before: `qgs` compiles in its first run.
@@ -74,12 +74,14 @@ def run(command: str, seconds: float) -> list[str]:
     """Run a program, and return its wall time in seconds and its memory in KiB."""
     log = Path("peers.time")
     steps = 200
-    for _ in range(3 if "$steps" in command else 1):
+    while True:
         shell = f"steps={steps}; {command}"
         subprocess.run(["time", "-o", log, "-f", "%e %M", "sh", "-ec", shell], check=True)
         taken = log.read_text().split()
-        steps = round(steps * seconds / float(taken[0]))
-    return taken
+        pace = seconds / float(taken[0])
+        if "$steps" not in command or abs(pace - 1) < 0.05:
+            return taken
+        steps = round(steps * pace)
 
 
 if __name__ == "__main__":
