@@ -160,9 +160,9 @@ class Refinement(ModelComponent):
 
 
 class Feedback(ModelComponent):
-    """Feedback: (QueryState, ImageMemory, Views) -> the state and memory of the next round.
+    """Feedback: state, memory, views, and the model's renderings -> state and memory of a round.
 
-    A round compares renderings of the last layer's Gaussians with the input photos. Then it runs
+    A round compares renderings of the state's Gaussians with the input photos. Then it runs
     the last `layers` decoder layers again, which update the state once more. In each round,
     `forward` gets the image memory that the first of these layers read before any feedback.
 

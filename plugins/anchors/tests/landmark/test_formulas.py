@@ -198,9 +198,7 @@ def test_steps_against_the_gradient_are_written_out():
 
 
 def test_errors_are_added_to_keys_and_values():
-    feedback = made(RenderedFeedback, shrink=2, cells=2).double()
-    with torch.no_grad():
-        feedback.marker += torch.randn(16)
+    feedback = shaken(made(RenderedFeedback, shrink=2, cells=2))
     given = feedback.shrunk(VIEWS)
     keys, values = drawn(4, 2, 2, 2, TOKENS, 8)
     told = ImageMemory(MEMORY.features, keys, values, grid=GRID)

@@ -96,8 +96,7 @@ class EllipsoidQueries(CentredQueries):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         # No rotation at first: with equal radii the model starts as LocusGS does.
-        identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
-        self.rotation = nn.Parameter(identity.repeat(config.count, 1))
+        self.rotation = nn.Parameter(torch.eye(1, 4).repeat(config.count, 1))
         raw = torch.tensor([*map(raw_radius_of, config.init_radii)])
         self.raw_radii = nn.Parameter(raw.repeat(config.count, 1))
 

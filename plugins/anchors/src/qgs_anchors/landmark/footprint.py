@@ -32,8 +32,6 @@ from qgs_anchors.landmark.places import cells, rows_in_square
 COLOR_MARGIN = 0.02
 """Least distance of initial colours from 0 and 1, where tanh would give them no gradient."""
 
-_OF_CHANNELS = ("linear.weight", "linear.bias")
-
 
 class FootprintCenters(RadiusScaledCenters):
     """Gaussian means at mu + r (u, v, 0) + r posact(offset), along the axes of the photo's camera.
@@ -95,7 +93,7 @@ class ColoredHead(GaussianHead):
         be nearer.
         """
         return {
-            name: self._of_cells(values) if name in _OF_CHANNELS else values
+            name: self._of_cells(values) if name.startswith("linear.") else values
             for name, values in learned.items()
         }
 

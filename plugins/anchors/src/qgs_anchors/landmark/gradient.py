@@ -1,7 +1,7 @@
 """`landmark/gradient`: feedback of the gradient of rendering errors to the queries, in rounds."""
 
 import torch
-from pydantic import PositiveInt
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from qgs.containers import map_tensors
@@ -10,8 +10,6 @@ from qgs.precision import full_precision
 from qgs.types import ImageMemory, QueryState, Views
 from qgs_anchors.landmark.rounds import RoundsFeedback
 
-RATE = 0.05
-"""Initial rate of steps."""
 MOMENTUM = 0.5
 """Part of a step that the next step repeats."""
 TINY = 1e-12
@@ -38,13 +36,15 @@ class GradientFeedback(RoundsFeedback):
         """Number of decoder layers, counted from the last, that each feedback round runs again
         after its steps."""
         steps: PositiveInt = 2
-        """Number of steps against the gradient in a round. Each renders all input photos."""
+        """Number of steps against the gradient in a round. Each renders all photos at once."""
+        rate: NonNegativeFloat = 0.05
+        """Initial rate of steps, also in a model that starts from one without such rounds."""
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.rate = nn.Parameter(torch.full((dims.width,), RATE))
+        self.rate = nn.Parameter(torch.full((dims.width,), config.rate))
 
     def forward(
         self,
@@ -72,9 +72,9 @@ def normalised_slope(
     """Return h = sign(g) log(1 + |g| / s), of shape (B, N, D), as `GradientFeedback` explains."""
     # Tensors of inference mode have no gradients, but copies outside it do.
     with torch.inference_mode(False), torch.enable_grad():
-        state, views = map_tensors(lambda x: x.detach().clone(), (state, views))
+        state, cameras = map_tensors(lambda x: x.detach().clone(), (state, views.cameras))
         features = state.features.requires_grad_()
-        rendering = render(decode(state), views.cameras)
+        rendering = render(decode(state), cameras)
         error = (rendering.rgb - views.images).square().sum()
         (g_BND,) = torch.autograd.grad(error, features)
     square_BN = g_BND.square().mean(-1)

@@ -257,8 +257,7 @@ class ObservedQueries(Queries):
         radii_BN1 = config.radius * side * z_BN1 / focal_BN1
         rows = 0
         if config.cells is not None:
-            square = config.count is None or config.least
-            fill = rows_in_square if square else rows_in_tile
+            fill = rows_in_square if config.count is None or config.least else rows_in_tile
             rows = fill(config.cells)
         shape_3 = F.pad(
             share_2.to(z_BN1) * constant(cameras.size[::-1], z_BN1) / side, (0, 1), value=rows

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 import torch.nn.functional as F
 from pydantic import PositiveInt
-from torch import nn
+from torch import Tensor, nn
 
 from qgs.contracts import Decode, ModelDims, Problem, RecipeContext, Render, memory_fields
 from qgs.tokengs.blocks import split_heads
@@ -59,13 +59,18 @@ class RenderedFeedback(RoundsFeedback):
             reason = f"images of {size[0]} x {size[1]} (H x W) cannot shrink by {config.shrink}"
             yield Problem("shrink", reason, "choose a number that divides both sides")
 
+    def initial(self) -> dict[str, Tensor]:
+        """Return weights with which renderings have no effect."""
+        own = self.state_dict()
+        return own | {k: torch.zeros_like(own[k]) for k in own if k.startswith(self.learned)}
+
     def shrunk(self, views: Views) -> Views:
         """Return the photos to compare with renderings: averaged to 1/`shrink` of their size."""
         by = self.config.shrink
         cameras = views.cameras
         size = (cameras.size[0] // by, cameras.size[1] // by)
         # Fewer pixels are cheaper to render, and errors are smooth.
-        images = F.avg_pool2d(views.images.flatten(0, 1), by).unflatten(0, views.images.shape[:2])
+        images = F.avg_pool3d(views.images, (1, by, by))
         return Views(images, Cameras(cameras.c2w, cameras.intrinsics / by, size))
 
     def forward(
