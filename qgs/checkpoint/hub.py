@@ -68,13 +68,9 @@ class HubCheckpoint(ModelHubMixin):
     def _from_pretrained(
         cls, *, model_id: str, device: Any, gaussians: int | None, **options: Any
     ) -> QueryGaussianModel:
-        folder = os.path.isdir(model_id)
-        file = (
-            Path(model_id, CHECKPOINT)
-            if folder
-            else hf_hub_download(model_id, CHECKPOINT, **options)
-        )
-        return load(file, device, gaussians=gaussians)
+        if not os.path.isdir(model_id):
+            model_id = hf_hub_download(model_id, CHECKPOINT, **options)
+        return load(model_id, device, gaussians=gaussians)
 
 
 def _facts(file: CheckpointFile) -> Iterator[str]:
