@@ -41,7 +41,8 @@ From = Annotated[
     typer.Option(
         "--from",
         help="Scene to optimise further: a folder that qgs scene wrote from the same photos. "
-        "Default: none; with it, --size and --gaussians are as in that scene.",
+        "Default: none; with it, --size, --gaussians and --scale-by are as in that scene. Repeat "
+        "its --holdout, --masks and --adjust; corrected poses are not kept.",
     ),
 ]
 PhotoSize = Annotated[
@@ -77,7 +78,7 @@ Degree = Annotated[
         min=0,
         max=3,
         help="Final degree of the spherical harmonics of colours. 0: one colour from all "
-        "directions.",
+        "directions. Harmonics of --from or of a model stay as they are.",
     ),
 ]
 Adjust = Annotated[

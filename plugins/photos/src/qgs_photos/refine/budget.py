@@ -94,7 +94,9 @@ class Budget:
             f"poses were ready after {opened:.0f} s; {seconds:.0f} s are for about {steps:,.0f} "
             f"steps on {self.described(size)}; twice the time would give {twice}"
         )
-        lacking = self.needed(sized(self.photos.small, SMALL)) - seconds
-        if not self.options.size and lacking > 0:
+        enough = sized(self.photos.small, SMALL)
+        lacking = self.needed(enough) - seconds
+        # stored photos may be smaller, and are never enlarged
+        if not self.options.size and size != enough and lacking > 0:
             minutes = math.ceil(lacking / 6) / 10
             yield f"these photos are small; {minutes} minutes more would give {SMALL} pixels"

@@ -20,8 +20,8 @@ class _Record(BaseModel):
     optimised: PositiveInt
     size: Size
     camera_centres: list[list[float]]
-    factor: PositiveFloat
-    scale_by: Distance | None
+    factor: PositiveFloat = 1.0
+    scale_by: Distance | None = None
 
 
 def chosen_start(photos: ScenePhotos, options: Options) -> Start:
@@ -29,10 +29,9 @@ def chosen_start(photos: ScenePhotos, options: Options) -> Start:
 
     Surroundings of that scene are left out, since they are made anew. The options are returned with
     the photo size, the number of Gaussians and the measured distance of that scene, unless they
-    have their own. Raises
-    FileNotFoundError if the folder is no scene, ValueError for options of a model, for a file that
-    is not as `qgs scene` writes it, for a scene that was made from other photos, other poses, or
-    with other photos held out, and the errors of `chosen_initialisation`.
+    have their own. Raises FileNotFoundError if the folder is no scene, ValueError for options of a
+    model, for a file that is not as `qgs scene` writes it, for a scene that was made from other
+    photos, other poses, or with other photos held out, and the errors of `chosen_initialisation`.
     """
     folder = options.earlier
     if folder is None:

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.data.view_samplers import evenly
+from qgs.geometry.harmonics import seen_colors
 from qgs.geometry.transforms import to_camera
 from qgs.metrics.images import psnr
 from qgs.types import Cameras, Gaussians, Views
@@ -155,12 +156,12 @@ def _weights(gaussians: Gaussians, view: Views) -> tuple[Tensor, Tensor, Tensor]
     The median of rendered depths comes with them.
     """
     with torch.enable_grad():
-        features = gaussians.means.new_zeros(1, gaussians.count, 2).requires_grad_()
-        render = VIEWER(replace(gaussians, features=features), view.cameras)
+        colors = seen_colors(gaussians, view.cameras)[:, 0].requires_grad_()
+        render = VIEWER(gaussians.replace(colors=colors, sh=None), view.cameras)
         errors = errors_of(render.rgb.detach(), view.images)[0, 0]
         factors = torch.stack([torch.ones_like(errors), errors])
-        # the derivatives by features are weights
-        (weights,) = torch.autograd.grad((render.features[0, 0] * factors).sum(), features)
+        # the derivatives by red and green are weights
+        (weights,) = torch.autograd.grad((render.rgb[0, 0, :2] * factors).sum(), colors)
     empty = (1 - render.alpha.detach())[0, 0]
     depth = render.depth.detach()[render.alpha > 0.5].median()
-    return weights[0].T, (empty * factors).sum((1, 2)), depth
+    return weights[0, :, :2].T, (empty * factors).sum((1, 2)), depth

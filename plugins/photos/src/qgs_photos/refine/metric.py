@@ -68,19 +68,24 @@ def _point(text: str, photos: Scene) -> Point:
 
 
 def metres(
-    points: tuple[Point, Point], length: float, gaussians: Gaussians, cameras: Cameras
+    points: tuple[Point, Point],
+    length: float,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    scale: Tensor,
 ) -> float:
-    """Return how many metres a unit of the world of Gaussians (1, G) is.
+    """Return how many metres a unit of the photos' world is.
 
-    length: metres between the points. cameras: of all photos in this world, (1, F). If a point
-    shows nothing, or both are at one place, warns and returns 1.
+    length: metres between the points, in the world of Gaussians (1, G) and cameras of all photos
+    (1, F), which is `scale` times the photos' world. If a point shows nothing, or both are at one
+    place, warns and returns 1.
     """
     start, end = (located(point, gaussians, cameras) for point in points)
     apart = float((end - start).norm())
     if not apart > 0:
         warn_once("--scale-by has no effect: a point shows nothing, or both are at one place")
         return 1.0
-    return length / apart
+    return length / apart * float(scale)
 
 
 def located(point: Point, gaussians: Gaussians, cameras: Cameras) -> Tensor:

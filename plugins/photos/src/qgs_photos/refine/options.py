@@ -41,8 +41,8 @@ class Options:
 
     def command(self, photos: str, out: str) -> str:
         """Return a command line that repeats `qgs scene`. `size` and `seconds` must be set."""
-        assert self.size is not None
-        assert self.seconds is not None
+        assert self.size
+        assert self.seconds
         height, width = self.size
         values = {
             "--out": out,
@@ -50,10 +50,10 @@ class Options:
             "--model": self.model,
             "--from": self.earlier,
             "--frames": self.frames,
-            "--scale": None if self.scale is None else f"{self.scale:.5g}",
+            "--scale": self.scale,
             "--size": f"{height}x{width}",
             "--gaussians": self.gaussians,
-            "--seconds": f"{self.seconds:.0f}" if self.seconds >= 10 else f"{self.seconds:.2g}",
+            "--seconds": f"{self.seconds:.4g}",
             "--holdout": self.holdout,
             "--degree": self.extras.degree,
         }

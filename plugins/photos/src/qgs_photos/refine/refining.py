@@ -186,7 +186,7 @@ class _Run:
             if part == 1 or (side // part >= _LEAST_SIDE and end > begin)
         ]
         self.start = min(wanted, gaussians.count)
-        coarsest, _ = self.levels[0]
+        coarsest = self.levels[0][0]
         gaussians = partly_swept(gaussians, coarsest, self.start, swept, self.generator)
         self.size = distance(gaussians, views)
         self.grows = bool(extras.degree) and gaussians.sh is None

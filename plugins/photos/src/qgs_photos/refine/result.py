@@ -28,7 +28,7 @@ from qgs.reconstruction.scene_formats import (
     writer_of,
 )
 from qgs.terminal import print_lines
-from qgs.types import Gaussians, Rendering, Views, World
+from qgs.types import Gaussians, Views, World
 from qgs_photos.refine.adjusting import exposed, fitted_exposure
 from qgs_photos.refine.evidence import Evidence, each_view, errors_of
 from qgs_photos.refine.metric import Distance
@@ -81,11 +81,6 @@ class Result:
         gaussians = in_own_world(self.world, load_ply(file).to(self.views.images.device))
         return replace(self, refined=replace(self.refined, gaussians=gaussians))
 
-    def render(self, views: Views) -> Rendering:
-        """Render the scene from the cameras of `views` (1, V)."""
-        gaussians = replace(self.refined.gaussians, features=None)
-        return VIEWER(gaussians, views.cameras)
-
 
 @torch.no_grad()
 def write_scene(result: Result, out: Path, page: bool, began: float, console: Console) -> None:
@@ -121,7 +116,7 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
             f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
             f"{mean['ssim']:.3f}, alpha {mean['alpha']:.3f}; a copy of the nearest photo: PSNR "
             f"{mean['nearest_input']:.2f} dB; mean error of colours {mean['error']:.3f}, expected "
-            f"{mean['expected_error']:.3f}"
+            f"from the other photos {mean['expected_error'] / record['error_scale']:.3f}"
         )
         if " --adjust exposure" in result.command:
             lines.append(
@@ -139,10 +134,10 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
 def _write_files(result: Result, folder: Path, page: bool, began: float) -> dict[str, Any]:
     """Write the files of `write_scene` into `folder`; return what metrics.json holds."""
     refined = result.refined
-    save_ply(result.in_photos_world(refined.gaussians), folder / "scene.ply")
+    stored = result.in_photos_world(refined.gaussians)
+    save_ply(stored, folder / "scene.ply")
     # .splat files have no harmonics
-    shown = replace(refined.gaussians, sh=None)
-    save_splat(result.in_photos_world(shown), folder / "scene.splat")
+    save_splat(stored.replace(sh=None), folder / "scene.splat")
     result = result.read_back(folder / "scene.ply")
     record = scores(result)
     if result.photos.held_out:
@@ -166,7 +161,7 @@ def page_of(result: Result, record: Mapping[str, Any]) -> str:
     views = replace(result.views, cameras=refined.cameras)
     rows = record["held_out"]
     best = sorted(range(len(rows)), key=lambda row: -rows[row]["psnr"])[:_JUDGED_ON_PAGE]
-    every = max(len(record["refined_on"]) // _ON_PAGE, 1)
+    every = -(-len(record["refined_on"]) // _ON_PAGE)
     stops = result.judged.select(best).joined(views.select(slice(None, None, every)))
     names = [f"{Path(rows[row]['photo']).name}, held out" for row in best]
     names += [Path(name).name for name in record["refined_on"][::every]]
@@ -174,8 +169,7 @@ def page_of(result: Result, record: Mapping[str, Any]) -> str:
     if mean := record["mean"]:
         note += f"; held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}"
     title = Path(result.photos.path).resolve().name
-    maps = (result.evidence.error_map(stop.cameras) for stop in each_view(stops))
-    errors = [*map(error_picture, maps)]
+    errors = [error_picture(result.evidence.error_map(stop.cameras)) for stop in each_view(stops)]
     tour = Tour(title, note, stops, names, len(best), refined.cameras, errors)
     return gaussians_html(refined.gaussians, tour)
 
@@ -187,7 +181,7 @@ def scores(result: Result) -> dict[str, Any]:
     each = list[dict[str, float]]()
     errors = list[Tensor]()
     for photo in each_view(result.judged):
-        rendering = result.render(photo)
+        rendering = VIEWER(result.refined.gaussians, photo.cameras)
         # what no optimisation is needed for
         nearest = nearest_input(result.views, photo.cameras)
         expected = result.evidence.error_map(photo.cameras)
@@ -253,7 +247,7 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
     """
     every = -(-len(rows) // _SHOWN)
     views = result.judged.select(slice(None, None, every))
-    renders = result.render(views).rgb[0]
+    renders = VIEWER(result.refined.gaussians, views.cameras).rgb[0]
     expected = (result.evidence.error_map(view.cameras) for view in each_view(views))
     pictures = {
         "photo": [rgb_picture(image) for image in views.images[0]],

@@ -16,6 +16,7 @@ from qgs.paths import opened_path
 from qgs.reconstruction.scene_formats import writer_of
 from qgs.renderers import AutoRenderer
 from qgs.terminal import print_lines
+from qgs.train.distributed import stop_requests
 from qgs.types import Gaussians, Views, World
 from qgs_photos.datatools.check import faults_of_poses
 from qgs_photos.datatools.findings import Finding
@@ -24,7 +25,7 @@ from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.evidence import MOST, evidence
 from qgs_photos.refine.initial import photos_start
-from qgs_photos.refine.metric import Distance, in_metres, metres, points_of
+from qgs_photos.refine.metric import in_metres, metres, points_of
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import RefinedScene, refine, seconds_of_step
 from qgs_photos.refine.result import Result, has_viewer, write_scene
@@ -65,6 +66,7 @@ def make_scene(
     with console.status("choosing a size for the time"):
         print_lines(console, map(str, faults_of_given_poses(photos)[:1]))
         world, given, options = chosen_start(photos, options)
+        refuse_unknown_points(photos, options)
         small = views_in(world, photos.small, photos.frames).to(options.device)
         # What masks leave out is empty, and black in viewers.
         color = (0.0, 0.0, 0.0) if options.masks else edge_color(small)
@@ -77,8 +79,8 @@ def make_scene(
         plan = Budget(step, small.cameras.size, photos, options)
         size = plan.affordable(left())
         count = plan.count(size)
-        end += min(len(photos.frames), MOST) * plan.mean_step(size)
         frames = (*photos.frames, *photos.held_out)
+        end += (min(len(photos.frames), MOST) + 3 * len(photos.held_out)) * plan.mean_step(size)
         every = views_in(world, photos.at(size), frames).to(options.device)
         every = masked(every) if options.masks else every
     budget = left()
@@ -89,10 +91,9 @@ def make_scene(
     most = int(SWEEP * budget / seconds_of_pixel)
     with console.status("placing Gaussians at pixels"):
         gaussians = given or photos_start(photos.small, world, small, count, most)
-    views = every.select(slice(len(photos.frames)))
     refined = refine(
         gaussians,
-        views,
+        every.select(slice(len(photos.frames))),
         left(),
         count=count,
         # a model's Gaussians leave holes that pixels fill; the others are at pixels already
@@ -102,9 +103,9 @@ def make_scene(
         extras=options.extras,
         begin=BEGIN if options.earlier else 0.0,
     )
-    with console.status("scoring held-out photos and writing files"):
-        around = None if options.masks else color
-        result = finished(command, world, refined, photos, every, around, options.scale_by)
+    # another Ctrl-C must not lose the scene
+    with stop_requests(True), console.status("scoring held-out photos and writing files"):
+        result = finished(command, world, refined, photos, every, color, options)
         write_scene(result, out, page, began, console)
 
 
@@ -114,16 +115,16 @@ def finished(
     refined: RefinedScene,
     photos: ScenePhotos,
     every: Views,
-    color: Sequence[float] | None,
-    distance: Distance | None,
+    color: Sequence[float],
+    options: Options,
 ) -> Result:
     """Return the result of an optimisation with surroundings, and without floaters.
 
-    every: photos of the optimisation, then the held-out photos: (1, V). color: RGB of surroundings;
-    None leaves them out. distance: measured distance by which files are in metres, if given.
+    every: photos of the optimisation, then the held-out photos: (1, V). color: RGB of surroundings,
+    which scenes with masks do not have.
     """
     optimised = refined.gaussians
-    whole = optimised if color is None else surrounded(optimised, every, color)
+    whole = optimised if options.masks else surrounded(optimised, every, color)
     around = whole.count - optimised.count
     views = every.select(slice(len(photos.frames)))
     judged = every.select(slice(len(photos.frames), None))
@@ -132,17 +133,21 @@ def finished(
     refined = replace(refined, gaussians=found.gaussians)
     count = found.gaussians.count - around
     factor = 1.0
+    distance = options.scale_by
     if distance:
-        # an earlier scene may have brought the distance
-        points = photos.points or points_of(distance, photos.at(every.cameras.size))
-        cameras = concatenated([refined.cameras, judged.cameras], 1)
+        points = points_of(distance, photos.at(every.cameras.size))
         # in the order of the photos
         frames = torch.tensor([*photos.frames, *photos.held_out]).argsort()
-        near = found.gaussians[:, around:]
-        units = metres(points, distance[-1], near, cameras[:, frames])
-        factor = units * float(world[1])
+        cameras = concatenated([refined.cameras, judged.cameras], 1)[:, frames]
+        factor = metres(points, distance[-1], found.gaussians[:, around:], cameras, world[1])
         world = in_metres(world, factor)
     return Result(command, count, world, refined, photos, views, judged, found, factor, distance)
+
+
+def refuse_unknown_points(photos: ScenePhotos, options: Options) -> None:
+    """Raise the errors of `points_of` before the minutes of an optimisation."""
+    if options.scale_by:
+        points_of(options.scale_by, photos.at(options.size or photos.small.cameras.size))
 
 
 def with_exposure(

@@ -3,7 +3,6 @@
 from qgs.contracts import Frames, Scene
 from qgs.data.view_samplers import held_out_frames
 from qgs.reconstruction.scenes import Size, photo_scene
-from qgs_photos.refine.metric import points_of
 from qgs_photos.refine.options import NONE, Options
 
 SMALL = 128
@@ -14,19 +13,14 @@ class ScenePhotos:
     """The photos of `qgs scene`, at any size.
 
     path: folder, URL or video. small: the scene with small photos. held_out: indices of photos that
-    are held out for scores. frames: indices of the other photos, for the optimisation. points: of
-    the measured distance; None without one.
+    are held out for scores. frames: indices of the other photos, for the optimisation.
     """
 
     def __init__(self, path: str, options: Options) -> None:
         self.path = path
         self.name = options.scene
         found = self.at(None)
-        small = sized(found, SMALL)
-        self.small = self.at(small)
-        self.points = None
-        if options.scale_by:
-            self.points = points_of(options.scale_by, self.at(options.size or small))
+        self.small = self.at(sized(found, SMALL))
         self.held_out = judged_frames(found, options.holdout)
         self.frames = tuple(frame for frame in range(len(found)) if frame not in self.held_out)
         # a model's inputs are chosen among the others
