@@ -33,11 +33,10 @@ def main(programs: Path, seconds: float, scenes: list[Path]) -> None:
         "| scene | program | seconds | KiB | steps | Gaussians | PSNR, dB | SSIM |\n"
         "|---|---|--:|--:|--:|--:|--:|--:|"
     )
-    commands = yaml.safe_load(programs.read_text())
     for scene in scenes:
         views = split(scene)
         height, width = views.cameras.size
-        for name, command in commands.items():
+        for name, command in yaml.safe_load(programs.read_text()).items():
             out = scene / "peers" / name
             given = (
                 f"photos={scene}/peers out={out} size={height}x{width} minutes={seconds / 60}\n"
@@ -71,17 +70,18 @@ def split(scene: Path) -> Views:
 
 
 def run(command: str, seconds: float) -> list[str]:
-    """Run a program, and return its wall time in seconds and its memory in KiB."""
+    """Run a program, with other `$steps` until it takes `seconds`: wall time, and memory in KiB."""
     log = Path("peers.time")
     steps = 200
-    while True:
+    for _ in range(9):
         shell = f"steps={steps}; {command}"
         subprocess.run(["time", "-o", log, "-f", "%e %M", "sh", "-ec", shell], check=True)
         taken = log.read_text().split()
         pace = seconds / float(taken[0])
-        if "$steps" not in command or abs(pace - 1) < 0.05:
-            return taken
         steps = round(steps * pace)
+        if abs(pace - 1) < 0.05 or "$steps" not in command:
+            break
+    return taken
 
 
 if __name__ == "__main__":

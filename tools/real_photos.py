@@ -70,7 +70,7 @@ def main(
             rows.append({**row, "distance": factor})
     print(table(rows))
     if out:
-        out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+        out.write_text(json.dumps(rows, indent=1))
 
 
 def scene_rows(

@@ -145,6 +145,12 @@ def test_a_page_has_the_colors_of_several_directions(page, tmp_path, monkeypatch
         assert shown == pytest.approx(expected.numpy(), abs=3)
 
 
+# Turns the scene before it is there.
+EARLY = """<script>addEventListener("DOMContentLoaded", () => {
+    document.body.dispatchEvent(new Event("wheel", {bubbles: true}));
+})</script>"""
+
+
 def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     """Photos are negatives of what our renderer shows."""
     lens = (300.0, 300.0, 160.0, 100.0)
@@ -154,7 +160,7 @@ def test_a_tour_stands_where_photos_were_taken(page, tmp_path):
     names = ["</script><b>left</b>", "middle", "right"]
     errors = [rgb_picture(1 - photo.flip(-1)) for photo in photos[0]]
     tour = Tour("walk", "3 photos", Views(1 - photos, cameras), names, 2, cameras, errors)
-    file = opened(page, tmp_path, gaussians_html(given, tour))
+    file = opened(page, tmp_path, gaussians_html(given, tour) + EARLY)
     page.until("the scene", "window.tour && !document.querySelector('#veil')")
     buttons = "[...document.querySelectorAll('#tour nav button')]"
     shown = ["play", "record", "expected error", *names]
@@ -204,10 +210,8 @@ def assert_alone(page, file):
 
 
 def test_a_report(page, tmp_path):
-    names = [stand_in(tmp_path / f"{kind}.safetensors") for kind in PAIR]
-    models = open_models(names, None, "cpu")
-    html = report_html(Comparison(models, {}, {}), model_scenes(models, 2))
-    file = opened(page, tmp_path, html)
+    models = open_models([stand_in(tmp_path / f"{kind}.safetensors") for kind in PAIR], None, "cpu")
+    file = opened(page, tmp_path, report_html(Comparison(models, {}, {}), model_scenes(models, 2)))
     page.until("the script", "document.readyState == 'complete' && !!window.theme.textContent")
 
     shown = "[...document.querySelectorAll('article')].map(a => a.checkVisibility())"

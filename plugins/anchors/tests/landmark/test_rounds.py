@@ -168,11 +168,10 @@ def test_a_model_without_rounds_starts_one_with_rounds(tmp_path, kind):
     model, said = started(plain, tmp_path / "plain.safetensors", *kind)
     given = views()
     assert "feedback.marker: none -> (32,)" in said
-    here = f"landmark/{model.feedback.name}"
-    assert f"trained with model.feedback.type: qgs/none (here {here})" in said
-    weights = model.state_dict()
+    name = f"landmark/{model.feedback.name}"
+    assert f"trained with model.feedback.type: qgs/none (here {name})" in said
     kept = plain.state_dict()
-    assert_equal({name: weights[name] for name in kept}, kept)
+    assert_equal({name: model.state_dict()[name] for name in kept}, kept)
     memory = model.encoder(given)
     state, _ = run(model, (0, 1, 2, 1, 2, 1, 2), model.queries(memory, given), memory)
     assert_close(model(given).state.features, state.features)
@@ -185,8 +184,9 @@ def test_rounds_start_from_rounds_of_their_kind(tmp_path):
     other = "model.feedback.cells=1"
     must_refuse(r"feedback\.embedding\.weight", started, *given, other, kind=CheckpointError)
     for other in (NO_ROUNDS, "model.feedback={type: landmark/gradient}"):
-        _, said = started(*given, other)
+        model, said = started(*given, other)
         assert "feedback.kv_proj.bias: (64,) -> none" in said
+    assert model.feedback.rate.min() > 0
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus", "landmark"])

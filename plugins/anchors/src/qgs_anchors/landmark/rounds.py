@@ -47,7 +47,7 @@ class RoundsFeedback(Feedback):
             yield Problem("layers", reason, f"write at most {depth}, or raise model.decoder.depth")
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the weights `learned` of another model, or `initial` without this kind in it."""
+        """Return the weights `learned` of another model; `initial` if it has no such feedback."""
         known = any(name.startswith(self.learned) for name in learned)
         return dict(learned) if known else self.initial()
 

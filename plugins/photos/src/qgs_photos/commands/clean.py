@@ -49,7 +49,7 @@ def clean(
     inside = in_own_world(in_metres(world, factor_of(source)), gaussians).to(torch.float32)
     found = evidence(inside, views)
     if not found.shown.any():
-        raise ValueError(f"{photos} show nothing of {source}: their poses are of another world")
+        raise ValueError(f"{photos} show nothing of {source}: their poses may be of another world")
     kept = gaussians[:, ~found.floating]
     save_gaussians(kept, out)
     before = quality(found.gaussians, views)

@@ -78,7 +78,7 @@ Degree = Annotated[
         min=0,
         max=3,
         help="Final degree of the spherical harmonics of colours. 0: one colour from all "
-        "directions. Harmonics of --from or of a model stay as they are.",
+        "directions. Gaussians of --from or of a model that have harmonics keep their degree.",
     ),
 ]
 Adjust = Annotated[

@@ -99,4 +99,4 @@ class Budget:
         # stored photos may be smaller, and are never enlarged
         if not self.options.size and size != enough and lacking > 0:
             minutes = math.ceil(lacking / 6) / 10
-            yield f"these photos are small; {minutes} minutes more would give {SMALL} pixels"
+            yield f"these photos are small; {minutes} minutes more would give {min(enough)} pixels"

@@ -77,7 +77,7 @@ class Evidence:
             rgb = VIEWER(self.gaussians, view.cameras).rgb
             found += float(errors_of(rgb, view.images).mean())
         count = judged.images.shape[1]
-        scale = (found / expected) ** (count / (count + 0.5)) if count else 1.0
+        scale = (found / expected) ** (count / (count + 0.5)) if found else 1.0
         return replace(self, errors=scale * self.errors, empty=scale * self.empty, scale=scale)
 
     def cleaned(self, judged: Views) -> "Evidence":

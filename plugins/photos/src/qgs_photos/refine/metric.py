@@ -76,8 +76,8 @@ def metres(
 ) -> float:
     """Return how many metres a unit of the photos' world is.
 
-    length: metres between the points, in the world of Gaussians (1, G) and cameras of all photos
-    (1, F), which is `scale` times the photos' world. If a point shows nothing, or both are at one
+    length: metres between the points. gaussians, cameras: (1, G), and of all photos (1, F), in a
+    world that is `scale` times the photos' world. If a point shows nothing, or both are at one
     place, warns and returns 1.
     """
     start, end = (located(point, gaussians, cameras) for point in points)

@@ -66,7 +66,6 @@ def make_scene(
     with console.status("choosing a size for the time"):
         print_lines(console, map(str, faults_of_given_poses(photos)[:1]))
         world, given, options = chosen_start(photos, options)
-        refuse_unknown_points(photos, options)
         small = views_in(world, photos.small, photos.frames).to(options.device)
         # What masks leave out is empty, and black in viewers.
         color = (0.0, 0.0, 0.0) if options.masks else edge_color(small)
@@ -74,13 +73,14 @@ def make_scene(
         few, seconds_of_pixel = timed_sweep(small)
         options = with_exposure(options, few, small, console)
         step, compiling = seconds_of_step(few, small, renderer, options.extras)
-        # once for each version of qgs: that time would be missing in the scene
-        began += compiling
+        began += compiling  # once for each version of qgs, and not part of the time
         plan = Budget(step, small.cameras.size, photos, options)
         size = plan.affordable(left())
+        if options.scale_by:  # refused before the minutes of optimisation
+            points_of(options.scale_by, photos.at(size))
         count = plan.count(size)
-        frames = (*photos.frames, *photos.held_out)
         end += (min(len(photos.frames), MOST) + 3 * len(photos.held_out)) * plan.mean_step(size)
+        frames = (*photos.frames, *photos.held_out)
         every = views_in(world, photos.at(size), frames).to(options.device)
         every = masked(every) if options.masks else every
     budget = left()
@@ -103,8 +103,8 @@ def make_scene(
         extras=options.extras,
         begin=BEGIN if options.earlier else 0.0,
     )
-    # another Ctrl-C must not lose the scene
-    with stop_requests(True), console.status("scoring held-out photos and writing files"):
+    # Ctrl-C must not lose the scene
+    with stop_requests(False), console.status("scoring held-out photos and writing files"):
         result = finished(command, world, refined, photos, every, color, options)
         write_scene(result, out, page, began, console)
 
@@ -142,12 +142,6 @@ def finished(
         factor = metres(points, distance[-1], found.gaussians[:, around:], cameras, world[1])
         world = in_metres(world, factor)
     return Result(command, count, world, refined, photos, views, judged, found, factor, distance)
-
-
-def refuse_unknown_points(photos: ScenePhotos, options: Options) -> None:
-    """Raise the errors of `points_of` before the minutes of an optimisation."""
-    if options.scale_by:
-        points_of(options.scale_by, photos.at(options.size or photos.small.cameras.size))
 
 
 def with_exposure(
