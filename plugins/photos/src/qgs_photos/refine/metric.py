@@ -35,11 +35,13 @@ class Point(NamedTuple):
     place: tuple[float, float] | None
 
 
-def points_of(distance: Distance, photos: Scene) -> tuple[Point, Point]:
-    """Return the two points of a distance.
+def points_of(distance: Distance | None, photos: Scene) -> tuple[Point, Point] | None:
+    """Return the two points of a distance; None without a distance.
 
     Raises ValueError for a point that does not exist, and for a length that is not above 0.
     """
+    if not distance:
+        return None
     start, end, length = distance
     if start == end or not 0 < length < math.inf:
         raise ValueError(f"--scale-by needs two points and the metres between them: {distance}")

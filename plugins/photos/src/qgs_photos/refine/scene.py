@@ -25,7 +25,7 @@ from qgs_photos.refine.budget import TIMED, Budget
 from qgs_photos.refine.earlier import chosen_start
 from qgs_photos.refine.evidence import MOST, evidence
 from qgs_photos.refine.initial import photos_start
-from qgs_photos.refine.metric import in_metres, metres, points_of
+from qgs_photos.refine.metric import Point, in_metres, metres, points_of
 from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import RefinedScene, refine, seconds_of_step
 from qgs_photos.refine.result import Result, has_viewer, write_scene
@@ -76,16 +76,14 @@ def make_scene(
         began += compiling  # once for each version of qgs, and not part of the time
         plan = Budget(step, small.cameras.size, photos, options)
         size = plan.affordable(left())
-        if options.scale_by:  # refused before the minutes of optimisation
-            points_of(options.scale_by, photos.at(size))
+        scene = photos.at(size)
+        points = points_of(options.scale_by, scene)  # refused before the minutes of optimisation
         count = plan.count(size)
         end += (min(len(photos.frames), MOST) + 3 * len(photos.held_out)) * plan.mean_step(size)
-        frames = (*photos.frames, *photos.held_out)
-        every = views_in(world, photos.at(size), frames).to(options.device)
+        every = views_in(world, scene, (*photos.frames, *photos.held_out)).to(options.device)
         every = masked(every) if options.masks else every
     budget = left()
-    chosen = replace(options, size=size, gaussians=count, seconds=budget)
-    command = chosen.command(path, str(out))
+    command = replace(options, size=size, gaussians=count, seconds=budget).command(path, str(out))
     # before the optimisation: an interrupted one can be repeated
     print_lines(console, [command, *plan.sentences(size, opened, budget)])
     most = int(SWEEP * budget / seconds_of_pixel)
@@ -105,7 +103,7 @@ def make_scene(
     )
     # Ctrl-C must not lose the scene
     with stop_requests(False), console.status("scoring held-out photos and writing files"):
-        result = finished(command, world, refined, photos, every, color, options)
+        result = finished(command, world, refined, photos, every, color, options, points)
         write_scene(result, out, page, began, console)
 
 
@@ -117,11 +115,12 @@ def finished(
     every: Views,
     color: Sequence[float],
     options: Options,
+    points: tuple[Point, Point] | None,
 ) -> Result:
     """Return the result of an optimisation with surroundings, and without floaters.
 
     every: photos of the optimisation, then the held-out photos: (1, V). color: RGB of surroundings,
-    which scenes with masks do not have.
+    which scenes with masks do not have. points: of the measured distance, if there is one.
     """
     optimised = refined.gaussians
     whole = optimised if options.masks else surrounded(optimised, every, color)
@@ -134,8 +133,7 @@ def finished(
     count = found.gaussians.count - around
     factor = 1.0
     distance = options.scale_by
-    if distance:
-        points = points_of(distance, photos.at(every.cameras.size))
+    if distance and points:
         # in the order of the photos
         frames = torch.tensor([*photos.frames, *photos.held_out]).argsort()
         cameras = concatenated([refined.cameras, judged.cameras], 1)[:, frames]
