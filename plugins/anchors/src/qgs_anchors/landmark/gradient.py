@@ -36,8 +36,8 @@ class GradientFeedback(RoundsFeedback):
         """Number of decoder layers, counted from the last, that each feedback round runs again
         after its steps."""
         steps: PositiveInt = 2
-        """Number of steps against the gradient in a round. Each renders all input
-        photos at once."""
+        """Number of steps against the gradient in a round. Each renders all input photos, at
+        once."""
         rate: NonNegativeFloat = 0.05
         """Initial rate of steps, also in a model that starts from one without such rounds."""
 
