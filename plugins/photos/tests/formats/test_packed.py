@@ -1,25 +1,45 @@
 """Compressed files: gsply writes and reads them, others read ours."""
 
-import json
+import math
 import shutil
 import subprocess
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
 import torch
+from browser import CHROMIUM, chromium
 from qgs_photos.formats.gltf import save_glb
+from qgs_photos.viewing import VIEWER
 from tables import assert_equal
-from walk import arc, assert_alike, cloud, pinhole
+from walk import assert_alike, cloud, pinhole
 
 import qgs
+from qgs.geometry.harmonics import seen_colors
+from qgs.geometry.poses import look_at
 from qgs.geometry.transforms import moved
 from qgs.reconstruction.scene_formats import save_gaussians
 
+_ANGLES = torch.arange(50) * math.tau / 50
+_HEIGHTS = torch.tensor([0.6, -0.6]).repeat(25)
+_AXES = torch.stack([_ANGLES.sin(), _HEIGHTS, _ANGLES.cos()], -1)
+AROUND = pinhole(look_at(-3 * _AXES, _AXES, torch.tensor([0.0, 1.0, 0.0])))[None]
+"""Fifty cameras around the origin, whose mean up direction is -y."""
+NEEDS_NPM = pytest.mark.skipif(
+    shutil.which("npm") is None, reason="there is no npm: apt install npm"
+)
+
 
 def assert_close_enough(found, given, sh=0.04):
-    assert_equal(assert_alike(found, given).sh, given.sh[0], atol=sh)
+    """Also the colours that 50 cameras around see."""
+    found = assert_alike(found, given)
+    assert_equal(found.sh, given.sh[0], atol=sh)
+    seen, expected = (seen_colors(scene, AROUND) for scene in (found[None], given))
+    assert_equal(seen, expected, atol=2 * sh)
 
 
 @pytest.mark.parametrize("suffix", ["spz", "compressed.ply"])
@@ -50,9 +70,9 @@ def node(*words, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("npm") is None, reason="there is no npm: apt install npm")
-def test_splat_transform_and_three_read_our_files(tmp_path):
-    node("npm", "install", "three@0.187", "@playcanvas/splat-transform@2.7", folder=tmp_path)
+@NEEDS_NPM
+def test_splat_transform_reads_our_files_and_we_its(tmp_path):
+    node("npm", "install", "@playcanvas/splat-transform@2.7", folder=tmp_path)
     given = cloud(300).replace(sh=torch.rand(1, 300, 15, 3) - 0.5)
     for name in ("a.spz", "a.compressed.ply"):
         save_gaussians(given, tmp_path / name)
@@ -71,17 +91,46 @@ def test_splat_transform_and_three_read_our_files(tmp_path):
         # .spz gives harmonics of degree 2 four bits, .sog has a table of few
         assert_close_enough(found, given, 0.7 if name == "back.sog" else 0.07)
 
-    cameras = pinhole(arc([-20.0, 0, 20], 3).float())[None]
-    save_glb(given, tmp_path / "a.glb", {name: cameras[:, [i]] for i, name in enumerate("abc")})
-    read = Path(__file__).with_name("read_glb.mjs").read_text()
-    (tmp_path / "read.mjs").write_text(read)
-    seen = json.loads(node("node", "read.mjs", "a.glb", folder=tmp_path))
+
+@pytest.fixture
+def served(tmp_path):
+    """The address of the files in a folder."""
+    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        Thread(target=server.serve_forever).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.mark.slow
+@NEEDS_NPM
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium: apt install chromium")
+def test_three_draws_our_scene_from_50_cameras_of_the_file(tmp_path, served):
+    node("npm", "install", "three@0.187", folder=tmp_path)
+    opaque = {"sh": torch.rand(1, 300, 15, 3) - 0.5, "opacities": torch.ones(1, 300)}
+    given = cloud(300).replace(**opaque)
+    names = [f"camera_{place}" for place in range(50)]
+    save_glb(given, tmp_path / "a.glb", {name: AROUND[:, [i]] for i, name in enumerate(names)})
+    shutil.copy(Path(__file__).with_name("read_glb.html"), tmp_path)
+    with chromium(tmp_path / "profile") as page:
+        page.open(f"{served}/read_glb.html")
+        page.until("the pictures", "!!window.seen")
+        seen = page.evaluate("seen")
     assert seen["counts"] == [300]
-    assert [camera["name"] for camera in seen["cameras"]] == [*"abc", "flight"]
+    assert seen["clips"] == [["flight", 49, ["flight.position", "flight.quaternion"]]]
+    assert [view["name"] for view in seen["views"]] == [*names, "flight"]
     turn = np.diag([1.0, -1, -1, 1])
-    lifted = turn.copy()
-    lifted[1, 3] = -np.quantile(-given.means[0, :, 1], 0.02)
-    for camera, c2w in zip(seen["cameras"], cameras.c2w[0].numpy(), strict=False):
-        world = np.reshape(camera["world"], (4, 4)).T
-        np.testing.assert_allclose(world, lifted @ c2w @ turn, atol=1e-5)
-    assert seen["clips"] == [["flight", 2, ["flight.position", "flight.quaternion"]]]
+    poses = AROUND.c2w[0].double().numpy() @ turn
+    worlds = [np.reshape(view["world"], (4, 4)).T for view in seen["views"][:-1]]
+    lifted = worlds[0] @ np.linalg.inv(poses[0])
+    np.testing.assert_allclose(lifted[:3, :3], turn[:3, :3], atol=1e-4)
+    np.testing.assert_allclose(worlds, lifted @ poses, atol=1e-4)
+    means = given.means[0].numpy() @ lifted[:3, :3].T + lifted[:3, 3]
+    farthest = 3 * float(given.scales.max())
+    np.testing.assert_allclose(seen["bounds"], [means.min(0), means.max(0)], atol=farthest)
+    render = VIEWER(given, AROUND)
+    for number, expected in enumerate(render.rgb[0].clamp(0, 1)):
+        picture = torch.tensor(seen["views"][number]["pixels"]).view(64, 64, 4)
+        errors = (picture[..., :3] / 255 - expected.permute(1, 2, 0)).abs().mean(-1)
+        # it blends edges in another way
+        assert errors[render.alpha[0, number, 0] > 0.9].mean() < 0.06

@@ -71,14 +71,16 @@ class Result:
     factor: float
     scale_by: Distance | None
 
-    def in_photos_world(self, gaussians: Gaussians) -> Gaussians:
-        """Return Gaussians (1, G) in the world coordinates of the photos' cameras."""
+    def stored(self) -> Gaussians:
+        """Return the Gaussians (1, G) in the world of the photos, with errors to expect."""
         reference, scale = self.world
+        gaussians = replace(self.refined.gaussians, features=self.evidence.errors[None, :, None])
         return moved(gaussians, reference, 1 / float(scale))
 
     def read_back(self, file: Path) -> "Result":
         """Return a copy of this result with the Gaussians in `file`, so as to score the file."""
-        gaussians = in_own_world(self.world, load_ply(file).to(self.views.images.device))
+        found = load_ply(file).replace(features=None).to(self.views.images.device)
+        gaussians = in_own_world(self.world, found)
         return replace(self, refined=replace(self.refined, gaussians=gaussians))
 
 
@@ -93,12 +95,13 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
     """
     refined = result.refined
     if writer_of(out):
-        stored = refined.gaussians
-        if out.suffix.lower() == ".glb":
-            stored = replace(stored, features=result.evidence.errors[None, :, None])
+        stored = result.stored()
+        # others cannot hold errors to expect
+        if out.suffix.lower() not in (".glb", ".ply"):
+            stored = stored.replace(features=None)
         names = map(result.photos.small.frame_name, result.photos.frames)
         cameras = in_photos_world(result.world, refined.cameras, names)
-        save_gaussians(result.in_photos_world(stored), out, cameras)
+        save_gaussians(stored, out, cameras)
         record = scores(result.read_back(out))
         written = [out]
     else:
@@ -134,10 +137,10 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
 def _write_files(result: Result, folder: Path, page: bool, began: float) -> dict[str, Any]:
     """Write the files of `write_scene` into `folder`; return what metrics.json holds."""
     refined = result.refined
-    stored = result.in_photos_world(refined.gaussians)
+    stored = result.stored()
     save_ply(stored, folder / "scene.ply")
-    # .splat files have no harmonics
-    save_splat(stored.replace(sh=None), folder / "scene.splat")
+    # .splat files have neither
+    save_splat(stored.replace(sh=None, features=None), folder / "scene.splat")
     result = result.read_back(folder / "scene.ply")
     record = scores(result)
     if result.photos.held_out:
