@@ -78,6 +78,8 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     expected, errors = np.transpose(record["expected_and_error"])
     assert (np.diff(expected) > 0).all()
     assert errors.mean() == pytest.approx(record["mean"]["error"], rel=0.01)
+    off = abs(expected / record["error_scale"] - errors).sum() / errors.sum()
+    assert record["calibration_error"] == pytest.approx(off)
     foreseen = f"expected from the other photos {expected.mean() / record['error_scale']:.3f}"
     assert f"{record['mean']['error']:.3f}, {foreseen}" in " ".join(output.split())
     is_worse = record["mean"]["psnr"] < record["mean"]["nearest_input"]
@@ -98,7 +100,8 @@ def test_an_earlier_scene_is_optimised_further(photos, tmp_path, monkeypatch):
     few = "--holdout 4 --seconds 0.3 --degree 0"
     earlier = tmp_path / "a"
     size = "--size 32x48 --gaussians 300 --scale-by 0.png 8.png 2.5"
-    _, first = made(f"scene {photos} {few} {size}", earlier)
+    output, first = made(f"scene {photos} {few} {size}", earlier)
+    assert f"in metres: {first['factor']:.4g} times" in output
     options = Options(earlier=earlier, holdout="4")
     world, given, _ = chosen_start(ScenePhotos(str(photos), options), options)
     ours = moved(given, world[0], 1 / world[1])

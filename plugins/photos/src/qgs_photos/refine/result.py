@@ -114,6 +114,8 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
         f"{refined.gaussians.count:,} Gaussians after {refined.steps:,} steps in "
         f"{refined.seconds:.0f} s on {len(result.photos.frames)} photos{ended}"
     ]
+    if result.scale_by:
+        lines.append(f"lengths are in metres: {result.factor:.4g} times those of the photos' world")
     if mean := record["mean"]:
         lines.append(
             f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
@@ -136,7 +138,6 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
 
 def _write_files(result: Result, folder: Path, page: bool, began: float) -> dict[str, Any]:
     """Write the files of `write_scene` into `folder`; return what metrics.json holds."""
-    refined = result.refined
     stored = result.stored()
     save_ply(stored, folder / "scene.ply")
     # .splat files have neither
@@ -201,6 +202,9 @@ def scores(result: Result) -> dict[str, Any]:
         }
         each.append({name: float(values.mean()) for name, values in found.items()})
     mean = {name: sum(row[name] for row in each) / len(each) for name in each[0]} if each else {}
+    scale = result.evidence.scale
+    pairs = groups(torch.cat(errors, 1)) if errors else []
+    off = sum(abs(expected / scale - error) for expected, error in pairs)
     return {
         "command": result.command,
         "gaussians": refined.gaussians.count,
@@ -214,8 +218,10 @@ def scores(result: Result) -> dict[str, Any]:
         "factor": result.factor,
         "scale_by": result.scale_by,
         "mean": mean,
-        "error_scale": result.evidence.scale,
-        "expected_and_error": groups(torch.cat(errors, 1)) if errors else [],
+        "error_scale": scale,
+        "expected_and_error": pairs,
+        # of what the photos of the optimisation let expect
+        "calibration_error": off / sum(error for _, error in pairs) if pairs else None,
         "held_out": [
             {"frame": frame, "photo": name_of(frame), **row}
             for frame, row in zip(result.photos.held_out, each, strict=True)
