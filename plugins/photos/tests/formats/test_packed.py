@@ -78,6 +78,9 @@ def test_splat_transform_reads_our_files_and_we_its(tmp_path):
         save_gaussians(given, tmp_path / name)
         node("npx", "splat-transform", "-w", name, "back.ply", folder=tmp_path)
         assert_close_enough(qgs.load_ply(tmp_path / "back.ply"), given)
+    save_gaussians(given.replace(sh=None), tmp_path / "a.splat")
+    node("npx", "splat-transform", "-w", "a.splat", "back.ply", folder=tmp_path)
+    assert_alike(qgs.load_ply(tmp_path / "back.ply"), given)
     qgs.save_ply(given, tmp_path / "a.ply")
     names = ["back.spz", "back.compressed.ply", "back.glb"]
     if find_spec("imagecodecs"):
