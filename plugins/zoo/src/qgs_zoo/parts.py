@@ -72,19 +72,10 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
 @full_precision
 def quaternions(rotations: Tensor) -> Tensor:
     """Convert rotations (..., 3, 3) to unit quaternions w x y z (..., 4), of arbitrary sign."""
-    a, b, c, d, e, f, g, h, i = rotations.flatten(-2).unbind(-1)
-    # 4 q q^T: each row is the quaternion times 4 times one of its numbers. The row with the
-    # largest diagonal entry is the most precise.
-    outer = [
-        1 + a + e + i, h - f, c - g, d - b,
-        h - f, 1 + a - e - i, d + b, c + g,
-        c - g, d + b, 1 - a + e - i, h + f,
-        d - b, c + g, h + f, 1 - a - e + i,
-    ]  # fmt: skip
-    rows = torch.stack(outer, -1).unflatten(-1, (4, 4))
-    longest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
-    row = torch.take_along_dim(rows, longest, -2).squeeze(-2)
-    return F.normalize(row, dim=-1)
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
+    # Kornia's have unit length only for exact rotations.
+    return F.normalize(rotation_matrix_to_quaternion(rotations), dim=-1)
 
 
 @contextmanager
