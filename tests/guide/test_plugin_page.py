@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from guide_pages import blocks
-from photo_formats import put
-from PIL import Image
+from photo_formats import noise, put, write_photos
 from qgs_dev import Case, CaseRun, cases_of
 from qgs_dev.new_command import rendered
 from tables import must_refuse
@@ -54,11 +53,8 @@ def test_components_keep_their_contracts(package):
 
 
 def test_the_source_keeps_its_contract(package, tmp_path):
-    for name in ("first", "second"):
-        folder = tmp_path / name
-        folder.mkdir()
-        for frame in range(9):
-            Image.effect_noise((40, 24), 9 * frame).save(folder / f"{frame}.png")
+    for scene, photos in enumerate(noise(2, 9, 24, 40, 3)):
+        folder = write_photos(tmp_path / str(scene), photos)
         np.save(folder / "poses.npy", [np.eye(4)] * 9)
         np.save(folder / "lens.npy", [30.0, 30.0, 20.0, 12.0])
     CaseRun(Case(package.ScanSource.Config(path=str(tmp_path)))).check(["core"])

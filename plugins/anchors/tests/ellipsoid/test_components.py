@@ -22,6 +22,7 @@ from qgs_anchors.ellipsoid.components import (
 from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS
+from scipy.spatial.transform import Rotation
 from small_parts import made, shaken
 from tables import assert_equal
 from torch.testing import assert_close
@@ -53,9 +54,7 @@ def test_a_turn_is_about_an_axis_of_the_world_and_never_half_a_turn():
         angle = 2 * math.atan(length / 2)
         quat = turned(about_z, torch.tensor([length, 0.0, 0.0]).double())
         assert_close(quat.norm().item(), 1.0)
-        c = math.cos(angle)
-        s = math.sin(angle)
-        about_x = torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]]).double()
+        about_x = torch.from_numpy(Rotation.from_euler("x", angle).as_matrix())
         assert_close(quat_to_matrix(quat), about_x @ quat_to_matrix(about_z))
 
 
