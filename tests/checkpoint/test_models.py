@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from commands import done, run_qgs
+from photo_formats import put
 from safetensors.torch import load_file
 from tables import must_refuse, names_in
 from training_runs import tiny
@@ -48,8 +49,7 @@ def test_a_name_stands_for_the_path_wherever_one_is_taken(shipped):
 
 
 def test_an_existing_file_of_that_name_wins(shipped):
-    Path("box").mkdir()
-    Path("box/small").write_bytes(shipped.read_bytes())
+    put(Path("box/small"), shipped.read_bytes())
     assert checkpoint_path("box/small") == Path("box/small")
 
 
