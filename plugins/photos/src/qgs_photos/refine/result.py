@@ -265,7 +265,7 @@ def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> image
         "expected error": [*map(error_picture, expected)],
     }
     titles = [f"{Path(row['photo']).name}\n{row['psnr']:.2f} dB" for row in rows[::every]]
-    return figure_picture(grid_figure(pictures, titles), 120)
+    return figure_picture(grid_figure(pictures, titles))
 
 
 def error_picture(errors: Tensor) -> images.Picture:
