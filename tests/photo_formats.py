@@ -216,12 +216,12 @@ def write_colmap(folder, photos, kind, camera=None, model="sparse/0", images="im
     place.mkdir(parents=True, exist_ok=True)
     name, parameters = camera or ("PINHOLE", photos.intrinsics)
     height, width = photos.size
-    numbers = " ".join(map(repr, map(float, parameters)))
+    numbers = " ".join(map(str, parameters))
     line = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {name} {width} {height} {numbers}\n"
     (place / "cameras.txt").write_text(line)
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
     for number in range(len(names), 0, -1):
-        pose = map(repr, map(float, world_to_camera(photos.c2w[number - 1])))
+        pose = map(str, world_to_camera(photos.c2w[number - 1]))
         lines += [f"{number} {' '.join(pose)} 7 {names[number - 1]}"]
         lines += ["3.5 4.5 11 8.0 9.0 -1"]
     (place / "images.txt").write_text("\n".join(lines) + "\n")

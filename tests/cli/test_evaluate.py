@@ -3,11 +3,9 @@
 import csv
 import shutil
 
-import numpy as np
 import pytest
 from commands import ONE_LAYER, done, run_qgs
-from photo_formats import noisy_photos
-from PIL import Image
+from photo_formats import noise, noisy_photos, write_photos
 from tables import contents, must_refuse, read_json, write_json
 from training_runs import resume
 
@@ -102,9 +100,7 @@ def test_tune_says_what_and_how_often():
 
 def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path):
     """Of photos alike but for a little noise, and Gaussians as large as they can be."""
-    rng = np.random.default_rng(0)
-    for file in sorted(noisy_photos(tmp_path, 9).glob("images/*")):
-        Image.fromarray(90 + rng.integers(0, 9, (20, 24, 3), np.uint8)).save(file)
+    write_photos(noisy_photos(tmp_path, 9) / "images", 90 + noise(9, 20, 24, 3) % 9)
     data = f"data={{type: qgs/photos, path: {tmp_path}, image_size: [16, 16], holdout: 3}}"
     views = "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}"
     model = qgs.compose(ONE_LAYER, [data, views])
