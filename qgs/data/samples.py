@@ -126,15 +126,15 @@ def with_noise(
     """
     if not views.pose_noise:
         return cameras
+    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
     c2w = cameras.c2w[0, :inputs]
     angle = math.radians(views.pose_noise)
     turns, moves = torch.from_numpy(rng.normal(0, angle, (2, inputs, 3))).to(c2w)
-    # The exponential of the cross product's matrix is the rotation.
-    cross = torch.linalg.cross(turns[:, None], torch.eye(3).to(c2w)[None]).mT
     distances = (c2w[:, :3, 3] - c2w[0, :3, 3]).norm(dim=-1, keepdim=True)
     # The first pose sets the world and stays exact; noise grows with the distance from it.
     off = cameras.c2w.clone()
-    off[0, 1:inputs, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
+    off[0, 1:inputs, :3, :3] = (c2w[:, :3, :3] @ axis_angle_to_rotation_matrix(turns))[1:]
     off[0, 1:inputs, :3, 3] += (moves * distances)[1:]
     return cameras.replace(c2w=off)
 
