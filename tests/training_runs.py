@@ -98,10 +98,6 @@ def batches(samples, count, size, **options):
         return list(islice(stream, count))
 
 
-def first_batch(recipe):
-    return batches(stream_of(recipe), 1, 2)[0]
-
-
 def losses(run="run"):
     return column(RunFolder(run).history(), "loss")
 

@@ -9,7 +9,7 @@ from qgs_research.bench.run import peak_memory, workload_of
 from tables import must_refuse
 from torch import nn
 from torch.testing import assert_close
-from training_runs import TWO, first_batch, tiny
+from training_runs import TWO, batches, stream_of, tiny
 from varying_head import VaryingHead
 
 from qgs.containers import map_tensors
@@ -58,7 +58,8 @@ class Marked(Loss):
 
 def begun(recipe):
     """The training pass of a new model, and a batch for it."""
-    return TrainingPass(recipe, recipe.build_model().train()), first_batch(recipe)
+    (batch,) = batches(stream_of(recipe), 1, 2)
+    return TrainingPass(recipe, recipe.build_model().train()), batch
 
 
 def setting(renderer, *kinds, dtype=torch.float32):
