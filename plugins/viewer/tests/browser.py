@@ -17,7 +17,7 @@ CHROMIUM = shutil.which("chromium")
 _FLAGS = (
     "--headless --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic "
     "--no-first-run --disable-background-networking --remote-debugging-port=0 "
-    "--remote-allow-origins=* --window-size=1280,800 about:blank"
+    "--remote-allow-origins=* --allow-file-access-from-files --window-size=1280,800 about:blank"
 )
 
 
