@@ -55,8 +55,6 @@ REST = [f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1])]
 
 All are written even if they are 0, because the viewer of the 3DGS release and plugins of game
 engines need them."""
-FEATURE = "feature_"
-"""Name of a property for a channel of `features`, before the channel's index."""
 PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, *_OTHERS)
 
 # Bytes of a header, at most: that of the 3DGS release has 1,500.
@@ -119,11 +117,11 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), as binary little-endian float32.
 
     Colours become f_dc, spherical harmonics f_rest, opacities logits, scales logarithms;
-    quaternions stay w x y z; normals are zero; `features` become feature_0, feature_1, ... Warns if
-    means are written relative to a local origin, which the comment `local origin X Y Z` names.
-    Raises ValueError for several scenes or for numbers that are not finite.
+    quaternions stay w x y z; normals are zero. Warns if `features` are left out, and if means are
+    written relative to a local origin, which the comment `local origin X Y Z` names. Raises
+    ValueError for several scenes or for numbers that are not finite.
     """
-    scene, origin = one_scene(gaussians, "PLY")
+    scene, origin = one_scene(gaussians, "PLY", "features")
     sh = scene.means.new_zeros(scene.count, SH_COUNTS[-1], 3) if scene.sh is None else scene.sh
     columns = [
         scene.means,
@@ -135,11 +133,7 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
         scene.scales.clamp_min(SCALE_MIN).log(),
         scene.quats,
     ]
-    names = [*PROPERTIES]
-    if scene.features is not None:
-        columns.append(scene.features)
-        names += [f"{FEATURE}{index}" for index in range(scene.features.shape[1])]
-    vertices = unstructured_to_structured(torch.cat(columns, 1).numpy(), names=names)
+    vertices = unstructured_to_structured(torch.cat(columns, 1).numpy(), names=PROPERTIES)
     comments = [f"local origin {origin}"] if origin else []
     whole = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -267,16 +261,7 @@ def read_ply(path: Path) -> Gaussians:
     used = sh.any(0).any(-1).nonzero().flatten().tolist()
     kept = next(kept for kept in (0, *SH_COUNTS) if kept > max(used, default=-1))
     colors = colors * SH_C0 + 0.5
-    channels = [name for name in names if name.startswith(FEATURE)]
-    return Gaussians(
-        means,
-        scales,
-        quats,
-        opacities[:, 0],
-        colors,
-        sh[:, :kept] if kept else None,
-        columns(channels) if channels else None,
-    )
+    return Gaussians(means, scales, quats, opacities[:, 0], colors, sh[:, :kept] if kept else None)
 
 
 def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> tuple[Gaussians, str]:

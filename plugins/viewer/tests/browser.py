@@ -17,7 +17,7 @@ CHROMIUM = shutil.which("chromium")
 _FLAGS = (
     "--headless --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic "
     "--no-first-run --disable-background-networking --remote-debugging-port=0 "
-    "--remote-allow-origins=* --allow-file-access-from-files --window-size=1280,800 about:blank"
+    "--remote-allow-origins=* --window-size=1280,800 about:blank"
 )
 
 
@@ -114,9 +114,9 @@ class Page:
 
 
 @contextmanager
-def chromium(profile):
-    """A page in a new browser with its profile in the folder `profile`."""
-    command = [CHROMIUM, f"--user-data-dir={profile}", *_FLAGS.split()]
+def chromium(profile, *flags):
+    """A page in a new browser with its profile in the folder `profile`, and further flags."""
+    command = [CHROMIUM, f"--user-data-dir={profile}", *_FLAGS.split(), *flags]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         port_file = profile / "DevToolsActivePort"

@@ -8,7 +8,7 @@ import gsply
 
 from qgs.files import replacing
 from qgs.geometry.transforms import moved
-from qgs.reconstruction.scene_formats import of_gsply, one_scene, save_ply
+from qgs.reconstruction.scene_formats import of_gsply, save_ply
 from qgs.types import Gaussians
 from qgs_photos.formats import TURN
 
@@ -40,10 +40,9 @@ def save_spz(gaussians: Gaussians, path: str | Path, _: object) -> None:
 
 def _stored(gaussians: Gaussians) -> gsply.GSData:
     """Return what a PLY file stores of one scene, without harmonics that the scene lacks."""
-    scene, _ = one_scene(gaussians, "compressed", "features")
     with TemporaryDirectory() as folder:
         plain = Path(folder, "plain.ply")
-        save_ply(scene.replace(features=None), plain)
+        save_ply(gaussians, plain)
         stored = gsply.plyread(plain)
     count = 0 if gaussians.sh is None else gaussians.sh.shape[-2]
     stored.shN = stored.shN[:, :count]

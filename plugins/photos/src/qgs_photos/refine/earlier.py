@@ -54,8 +54,7 @@ def chosen_start(photos: ScenePhotos, options: Options) -> Start:
             f"other photos held out: give what its command names, {record.command}"
         )
     world = photos_world(photos)
-    stored = load_ply(file).replace(features=None)
-    every = in_own_world(in_metres(world, record.factor), stored).to(options.device)
+    every = in_own_world(in_metres(world, record.factor), load_ply(file)).to(options.device)
     # surroundings come first
     gaussians = every[:, -record.optimised :]
     count = options.gaussians or gaussians.count

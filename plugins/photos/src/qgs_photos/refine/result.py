@@ -71,16 +71,14 @@ class Result:
     factor: float
     scale_by: Distance | None
 
-    def stored(self) -> Gaussians:
-        """Return the Gaussians (1, G) in the world of the photos, with errors to expect."""
+    def in_photos_world(self, gaussians: Gaussians) -> Gaussians:
+        """Return Gaussians (1, G) in the world coordinates of the photos' cameras."""
         reference, scale = self.world
-        gaussians = replace(self.refined.gaussians, features=self.evidence.errors[None, :, None])
         return moved(gaussians, reference, 1 / float(scale))
 
     def read_back(self, file: Path) -> "Result":
         """Return a copy of this result with the Gaussians in `file`, so as to score the file."""
-        found = load_ply(file).replace(features=None).to(self.views.images.device)
-        gaussians = in_own_world(self.world, found)
+        gaussians = in_own_world(self.world, load_ply(file).to(self.views.images.device))
         return replace(self, refined=replace(self.refined, gaussians=gaussians))
 
 
@@ -95,13 +93,13 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
     """
     refined = result.refined
     if writer_of(out):
-        stored = result.stored()
-        # others cannot hold errors to expect
-        if out.suffix.lower() not in (".glb", ".ply"):
-            stored = stored.replace(features=None)
+        stored = refined.gaussians
+        # readers of PLY files break at properties that they do not know
+        if out.suffix.lower() == ".glb":
+            stored = replace(stored, features=result.evidence.errors[None, :, None])
         names = map(result.photos.small.frame_name, result.photos.frames)
         cameras = in_photos_world(result.world, refined.cameras, names)
-        save_gaussians(stored, out, cameras)
+        save_gaussians(result.in_photos_world(stored), out, cameras)
         record = scores(result.read_back(out))
         written = [out]
     else:
@@ -114,7 +112,7 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
         f"{refined.gaussians.count:,} Gaussians after {refined.steps:,} steps in "
         f"{refined.seconds:.0f} s on {len(result.photos.frames)} photos{ended}"
     ]
-    if result.scale_by:
+    if result.factor != 1:
         lines.append(f"lengths are in metres: {result.factor:.4g} times those of the photos' world")
     if mean := record["mean"]:
         lines.append(
@@ -138,10 +136,10 @@ def write_scene(result: Result, out: Path, page: bool, began: float, console: Co
 
 def _write_files(result: Result, folder: Path, page: bool, began: float) -> dict[str, Any]:
     """Write the files of `write_scene` into `folder`; return what metrics.json holds."""
-    stored = result.stored()
+    stored = result.in_photos_world(result.refined.gaussians)
     save_ply(stored, folder / "scene.ply")
-    # .splat files have neither
-    save_splat(stored.replace(sh=None, features=None), folder / "scene.splat")
+    # .splat files have no harmonics
+    save_splat(stored.replace(sh=None), folder / "scene.splat")
     result = result.read_back(folder / "scene.ply")
     record = scores(result)
     if result.photos.held_out:
@@ -220,7 +218,7 @@ def scores(result: Result) -> dict[str, Any]:
         "mean": mean,
         "error_scale": scale,
         "expected_and_error": pairs,
-        # of what the photos of the optimisation let expect
+        # before that scaling
         "calibration_error": off / sum(error for _, error in pairs) if pairs else None,
         "held_out": [
             {"frame": frame, "photo": name_of(frame), **row}
