@@ -141,10 +141,7 @@ class Frusta:
         seen = self.seen(target, near)
         frames = np.array(near)
         # Pairs of inputs are the ends of a window; a single input is both ends.
-        first = np.arange(len(near))
-        second = first
-        if inputs > 1:
-            first, second = np.triu_indices(len(near), 1)
+        first, second = np.triu_indices(len(near), 1) if inputs > 1 else np.diag_indices(len(near))
         a = frames[first]
         b = frames[second]
         # Comparing with a photo that is almost an input says little.

@@ -22,10 +22,9 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
         raise FileNotFoundError(
             f"{path} (from {UPath.cwd()}) does not exist: give the folder of a data set"
         )
-    # Plug-ins come first: many layouts hold photos, but only a plug-in reads all of the layout.
-    asked = sorted(sources, key=lambda kind: kind.startswith("qgs/"))
     found: list[str] = []
-    for kind in asked:
+    # Plug-ins come first: many layouts hold photos, but only a plug-in reads all of the layout.
+    for kind in sorted(sources, key=lambda kind: kind.startswith("qgs/")):
         source: Any = sources[kind]
         try:
             if source.recognises(path):

@@ -140,10 +140,8 @@ def _weights(
 
     means, conics, opacities: values of the splats (G, ...), sorted front to back.
     """
-    height, width = size
     # Pixel centres are at .5: (0, 0) is the corner of the image.
-    u = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
-    v = torch.arange(height, dtype=means.dtype, device=means.device) + 0.5
+    v, u = (torch.arange(side, dtype=means.dtype, device=means.device) + 0.5 for side in size)
     # (G, 1, W), (G, H, 1)
     dx = u - means[:, None, :1]
     dy = v[:, None] - means[:, 1:, None]

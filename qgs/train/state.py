@@ -167,8 +167,7 @@ class OptimizerState:
         Raises KeyError if a parameter has no entry.
         """
         kept = {place: state[name] for place, name in enumerate(self._names) if state[name]}
-        present = self._optimizer.state_dict()
-        self._optimizer.load_state_dict({**present, "state": kept})
+        self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": kept})
 
 
 class MovingAverage(AveragedModel):

@@ -244,7 +244,7 @@ def _slices(cameras: Cameras, step: int) -> list[slice]:
 
 
 def _trained(parameters: Tensors, layer: LayerPrediction) -> Tensors:
-    tensors = {**parameters, **dict(named_tensors(layer))}
+    tensors = parameters | dict(named_tensors(layer))
     return {name: tensor for name, tensor in tensors.items() if tensor.requires_grad}
 
 

@@ -251,7 +251,7 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
 
     train = named("train")
     test = named("test") | named("val")
-    splits = {**dict.fromkeys(train, "train"), **dict.fromkeys(test, "test")}
+    splits = dict.fromkeys(train, "train") | dict.fromkeys(test, "test")
     rest = "train" if test else None
     if train:
         rest = "unused" if test else "test"
