@@ -160,9 +160,8 @@ class QueryGaussianModel(nn.Module):
                 state, memory = self.feedback(state, first, views, self.decode, self.render)
             elif index == again:
                 first = memory
-            refine = self.refinements[self.refinement_of[index]]
             state, memory = self.decoder[index](state, memory)
-            state = refine(state)
+            state = self.refinements[self.refinement_of[index]](state)
             if number in layers or index == last - 1:
                 decoded[number] = LayerPrediction(self.decode(state), state)
         return Prediction(decoded[len(order)].gaussians, state, decoded)

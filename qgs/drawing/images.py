@@ -37,7 +37,7 @@ def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
     Pixels of depth 0 (unknown) are grey.
     """
     picture = shaded(depth, near, far, DEPTH_MAP)
-    picture[depth.detach()[0].cpu().numpy() <= 0] = NOTHING
+    picture[(depth[0] <= 0).cpu().numpy()] = NOTHING
     return picture
 
 
@@ -57,7 +57,6 @@ def depth_range(depths: Tensor) -> tuple[float, float]:
 
     Without depths above 0, return 0 and 1.
     """
-    depths = depths.detach()
     seen = depths[depths > 0].float()
     if not seen.numel():
         return 0.0, 1.0
@@ -91,11 +90,10 @@ def write_gif(frames: Sequence[Picture], path: str | Path) -> None:
     # One palette for all: others would make still pixels flicker.
     sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
     palette = sample.quantize(256, method=Image.Quantize.MEDIANCUT)
-    images = [
+    first, *rest = [
         Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames
     ]
     milliseconds = round(1000 / FRAMES_PER_SECOND)
-    first, *rest = images
     with replacing(path) as temporary:
         first.save(
             temporary, "GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0
