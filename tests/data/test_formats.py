@@ -30,8 +30,7 @@ from qgs.drawing.images import rgb_picture
 
 
 def assert_same(read, photos):
-    assert read.cameras.c2w.dtype == torch.float64
-    assert_allclose(read.cameras.c2w, photos.c2w, rtol=0, atol=1e-9)
+    assert_equal(read.cameras.c2w, torch.from_numpy(photos.c2w), atol=1e-9)
     expected = [photos.intrinsics] * len(photos.files)
     assert_allclose(read.cameras.intrinsics, expected, rtol=0, atol=1e-9)
     for i, file in enumerate(photos.files):

@@ -5,7 +5,7 @@ from unittest.mock import Mock
 import torch
 from line_scenes import Line, Lines, plan_of, samples_of
 from photo_formats import cut, opened, synthetic, write_nerfstudio
-from tables import assert_near, must_refuse, rows, write_json
+from tables import assert_equal, assert_near, must_refuse, rows, write_json
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.evaluate.plan import read_index
@@ -51,7 +51,7 @@ def test_samples_are_those_of_the_index_in_its_order(tmp_path):
     assert (first.scene, second.scene) == ("three", "one")
     assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))
     assert_near(first.targets.images[0, :, 0, 0, 0], [0.02, 0.03, 0.02])
-    assert first.inputs.cameras.c2w[0, 0].tolist() == torch.eye(4).tolist()
+    assert_equal(first.inputs.cameras.c2w[0, 0], torch.eye(4))
 
 
 def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(tmp_path):

@@ -61,10 +61,10 @@ def test_lines_end_on_the_patches_that_are_read_most():
 
 def test_other_inputs_leave_the_scene_where_it_is():
     source = source_of("locus", BY_DISTANCE)
-    every = [(frames, source.scene_of(frames)) for frames in ((1, 4), (4, 1), (4, 5, 1))]
-    for frames, scene in every:
-        c2w = scene.views.cameras.c2w[0, [frames.index(1), frames.index(4)]]
-        assert_equal(c2w, every[0][1].views.cameras.c2w[0], atol=1e-5)
+    expected = source.scene_of((1, 4)).views.cameras.c2w[0]
+    for frames in ((4, 1), (4, 5, 1)):
+        c2w = source.scene_of(frames).views.cameras.c2w[0, [frames.index(1), frames.index(4)]]
+        assert_equal(c2w, expected, atol=1e-5)
 
 
 def test_a_picked_query_stands_out():

@@ -53,7 +53,6 @@ def test_a_turn_is_about_an_axis_of_the_world_and_never_half_a_turn():
     for length in (0.0, 0.01, 1.0, 1e4):
         angle = 2 * math.atan(length / 2)
         quat = turned(about_z, torch.tensor([length, 0.0, 0.0]).double())
-        assert_close(quat.norm().item(), 1.0)
         about_x = torch.from_numpy(Rotation.from_euler("x", angle).as_matrix())
         assert_close(quat_to_matrix(quat), about_x @ quat_to_matrix(about_z))
 
@@ -162,7 +161,7 @@ def _shared(layer):
     state = layer.state
     raw = state[RAW_RADII] if RAW_RADII in state.fields else state[RAW_RADIUS].expand(-1, -1, 3)
     own = {"center": state[CENTER], "radii": raw, "features": state.features}
-    return {**own, **dict(named_tensors(layer.gaussians))}
+    return own | dict(named_tensors(layer.gaussians))
 
 
 READING = ("queries", "centers", "decoder.cross_attention", "decoder.refinement")
