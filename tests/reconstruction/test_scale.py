@@ -49,17 +49,17 @@ def test_without_further_photos_an_input_is_judged_or_inputs_alone():
 def test_the_range_follows_the_unit_and_the_training():
     baseline = float((Walk.cameras.c2w[1] - Walk.cameras.c2w[4])[:3, 3].norm())
     trained = Domain({"baseline": [0.1, 0.4]}, 4)
-    wide = (0.1 / 2 / baseline, 0.4 * 4 / baseline)
-    for depth, expected in (
-        (0.0, wide),
-        (3.0, (0.4 / 3, 2 / 3)),
-        (1.0, (0.4, wide[1])),
-        (100.0, wide),  # the training has another unit
-    ):
-        found = scale.search_range(trained, Walk(), (1, 4), depth)
-        assert found == pytest.approx(expected, rel=1e-5)
     far = Domain({"baseline": [0.1, 0.4], "depth": [5.0, 6.0]}, 4)
-    assert scale.search_range(far, Walk(), (1, 4), 3.0) == pytest.approx(wide, rel=1e-5)
+    wide = (0.1 / 2 / baseline, 0.4 * 4 / baseline)
+    for known, depth, expected in (
+        (trained, 0.0, wide),
+        (trained, 3.0, (0.4 / 3, 2 / 3)),
+        (trained, 1.0, (0.4, wide[1])),
+        (trained, 100.0, wide),  # the training has another unit
+        (far, 3.0, wide),
+    ):
+        found = scale.search_range(known, Walk(), (1, 4), depth)
+        assert found == pytest.approx(expected, rel=1e-5)
     turning = Domain({"baseline": [0.0, 0.0]}, 4)
     assert scale.search_range(turning, Walk(), (1, 4), 3.0) == (1.0, 1.0)
     still = Walk()
