@@ -8,7 +8,7 @@ import pytest
 import torch
 from photo_formats import put
 from safetensors import SafetensorError
-from tables import contents, must_refuse
+from tables import contents, must_refuse, names_in
 
 from qgs.checkpoint.tensors import write_tensors
 from qgs.files import is_leftover, replacing, replacing_entries, write_text
@@ -65,7 +65,7 @@ def test_a_disk_is_called_full_only_where_it_is(tmp_path, monkeypatch):
         assert ("free space" in str(error)) == full
         assert full or error.errno == number
         assert words in str(error)
-        assert not list(tmp_path.iterdir())
+        assert not names_in(tmp_path)
 
 
 def test_leftovers_of_killed_processes_are_told_from_what_users_made(tmp_path):

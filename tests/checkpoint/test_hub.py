@@ -37,11 +37,12 @@ def test_a_model_comes_back_and_its_card_says_what_the_checkpoint_knows(hub, tmp
     qgs.save(model, run / "checkpoint.safetensors", extra={"step": "1200", KEY: seen.text})
     put(run / SCORES, b"| method | PSNR |\n")
     url = qgs.push_to_hub(run, "me/locus", license="apache-2.0", branch="v1")
+    pushed = Path(url)
     back = qgs.from_pretrained(url)
     assert_equal(back.state_dict(), model.state_dict())
 
-    assert names_in(Path(url)) == {"README.md", "config.json", "checkpoint.safetensors"}
-    _, data, text = (Path(url) / "README.md").read_text().split("---\n", 2)
+    assert names_in(pushed) == {"README.md", "config.json", "checkpoint.safetensors"}
+    _, data, text = (pushed / "README.md").read_text().split("---\n", 2)
     assert yaml.safe_load(data)["license"] == "apache-2.0"
     for told in (
         'qgs.from_pretrained("me/locus")',
@@ -53,7 +54,7 @@ def test_a_model_comes_back_and_its_card_says_what_the_checkpoint_knows(hub, tmp
     ):
         assert told in text
     # nobody else needs to know where the run lies
-    assert not any(str(tmp_path).encode() in file for file, _ in contents(Path(url)).values())
+    assert not any(str(tmp_path).encode() in file for file, _ in contents(pushed).values())
     (run / SCORES).write_text("of https://me:secret@host/model")
     must_refuse("a password", qgs.push_to_hub, run, "me/locus", license="apache-2.0")
 

@@ -35,8 +35,7 @@ def test_an_index_becomes_a_protocol_and_strict_evaluations_that_lack_a_scene_fa
     words = (f"eval {trained[1]} --out {out} --index", index)
     done(*words)
     assert summary(out)["protocol"]["name"] == "two: rooms"
-    content = read_json(out / "protocol.json")
-    assert content["views"]["index"].keys() == {"test/000001", "absent"}
+    assert read_json(out / "protocol.json")["views"]["index"].keys() == {"test/000001", "absent"}
     assert str(tmp_path) not in (out / "summary.json").read_text()
     assert run_qgs(*words, "--strict").exit_code == 1
     write_json(index, {"test/000001": entry})

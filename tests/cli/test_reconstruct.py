@@ -10,7 +10,7 @@ from commands import done, record_of, saved
 from photo_formats import put, scene
 from PIL import Image
 from reconstructing import HOLDOUTS, kinds
-from tables import must_refuse, rows
+from tables import must_refuse, names_in, rows
 
 import qgs
 from qgs.reconstruction.scenes import frame_list
@@ -125,4 +125,4 @@ SENSELESS = """
 def test_options_that_make_no_sense_are_refused(checkpoint, photos, here):
     for words, reason in rows(SENSELESS):
         must_refuse(reason, written, "out", f"{checkpoint} {photos} {words}")
-    assert not [*here.iterdir()]
+    assert not names_in(here)

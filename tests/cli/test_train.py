@@ -56,7 +56,7 @@ def test_what_is_missing_is_told_before_training(here):
     for overrides, message in cases:
         line = f"train {FINETUNE} --out run --device cpu"
         must_not_find(message, done, line, *sets(*overrides))
-        assert not list(here.iterdir())
+        assert not names_in(here)
 
 
 def test_paths_become_absolute_and_urls_stay(here):

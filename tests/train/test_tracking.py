@@ -8,7 +8,7 @@ from unittest.mock import MagicMock
 
 import pytest
 from accelerate import PartialState
-from tables import must_refuse, text_console
+from tables import must_refuse, names_in, text_console
 from training_runs import TRAINED, read_jsonl, resume, run, tiny
 
 from qgs.contracts import MissingExtraError
@@ -67,7 +67,7 @@ def test_a_missing_tracker_is_told_before_anything_is_made(here, monkeypatch):
     monkeypatch.setattr("qgs.train.tracking.find_spec", lambda name: None)
     recipe = tiny("tokengs", "training.trackers=[tensorboard]")
     must_refuse("pip install tensorboard", run, recipe, kind=MissingExtraError)
-    assert not [*here.iterdir()]
+    assert not names_in(here)
 
 
 def test_tensorboard_gets_what_the_history_gets_and_drops_what_was_lost(copied):

@@ -62,7 +62,7 @@ def test_names_that_are_refused(tmp_path: Path) -> None:
     names = ("Far Sighted", "../escape", "", "locus", "class", "torch")
     errors = {name: run_qgs("new-plugin --", name).exception for name in names}
     assert not [name for name, error in errors.items() if not isinstance(error, ValueError)]
-    assert not list(tmp_path.iterdir())
+    assert not names_in(tmp_path)
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
