@@ -21,6 +21,7 @@ from qgs.extensions import ExtensionError
 from qgs.reconstruction.scene_formats import PROPERTIES, load_ply, save_gaussians, save_ply
 
 pytestmark = pytest.mark.usefixtures("here")
+REST = [f"f_rest_{index}" for index in range(45)]
 
 
 def harmonic(number, harmonics):
@@ -46,7 +47,7 @@ def ply(**elements):
 def test_the_file_is_that_of_the_3dgs_release():
     """f_rest_0 to 14 are red, 15 to 29 green, 30 to 44 blue."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    names += [f"f_rest_{index}" for index in range(45)]
+    names += REST
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     given = harmonic(50, 8)[0]
     for gaussians in (given, given.replace(sh=None)):
@@ -139,18 +140,17 @@ def test_packed_files_of_other_programs_are_read():
 def test_files_of_fewer_degrees_are_read():
     given = harmonic(4, 3)
     vertices = vertices_of(saved("scene.ply", given))
-    kept = [name for name in PROPERTIES if not name.startswith("f_rest_")]
+    kept = [name for name in PROPERTIES if name not in REST]
 
     def written(rest):
         fewer = repack_fields(vertices[[*kept, *rest]])
-        fewer.dtype.names = [*kept, *(f"f_rest_{index}" for index in range(len(rest)))]
+        fewer.dtype.names = [*kept, *REST[: len(rest)]]
         path = Path("fewer.ply")
         path.write_bytes(ply(vertex=fewer))
         return path
 
-    rest = [f"f_rest_{index}" for index in range(45)]
-    first = rest[0:3] + rest[15:18] + rest[30:33]
-    zeros = rest[3:15] + rest[18:30]
+    first = REST[0:3] + REST[15:18] + REST[30:33]
+    zeros = REST[3:15] + REST[18:30]
     assert torch.equal(load_ply(written(first)).sh, given.sh)
     assert load_ply(written(zeros)).sh is None
     must_refuse("10 properties", load_ply, written(zeros[:10]))
@@ -185,8 +185,7 @@ def test_other_files_are_refused_by_name():
 def test_convert_keeps_the_most_opaque():
     given = harmonic(50, 8)
     qgs.save_ply(given, "all.ply")
-    told = done("convert all.ply few.ply --count 7").output
-    assert "7 of 50 Gaussians" in told
+    assert "7 of 50 Gaussians" in done("convert all.ply few.ply --count 7").output
     few = load_ply("few.ply")
     best = given.opacities[0].topk(7).indices.sort().values  # in the order of the file
     assert_close(few.means[0], given.means[0, best])

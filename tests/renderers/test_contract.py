@@ -198,8 +198,7 @@ def test_images_follow_the_formulas():
     )
     config = RendererConfig(transmittance_min=0.2, alpha_cap=0.6, background=(0.1, 0.2, 0.3))
     rendering = TorchRenderer(config)(gaussians, cameras)
-    images = (rendering.rgb, rendering.features, rendering.depth, rendering.alpha)
-    found = torch.cat(images, 2)
+    found = torch.cat([rendering.rgb, rendering.features, rendering.depth, rendering.alpha], 2)
     colors = seen_colors(gaussians, cameras)
     background = found.new_tensor(config.background)
     for b, v in product(range(2), range(2)):

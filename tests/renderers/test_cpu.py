@@ -24,7 +24,7 @@ def test_the_number_of_threads_changes_no_bit():
         for count in (1, 2, 5):
             torch.set_num_threads(count)
             rendering, gradients = differentiate(RENDER, *scene)
-            results.append({**dict(named_tensors(rendering)), **gradients})
+            results.append(dict(named_tensors(rendering)) | gradients)
         for found in results[1:]:
             assert_equal(found, results[0])
 

@@ -98,7 +98,7 @@ def written_out(objective, inputs, targets):
 def gradients(module, total):
     module.zero_grad()
     total.backward()
-    return {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
+    return {n: p.grad for n, p in module.named_parameters() if p.grad is not None}
 
 
 def furthest(found, wanted):

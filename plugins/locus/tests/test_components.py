@@ -13,7 +13,7 @@ from qgs import QueryState
 
 def test_a_radius_is_read_in_two_ways_and_made_raw():
     radii = torch.tensor([0.05, 0.3, 1.0, 30.0])
-    raw = torch.tensor([raw_radius_of(radius) for radius in radii.tolist()] + [-20.0])
+    raw = torch.tensor([*map(raw_radius_of, radii.tolist()), -20.0])
     floor = support_radius(raw, RadiusOptions())
     offset = support_radius(raw, RadiusOptions(radius_bound="offset"))
     assert_close(floor, torch.cat([radii, torch.tensor([1e-3])]))

@@ -96,14 +96,14 @@ def test_attention_maps_share_one_scale_and_show_what_a_mask_hides_as_nothing():
 
 def test_covariances_are_those_of_points_that_were_placed_one_by_one():
     gaussians = cloud(5)
-    pose = torch.eye(4).double()
-    pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix())
-    pose[:3, 3] = torch.tensor([1.0, -2.0, 0.5])
-    found = splats(moved(gaussians, pose, 1.7))
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix()
+    pose[:3, 3] = [1.0, -2.0, 0.5]
+    found = splats(moved(gaussians, torch.from_numpy(pose), 1.7))
     for g, turn in enumerate(Rotation.from_quat(gaussians.quats[0], scalar_first=True).as_matrix()):
         axes = turn * gaussians.scales[0, g].numpy()  # one standard deviation along each
         ends = gaussians.means[0, g].numpy() + axes.T
-        ends = 1.7 * ends @ pose[:3, :3].T.numpy() + pose[:3, 3].numpy()
+        ends = 1.7 * ends @ pose[:3, :3].T + pose[:3, 3]
         arms = ends - found.centers[g]
         assert_allclose(arms.T @ arms, found.covariances[g], rtol=1e-4, atol=1e-6)
 

@@ -84,8 +84,8 @@ def test_colours_reproject_through_depth():
     views = Views(scene.images(frames)[None], scene.cameras[frames][None])
     depths = scene.depths(frames)
     assert depths.min() > 0  # a room is closed
-    (first, second) = views.images[0]
-    (one, other) = views.cameras[0].intrinsics
+    first, second = views.images[0]
+    one, other = views.cameras[0].intrinsics
     points = (pixel_directions(one, size) * depths[0, 0, ..., None]).flatten(0, 1)
     c2w = views.cameras.c2w[0, 0]
     local = to_camera((points @ c2w[:3, :3].T + c2w[:3, 3])[None], views.cameras)[0, 1]

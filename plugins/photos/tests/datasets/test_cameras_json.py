@@ -32,7 +32,7 @@ def file(photos, tmp_path):
 def rows(columns, **shared):
     """A mapping for each photo."""
     values = zip(*columns.values(), strict=True)
-    return [{**shared, **dict(zip(columns, row, strict=True))} for row in values]
+    return [shared | dict(zip(columns, row, strict=True)) for row in values]
 
 
 def forms(names, poses):

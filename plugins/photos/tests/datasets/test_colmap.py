@@ -98,7 +98,7 @@ def test_names_in_folders_are_read_in_their_order(tmp_path, photos):
     """Blanks in names too, which pycolmap cannot read."""
     for kind, last in (("text", "right/1 a.png"), ("binary", "right/1.png")):
         names = [last, "left/2.png", "left/10.png"]
-        ordered = [f"images/{name}" for name in ("left/10.png", "left/2.png", last)]
+        ordered = [f"images/{name}" for name in reversed(names)]
         scene = read(write_colmap(tmp_path / kind, photos, kind, names=names))
         assert [scene.frame_name(i) for i in range(3)] == ordered
         assert_allclose(scene.cameras.c2w, photos.c2w[[2, 1, 0]], atol=1e-9)

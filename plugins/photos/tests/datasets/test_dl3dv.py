@@ -78,7 +78,7 @@ def is_read_as_written(root):
 
 
 def test_reduced_photos_are_chosen():
-    files = {**scene_files(images="images_8"), **scene_files()}
+    files = scene_files(images="images_8") | scene_files()
     write("abc", {**files, "images_8/0.png": photo(9, (16, 9))})
     for options, red in (({"images": "images_8"}, 90), ({}, 0)):
         assert scene(**options).images([0])[0, 0, 0, 0] * 255 == pytest.approx(red)

@@ -34,6 +34,7 @@ class Room:
         listing = json.dumps({**self.camera, "frames": self.frames})
         for name, data in {**self.files, "transforms.json": listing.encode()}.items():
             put(folder / name, data)
+        return folder
 
 
 class Planted:

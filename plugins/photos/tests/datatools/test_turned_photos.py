@@ -47,8 +47,7 @@ def written(shots, tmp_path):
             room.files[name] = encoded(image, exif=turned(orientation))
             masks.append(255 * (np.array(image)[..., 0] > 128).astype(np.uint8))
         room.mask(masks)
-        room.write(tmp_path / f"{orientation} {listed}")
-        return tmp_path / f"{orientation} {listed}"
+        return room.write(tmp_path / f"{orientation} {listed}")
 
     return written
 

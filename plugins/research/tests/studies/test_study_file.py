@@ -87,9 +87,8 @@ budget: | evaluations: {more: {model: {width: 8}}}\nbudget: | :8: evaluations.mo
 
 
 def test_what_is_wrong_is_told_with_its_line_before_anything_trains(tmp_path):
-    rows = WRONG.replace("VARIANT", VARIANT).strip("\n").splitlines()
     many = "".join(f"  v{n}:\n" for n in range(198))
-    for row in rows:
+    for row in WRONG.replace("VARIANT", VARIANT).strip("\n").splitlines():
         written, instead, place, word = row.replace(r"\n", "\n").replace("MANY", many).split(" | ")
         assert SOUND.count(written) == 1, written
         with pytest.raises(RecipeError) as caught:

@@ -64,10 +64,10 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     sh = theirs["harmonics"][..., :16]
     turned = harmonics(seen[:, [2, 0, 1]], sh.shape[-1] - 1) @ sh[..., 1:].mT
     colours = ours.colors[..., None, :] + harmonics(seen, ours.sh.shape[-2]) @ ours.sh
-    found = (ours.means, covariances(ours), ours.opacities, colours)
+    found = [ours.means, covariances(ours), ours.opacities, colours]
     wanted = [theirs[name] for name in ("means", "covariances", "opacities")]
     wanted.append(0.5 + SH_C0 * sh[..., None, :, 0] + turned)
-    assert_close(found, (*wanted,), rtol=parity.RTOL, atol=parity.ATOL)
+    assert_close(found, wanted, rtol=parity.RTOL, atol=parity.ATOL)
 
 
 def test_both_ways_to_correlate_agree(monkeypatch):
