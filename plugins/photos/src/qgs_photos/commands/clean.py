@@ -19,7 +19,13 @@ app = typer.Typer(help="Leave floaters out of a file of Gaussians.")
 def clean(
     source: Annotated[Path, typer.Argument(metavar="IN", help="File of Gaussians.")],
     photos: Annotated[str, typer.Argument(help="Photos of the scene, with poses in its world.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="New file; must not exist yet.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help="New file; must not exist yet. A .glb gets the cameras of the photos.",
+        ),
+    ],
     scene_name: SceneName = None,
 ) -> None:
     """Leave out Gaussians near a camera that at most two photos show.
@@ -31,7 +37,7 @@ def clean(
 
     import torch
 
-    from qgs.data.samples import views_in
+    from qgs.data.samples import in_photos_world, views_in
     from qgs.reconstruction.scene_formats import load_ply, save_gaussians
     from qgs_photos.record import factor_of
     from qgs_photos.refine.evidence import evidence, quality
@@ -46,12 +52,14 @@ def clean(
     world = photos_world(given)
     finer = given.at(sized(given.small, _SIDE))
     views = views_in(world, finer, given.frames)
-    inside = in_own_world(in_metres(world, factor_of(source)), gaussians).to(torch.float32)
+    measured = in_metres(world, factor_of(source))
+    inside = in_own_world(measured, gaussians).to(torch.float32)
     found = evidence(inside, views)
     if not found.shown.any():
         raise ValueError(f"{photos} show nothing of {source}: their poses may be of another world")
     kept = gaussians[:, ~found.floating]
-    save_gaussians(kept, out)
+    names = map(given.small.frame_name, given.frames)
+    save_gaussians(kept, out, in_photos_world(measured, views.cameras, names))
     before = quality(found.gaussians, views)
     after = quality(found.gaussians[:, ~found.floating], views)
     typer.echo(
