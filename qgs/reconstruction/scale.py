@@ -121,7 +121,7 @@ def find_scale(
     model: must be in evaluation mode; the search runs on its device. compared: frames
         kept for the scores of the result, which the search does not render.
     """
-    given = inputs
+    given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
     if len(given) > 2:
         middle = given[len(given) // 2]

@@ -202,7 +202,7 @@ def scores(result: Result) -> dict[str, Any]:
     mean = {name: sum(row[name] for row in each) / len(each) for name in each[0]} if each else {}
     scale = result.evidence.scale
     pairs = groups(torch.cat(errors, 1)) if errors else []
-    off = sum(abs(expected / scale - error) for expected, error in pairs)
+    differences = sum(abs(expected / scale - error) for expected, error in pairs)
     return {
         "command": result.command,
         "gaussians": refined.gaussians.count,
@@ -218,8 +218,8 @@ def scores(result: Result) -> dict[str, Any]:
         "mean": mean,
         "error_scale": scale,
         "expected_and_error": pairs,
-        # before that scaling
-        "calibration_error": off / sum(error for _, error in pairs) if pairs else None,
+        # of errors before that scaling
+        "calibration_error": differences / sum(error for _, error in pairs) if pairs else None,
         "held_out": [
             {"frame": frame, "photo": name_of(frame), **row}
             for frame, row in zip(result.photos.held_out, each, strict=True)
