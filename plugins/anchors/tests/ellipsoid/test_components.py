@@ -53,6 +53,7 @@ def test_a_turn_is_about_an_axis_of_the_world_and_never_half_a_turn():
     for length in (0.0, 0.01, 1.0, 1e4):
         angle = 2 * math.atan(length / 2)
         quat = turned(about_z, torch.tensor([length, 0.0, 0.0]).double())
+        assert_close(quat.norm().item(), 1.0)
         about_x = torch.from_numpy(Rotation.from_euler("x", angle).as_matrix())
         assert_close(quat_to_matrix(quat), about_x @ quat_to_matrix(about_z))
 

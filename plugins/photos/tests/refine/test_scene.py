@@ -1,6 +1,5 @@
 """`qgs scene` on a tiny folder: its files, what it chooses, and the points that it starts from."""
 
-import json
 import re
 import shutil
 import struct
@@ -24,6 +23,7 @@ from qgs_photos.refine.result import has_viewer
 from qgs_photos.refine.scene import faults_of_given_poses
 from qgs_photos.refine.scene_photos import ScenePhotos, judged_frames, sized
 from tables import must_not_find, must_refuse, names_in, read_json, rows, text_console
+from test_gltf import opened
 from test_refining import mean_psnr
 from textured_room import INTRINSICS, walk
 from torch.testing import assert_close
@@ -79,6 +79,7 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     mean = record["mean"]
     assert mean["alpha"] > 0.99
     assert errors.mean() == pytest.approx(mean["error"], rel=0.01)
+    assert expected.mean() == pytest.approx(mean["expected_error"], rel=0.01)
     foreseen = mean["expected_error"] / record["error_scale"]
     line = f"{mean['error']:.3f}, expected from the other photos {foreseen:.3f}"
     assert line in " ".join(output.split())
@@ -154,8 +155,7 @@ def test_a_model_makes_the_start(photos, tmp_path):
 
 def ratio_of_cameras(file, photos):
     """Distances between the cameras in a .glb file over those between the photos."""
-    (length,) = struct.unpack_from("<I", file.read_bytes(), 12)
-    content = json.loads(file.read_bytes()[20 : 20 + length])
+    content, _ = opened(file)
     _, *nodes, flight = content["nodes"]
     assert [node["name"] for node in nodes] == [f"images/{number}.png" for number in range(9)]
     assert flight["name"] == "flight"
