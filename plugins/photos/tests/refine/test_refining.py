@@ -61,7 +61,7 @@ def mean_psnr(gaussians, views):
 
 def free(gaussians):
     """Parameters that are learnt with one rate, whatever is given."""
-    names = ("means", "log_scales", "quats", "opacity_logits", "color_logits", "colors", "sh")
+    names = ("means", "log_scales", "quats", "opacity_logits", "colors", "sh")
     return FreeGaussians(gaussians, dict.fromkeys(names, 1e-2))
 
 
@@ -181,9 +181,9 @@ def test_growth_leaves_the_rendering_as_it_is():
     assert means.diff(dim=0).norm(dim=1).mean() < torch.pdist(means).mean() / 2
 
 
-def refined(views, seconds, **extras):
-    """The true cloud, refined on views that are not quite true."""
-    return refine(cloud(60), views, seconds, swept=0.0, extras=Extras(**extras))
+def refined(views, seconds, start=None, **extras):
+    """The true cloud or another one, refined on views that are not quite true."""
+    return refine(start or cloud(60), views, seconds, swept=0.0, extras=Extras(**extras))
 
 
 def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay():
@@ -231,23 +231,23 @@ def test_exposures_of_photos_leave_the_mean_to_the_gaussians():
     assert error("exposure") < 0.8 * error()
 
 
-def test_harmonics_grow_with_time():
-    seen = []
-
-    def watching(gaussians, cameras):
-        seen.append(0 if gaussians.sh is None else gaussians.sh.shape[-2])
-        return RENDERER(gaussians, cameras)
-
-    def watched(start, seconds):
-        options = {"renderer": watching, "extras": Extras(degree=2)}
-        return refine(start, photos(2), seconds, **options).gaussians.sh.shape
-
-    assert watched(cloud(30), 40) == (1, 30, 8, 3)
-    assert seen == sorted(seen)
-    assert {*seen} == {0, 3, 8}
-    # a start with harmonics of its own keeps them all
+def test_harmonics_are_added_unless_the_start_has_some():
     given = cloud(30).replace(sh=torch.zeros(1, 30, 3, 3))
-    assert watched(given, 5) == given.sh.shape
+    for start, number in ((given, 3), (cloud(30), 8)):
+        assert refined(photos(2), 5, start, degree=2).gaussians.sh.shape[2] == number
+
+
+def test_values_since_the_last_growth_are_averaged():
+    given = free(cloud(20))
+    given.average()
+    given.grow(24, generator())
+    means = given.values["means"]
+    grown = means.detach().clone()
+    for step in (1.0, 1.0, 4.0):
+        means.data += step
+        given.average()
+    given.settle()
+    assert_close(means, grown + 3)
 
 
 def test_what_masks_leave_out_is_black():

@@ -12,28 +12,6 @@ from qgs_photos.commands import refuse_no_time
 
 app = typer.Typer(help="Fit a reconstruction to the photos of its scene.")
 
-Count = Annotated[
-    int | None,
-    typer.Option(
-        min=1, help="Number of Gaussians in the result. Default: that of the reconstruction."
-    ),
-]
-PhotoSize = Annotated[
-    str | None,
-    typer.Option(
-        metavar="HxW",
-        help="Height and width of the photos in the optimisation. Default: the size with which "
-        "the reconstruction was made.",
-    ),
-]
-InputsOnly = Annotated[
-    bool,
-    typer.Option(
-        "--inputs-only",
-        help="Optimise only on the input photos of the reconstruction, not on others of the scene.",
-    ),
-]
-
 
 @app.command()
 def refine(
@@ -52,9 +30,28 @@ def refine(
         ),
     ] = None,
     seconds: Annotated[float, typer.Option(help="Time of the optimisation in seconds.")] = 30.0,
-    gaussians: Count = None,
-    size: PhotoSize = None,
-    inputs_only: InputsOnly = False,
+    gaussians: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Number of Gaussians in the result. Default: that of the reconstruction."
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HxW",
+            help="Height and width of the photos in the optimisation. Default: the size with "
+            "which the reconstruction was made.",
+        ),
+    ] = None,
+    inputs_only: Annotated[
+        bool,
+        typer.Option(
+            "--inputs-only",
+            help="Optimise only on the input photos of the reconstruction, not on others of the "
+            "scene.",
+        ),
+    ] = False,
     scene_name: SceneName = None,
     device: Device = "auto",
 ) -> None:

@@ -61,10 +61,6 @@ Count = Annotated[
         "(or --seconds).",
     ),
 ]
-Seconds = Annotated[
-    float | None,
-    typer.Option(help="Time of the optimisation alone in seconds; --minutes then has no effect."),
-]
 Holdout = Annotated[
     str,
     typer.Option(
@@ -77,7 +73,7 @@ Degree = Annotated[
     typer.Option(
         min=0,
         max=3,
-        help="Final degree of the spherical harmonics of colours. 0: one colour from all "
+        help="Degree of the spherical harmonics of colours. 0: one colour from all "
         "directions. Gaussians of --from or of a model that have harmonics keep their degree.",
     ),
 ]
@@ -89,11 +85,6 @@ Adjust = Annotated[
         "brightness, else nothing."
     ),
 ]
-Masks = Annotated[
-    bool,
-    typer.Option("--masks", help="Treat pixels outside the masks of photos as background."),
-]
-
 ScaleBy = Annotated[
     tuple[str, str, float] | None,
     typer.Option(
@@ -117,11 +108,19 @@ def scene(
     scale: Scale = None,
     size: PhotoSize = None,
     gaussians: Count = None,
-    seconds: Seconds = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            help="Time of the optimisation alone in seconds; --minutes then has no effect."
+        ),
+    ] = None,
     holdout: Holdout = "8",
     degree: Degree = 1,
     adjust: Adjust = None,
-    masks: Masks = False,
+    masks: Annotated[
+        bool,
+        typer.Option("--masks", help="Treat pixels outside the masks of photos as background."),
+    ] = False,
     scale_by: ScaleBy = None,
     scene_name: SceneName = None,
     device: Device = "auto",

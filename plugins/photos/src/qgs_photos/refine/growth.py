@@ -21,28 +21,23 @@ higher threshold would remove faint Gaussians, which show fog."""
 _BESIDE = 0.2
 # Copies of one Gaussian at a time, as in the paper's code.
 _MOST_COPIES = 51
-_COLOR_MARGIN = 0.02
 _OPACITY_MARGIN = 1e-4
 
 
 class FreeGaussians:
     """Gaussians (1, G) as parameters (G, ...) without bounds, and their Adam optimizer.
 
-    values: the parameters by name: means, log_scales, quats, opacity_logits, color_logits, and sh
-    and features if given. With sh, colours have no bounds, so `colors` replaces color_logits.
-    active: number of spherical harmonics that are used; the others keep their values. None without
-    sh. rates: learning rate by name.
+    values: the parameters by name: means, log_scales, quats, opacity_logits, colors, and sh and
+    features if given. rates: learning rate by name.
     """
 
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
-        free = gaussians.sh is not None
         given = {
             "means": gaussians.means,
             "log_scales": gaussians.scales.clamp_min(1e-7).log(),
             "quats": gaussians.quats,
             "opacity_logits": gaussians.opacities.logit(_OPACITY_MARGIN),
-            "color_logits": None if free else gaussians.colors.logit(_COLOR_MARGIN),
-            "colors": gaussians.colors if free else None,
+            "colors": gaussians.colors,
             "sh": gaussians.sh,
             "features": gaussians.features,
         }
@@ -61,7 +56,7 @@ class FreeGaussians:
             eps=1e-15,
             fused=True,
         )
-        self.active = None if gaussians.sh is None else gaussians.sh.shape[-2]
+        self.averaged = 0
 
     @property
     def count(self) -> int:
@@ -76,10 +71,26 @@ class FreeGaussians:
             scales=values["log_scales"].exp(),
             quats=F.normalize(values["quats"], dim=-1),
             opacities=values["opacity_logits"].sigmoid(),
-            colors=values["colors"] if "colors" in values else values["color_logits"].sigmoid(),
-            sh=values["sh"][:, : self.active] if self.active else None,
+            colors=values["colors"],
+            sh=values.get("sh"),
             features=values.get("features"),
         )[None]
+
+    @torch.no_grad()
+    def average(self) -> None:
+        """Include the values in the mean of all values since the last growth."""
+        self.averaged += 1
+        if self.averaged == 1:
+            self.mean = {name: value.clone() for name, value in self.values.items()}
+        for name, mean in self.mean.items():
+            mean.lerp_(self.values[name], 1 / self.averaged)
+
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Replace the values by their mean, if there is one."""
+        if self.averaged:
+            for name, mean in self.mean.items():
+                self.values[name].copy_(mean)
 
     @torch.no_grad()
     def grow(self, count: int, generator: torch.Generator) -> None:
@@ -99,8 +110,10 @@ class FreeGaussians:
             return
         # on the CPU, as the generator is
         weights = torch.where(faint, 0, opacities).cpu()
-        parents = torch.multinomial(weights, needed, replacement=True, generator=generator)
-        parents = parents.to(opacities.device)
+        parents = torch.multinomial(weights, needed, replacement=True, generator=generator).to(
+            opacities.device
+        )
+        self.averaged = 0
         self._split(parents)
         places = self._places_in(parents, generator)
         order = along_curve(_with_copies(self.values["means"], dead, places))

@@ -33,18 +33,18 @@ _RATES = {
     "log_scales": 3.4e-2,
     "quats": 8.5e-3,
     "opacity_logits": 0.085,
-    "color_logits": 4.25e-2,
-    # Beside `sh`: as the logits move a colour of one half.
     "colors": 1e-2,
-    # A twentieth of the logits', as 3DGS has it.
     "sh": 2.1e-3,
     # Features are kept as they are.
     "features": 0.0,
 }
 # Final learning rates over the first. Rates begin with half, until this part of the budget.
-_LAST = 0.28
-_LAST_OF_MEANS = 0.028
+_LAST = 0.5
+_LAST_OF_MEANS = 0.05
 _WARM = 0.15
+# Part of the budget from which on the result is the mean of all steps, because each step fits one
+# photo.
+_AVERAGED = 0.95
 # Weight of SSIM beside the mean squared error.
 _SSIM = 0.25
 # Weight of mean opacity and mean scale: at least the first, else the second over the number of
@@ -63,8 +63,6 @@ _STEPS_BETWEEN_GROWTHS = 40
 _LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))
 # No level is smaller, in pixels: SSIM and the sweep need some.
 _LEAST_SIDE = 64
-# Part of the budget from which on a degree of harmonics is used.
-_DEGREES_FROM = (0.1, 0.35, 0.6)
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,9 @@ class RefinedScene:
 class Extras:
     """Quantities to optimise in addition to means, shapes, opacities and colours of the Gaussians.
 
-    degree: spherical harmonics up to this degree, 0 to 3, are added in steps if the first Gaussians
-    have none; 0 adds none. adjust: properties of each photo: "poses", its camera, and "exposure",
-    an affine map of its colours. Other words have no effect; None leaves the choice to `qgs scene`.
+    degree: spherical harmonics up to this degree, 0 to 3, are added if the first Gaussians have
+    none; 0 adds none. adjust: properties of each photo: "poses", its camera, and "exposure", an
+    affine map of its colours. Other words have no effect; None leaves the choice to `qgs scene`.
     """
 
     degree: int = 0
@@ -189,8 +187,7 @@ class _Run:
         coarsest = self.levels[0][0]
         gaussians = partly_swept(gaussians, coarsest, self.start, swept, self.generator)
         self.size = distance(gaussians, views)
-        self.grows = bool(extras.degree) and gaussians.sh is None
-        if self.grows:
+        if extras.degree and gaussians.sh is None:
             shape = (1, gaussians.count, SH_COUNTS[extras.degree - 1], 3)
             gaussians = gaussians.replace(sh=gaussians.means.new_zeros(shape))
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
@@ -212,10 +209,13 @@ class _Run:
             if self.step > 1:
                 self.spent += perf_counter() - began
             used = self.spent / self.seconds
+            if used >= _AVERAGED:
+                self.free.average()
             progress.show(self.step, loss, quality, used)
         # a budget of a few steps ends before growth is due
         if not stop and self.free.count < self.wanted:
             self.free.grow(self.wanted, self.generator)
+        self.free.settle()
 
     def optimise(self) -> tuple[float, float]:
         """Take a step on one photo, and add Gaussians if their next addition is due.
@@ -233,9 +233,6 @@ class _Run:
             self.order = torch.randperm(self.photos, generator=self.generator).tolist()
         place = self.order.pop()
         photo = views.select([place])
-        if self.grows:
-            degrees = sum(used >= start for start in _DEGREES_FROM)
-            self.free.active = (0, *SH_COUNTS)[degrees]
         gaussians = self.free.gaussians()
         cameras = self.adjustments.cameras(place, photo.cameras)
         rgb = self.renderer(gaussians.replace(features=None), cameras).rgb
@@ -258,7 +255,7 @@ class _Run:
             share = min(used / _GROWN, 1.0)
             now = round(self.start * (self.wanted / self.start) ** share)
             self.free.grow(now, self.generator)
-        return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))
+        return loss.item(), -10 * math.log10(max(error.item(), 1e-10))
 
 
 def partly_swept(
