@@ -48,16 +48,16 @@ def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
     """Return the colours (B, V, G, 3), at least 0, of Gaussians (B, G) from cameras (B, V).
 
     B, G and V are scenes, Gaussians and views. The colour of Gaussians without `sh` does not depend
-    on the camera: the result is `colors` as (B, 1, G, 3). View directions point from the camera's
+    on the camera: the result is (B, 1, G, 3). View directions point from the camera's
     centre to the mean of the Gaussian. The result is differentiable in colors, sh, means and c2w.
     """
-    if gaussians.sh is None:
-        return gaussians.colors[:, None]
-    directions = F.normalize(gaussians.means[:, None] - cameras.c2w[..., None, :3, 3], dim=-1)
-    # Directions from the camera to the Gaussian, as the 3DGS release has them.
-    values = harmonics(directions, gaussians.sh.shape[-2])
-    varying = torch.einsum("bvgc,bgcx->bvgx", values, gaussians.sh)
-    return (gaussians.colors[:, None] + varying).clamp_min(0)
+    colors = gaussians.colors[:, None]
+    if gaussians.sh is not None:
+        offsets = gaussians.means[:, None] - cameras.c2w[..., None, :3, 3]
+        # Directions from the camera to the Gaussian, as the 3DGS release has them.
+        values = harmonics(F.normalize(offsets, dim=-1), gaussians.sh.shape[-2])
+        colors = colors + torch.einsum("bvgc,bgcx->bvgx", values, gaussians.sh)
+    return colors.clamp_min(0)
 
 
 @full_precision

@@ -246,7 +246,7 @@ def harmonics_script(scene: QueryScene) -> str:
     if gaussians.sh is None:
         return ""
     colors = gaussians.colors[0, :, None].cpu()
-    # viser's colours are from 0 to 1, which those beside harmonics may leave
+    # viser's colours are from 0 to 1, which those of a scene may leave
     values = torch.cat([colors - colors.clamp(0, 1), gaussians.sh[0].cpu()], 1)
     most = float(values.abs().max()) + 1e-6
     # most coefficients are far smaller than the largest: 8 bits of their roots are closer

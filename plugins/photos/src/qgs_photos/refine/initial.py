@@ -29,7 +29,7 @@ from qgs_photos.viewing import in_own_world
 
 ENOUGH = 4
 """Least number of photos for which Gaussians at pixels are as good a start of the optimisation as
-the Gaussians of a model. docs/refine.md explains the choice."""
+the Gaussians of a model."""
 _OPACITY = 0.1
 # Nearest points that give a size.
 _NEIGHBOURS = 3

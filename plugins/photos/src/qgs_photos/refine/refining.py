@@ -42,8 +42,7 @@ _RATES = {
 _LAST = 0.5
 _LAST_OF_MEANS = 0.05
 _WARM = 0.15
-# Part of the budget from which on the result is the mean of all steps, because each step fits one
-# photo.
+# Part of the budget from which on values are averaged, because each step fits one photo.
 _AVERAGED = 0.95
 # Weight of SSIM beside the mean squared error.
 _SSIM = 0.25
@@ -51,8 +50,8 @@ _SSIM = 0.25
 # photos, because few photos leave more freedom to fill space with fog.
 _SMALL = 0.06
 _SMALL_OF_FEW = 0.4
-# Weight of squares of what lies outside of 0 to 1 in colours beside harmonics, which .spz, .splat
-# and many viewers cannot hold.
+# Weight of squares of what lies outside of 0 to 1 in colours (without their harmonics), which .spz,
+# .splat and many viewers cannot hold.
 _OUTSIDE = 10.0
 # Part of the budget at which growth is complete.
 _GROWN = 0.6
@@ -146,8 +145,8 @@ def seconds_of_step(
 ) -> tuple[float, float]:
     """Measure the seconds of a step of `refine` on these Gaussians and photos (1, V).
 
-    Runs four steps with all spherical harmonics. Returns the least time of the last three steps,
-    and the additional time of the first step, in which kernels compile.
+    Runs four steps. Returns the least time of the last three steps, and the additional time of the
+    first step, in which kernels compile.
     """
     # at the end of the schedule
     run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras, 1.0)
@@ -209,8 +208,6 @@ class _Run:
             if self.step > 1:
                 self.spent += perf_counter() - began
             used = self.spent / self.seconds
-            if used >= _AVERAGED:
-                self.free.average()
             progress.show(self.step, loss, quality, used)
         # a budget of a few steps ends before growth is due
         if not stop and self.free.count < self.wanted:
@@ -255,6 +252,8 @@ class _Run:
             share = min(used / _GROWN, 1.0)
             now = round(self.start * (self.wanted / self.start) ** share)
             self.free.grow(now, self.generator)
+        if used >= _AVERAGED:
+            self.free.average()
         return loss.item(), -10 * math.log10(max(error.item(), 1e-10))
 
 
