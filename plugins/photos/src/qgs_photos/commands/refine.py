@@ -12,6 +12,15 @@ from qgs_photos.commands import refuse_no_time
 
 app = typer.Typer(help="Fit a reconstruction to the photos of its scene.")
 
+PhotoSize = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HxW",
+        help="Height and width of the photos in the optimisation. Default: the size with which "
+        "the reconstruction was made.",
+    ),
+]
+
 
 @app.command()
 def refine(
@@ -36,14 +45,7 @@ def refine(
             min=1, help="Number of Gaussians in the result. Default: that of the reconstruction."
         ),
     ] = None,
-    size: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HxW",
-            help="Height and width of the photos in the optimisation. Default: the size with "
-            "which the reconstruction was made.",
-        ),
-    ] = None,
+    size: PhotoSize = None,
     inputs_only: Annotated[
         bool,
         typer.Option(

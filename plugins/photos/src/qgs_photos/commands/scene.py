@@ -61,6 +61,10 @@ Count = Annotated[
         "(or --seconds).",
     ),
 ]
+Seconds = Annotated[
+    float | None,
+    typer.Option(help="Time of the optimisation alone in seconds; --minutes then has no effect."),
+]
 Holdout = Annotated[
     str,
     typer.Option(
@@ -85,6 +89,10 @@ Adjust = Annotated[
         "brightness, else nothing."
     ),
 ]
+Masks = Annotated[
+    bool,
+    typer.Option("--masks", help="Treat pixels outside the masks of photos as background."),
+]
 ScaleBy = Annotated[
     tuple[str, str, float] | None,
     typer.Option(
@@ -108,19 +116,11 @@ def scene(
     scale: Scale = None,
     size: PhotoSize = None,
     gaussians: Count = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(
-            help="Time of the optimisation alone in seconds; --minutes then has no effect."
-        ),
-    ] = None,
+    seconds: Seconds = None,
     holdout: Holdout = "8",
     degree: Degree = 1,
     adjust: Adjust = None,
-    masks: Annotated[
-        bool,
-        typer.Option("--masks", help="Treat pixels outside the masks of photos as background."),
-    ] = False,
+    masks: Masks = False,
     scale_by: ScaleBy = None,
     scene_name: SceneName = None,
     device: Device = "auto",

@@ -79,9 +79,9 @@ class FreeGaussians:
     @torch.no_grad()
     def average(self) -> None:
         """Include the values in the mean of all values since the last growth."""
-        self.averaged += 1
-        if self.averaged == 1:
+        if not self.averaged:
             self.mean = {name: value.clone() for name, value in self.values.items()}
+        self.averaged += 1
         for name, mean in self.mean.items():
             mean.lerp_(self.values[name], 1 / self.averaged)
 

@@ -207,8 +207,7 @@ class _Run:
             # the first step compiles kernels
             if self.step > 1:
                 self.spent += perf_counter() - began
-            used = self.spent / self.seconds
-            progress.show(self.step, loss, quality, used)
+            progress.show(self.step, loss, quality, self.spent / self.seconds)
         # a budget of a few steps ends before growth is due
         if not stop and self.free.count < self.wanted:
             self.free.grow(self.wanted, self.generator)

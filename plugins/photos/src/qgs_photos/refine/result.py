@@ -279,7 +279,6 @@ def has_viewer(console: Console) -> bool:
     try:
         import qgs_viewer.page  # noqa: F401
     except ImportError:
-        lacking = f"index.html is not written, it needs query-gaussians-viewer: {INSTALL_ALL}"
-        print_lines(console, [lacking])
+        print_lines(console, [f"no index.html: it needs query-gaussians-viewer: {INSTALL_ALL}"])
         return False
     return True

@@ -155,8 +155,8 @@ def with_exposure(
     adjust = "nothing"
     if spread > DIFFER:
         adjust = "exposure"
-        differs = f"the brightness of photos differs by {spread:.0%}"
-        print_lines(console, [f"{differs}: the exposure of each is optimised"])
+        line = f"photos differ in brightness by {spread:.0%}: the exposure of each is optimised"
+        print_lines(console, [line])
     return replace(options, extras=replace(options.extras, adjust=[adjust]))
 
 
