@@ -10,10 +10,10 @@ TEXTS = ("qgs", "plugins", "tests", "tools", "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 488_790},
-    "qgs": {"tokens": 99_530, "parallel": 1, "why": 3},
+    "all": {"tokens": 488_780},
+    "qgs": {"tokens": 99_525, "parallel": 1, "why": 3},
     "plugins": {"tokens": 203_790, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 163_190, "parallel": 1},
+    "tests": {"tokens": 163_180, "parallel": 1},
     "tools": {"tokens": 17_920, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,
