@@ -48,8 +48,8 @@ def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
     """Return the colours (B, V, G, 3), at least 0, of Gaussians (B, G) from cameras (B, V).
 
     B, G and V are scenes, Gaussians and views. The colour of Gaussians without `sh` does not depend
-    on the camera: the result is (B, 1, G, 3). View directions point from the camera's
-    centre to the mean of the Gaussian. The result is differentiable in colors, sh, means and c2w.
+    on the camera: the result is (B, 1, G, 3). View directions point from the camera's centre to the
+    mean of the Gaussian. The result is differentiable in colors, sh, means and c2w.
     """
     colors = gaussians.colors[:, None]
     if gaussians.sh is not None:

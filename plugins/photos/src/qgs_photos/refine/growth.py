@@ -110,9 +110,8 @@ class FreeGaussians:
             return
         # on the CPU, as the generator is
         weights = torch.where(faint, 0, opacities).cpu()
-        parents = torch.multinomial(weights, needed, replacement=True, generator=generator).to(
-            opacities.device
-        )
+        parents = torch.multinomial(weights, needed, replacement=True, generator=generator)
+        parents = parents.to(opacities.device)
         self.averaged = 0
         self._split(parents)
         places = self._places_in(parents, generator)

@@ -155,8 +155,7 @@ def with_exposure(
     adjust = "nothing"
     if spread > DIFFER:
         adjust = "exposure"
-        line = f"photos differ in brightness by {spread:.0%}: the exposure of each is optimised"
-        print_lines(console, [line])
+        print_lines(console, [f"brightness differs by {spread:.0%}: exposures are optimised"])
     return replace(options, extras=replace(options.extras, adjust=[adjust]))
 
 
