@@ -185,8 +185,10 @@ class ImageMemory(TensorContainer):
         memory. Copies of the memory start with an empty cache. Results without gradients, or from
         inference mode, are not used for calls with gradients.
         """
+        # torch.compile cannot trace the question, and makes graphs for each mode.
+        inference = not torch.compiler.is_compiling() and torch.is_inference_mode_enabled()
         # What was made without gradients is of no use to a pass that needs them.
-        key = (name, torch.is_grad_enabled(), torch.is_inference_mode_enabled())
+        key = (name, torch.is_grad_enabled(), inference)
         if key not in self._derived:
             self._derived[key] = compute()
         return self._derived[key]

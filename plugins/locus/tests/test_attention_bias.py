@@ -92,5 +92,6 @@ def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(monkeypatch
             made.clear()
             seen = found(attention, kind, given, learnt)
             assert seen.keys() == {"read", *learnt}
-            assert {tuple(x is not None for x in pair) for pair in made} == wanted
+            if attention is biased_attention:
+                assert {tuple(x is not None for x in pair) for pair in made} == wanted
             assert not wrong(seen, best)

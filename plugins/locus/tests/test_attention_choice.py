@@ -6,7 +6,7 @@ import pytest
 import torch
 from qgs_locus.kernels import attention_choice
 from qgs_locus.kernels.attention_bias import biased_attention
-from qgs_locus.kernels.attention_choice import SHARE, chosen_kernel
+from qgs_locus.kernels.attention_choice import SHARE, chosen_kernel, has_triton
 from qgs_locus.ray_bias import RayBias
 from tables import must_refuse
 
@@ -24,11 +24,12 @@ def case(bias_type=RayBias, dtype=torch.float32, width=8):
 
 @pytest.fixture
 def chosen(monkeypatch):
-    """What a GPU chooses of which a layer may take `memory` bytes, with this version of Triton."""
+    """What a GPU chooses of which a layer may take `memory` bytes, with or without Triton."""
 
-    def of(kernel="auto", memory=0, version=(3, 5), learnt=False, **options):
-        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, memory * SHARE))
-        monkeypatch.setattr(attention_choice, "triton_version", lambda: version)
+    def of(kernel="auto", memory=0, triton=True, learnt=False, **options):
+        gpu = SimpleNamespace(total_memory=memory * SHARE)
+        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
+        monkeypatch.setattr(attention_choice, "TRITON", triton)
         q, bias = case(**options)
         bias.tokens.requires_grad_(learnt)
         # a tensor, as far as the choice looks, that says it is on CUDA
@@ -55,9 +56,8 @@ def test_the_plain_path_is_taken_while_it_fits(chosen):
 
 def test_what_triton_cannot_compute_goes_through_blocks(chosen):
     for options in (
-        {"version": ()},
-        {"version": (3, 2)},
-        {"version": (3, 10), "bias_type": NotInTriton},
+        {"triton": False},
+        {"bias_type": NotInTriton},
         {"width": 300},
         {"dtype": torch.float64},
         {"learnt": True},
@@ -66,13 +66,19 @@ def test_what_triton_cannot_compute_goes_through_blocks(chosen):
         must_refuse("triton", chosen, "triton", **options)
 
 
+def test_triton_is_new_enough(monkeypatch):
+    for version, enough in (("3.2.0", False), ("3.5.1", True), ("3.10.0", True)):
+        monkeypatch.setattr(attention_choice, "version", lambda name, found=version: found)
+        assert has_triton() == enough
+
+
 @torch.no_grad()
 def test_tokens_that_could_learn_go_through_triton_where_nothing_does(chosen):
     assert chosen(learnt=True) == "triton"
 
 
 def test_on_a_cpu_blocks_are_taken_and_triton_is_refused(monkeypatch):
-    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setattr(attention_choice, "INTERPRETED", False)
     q, bias = case()
     assert chosen_kernel(q, bias, "auto") == "blocks"
     must_refuse("a GPU", biased_attention, q, q, q, bias, "triton")

@@ -12,6 +12,7 @@ Axes: F numbers per query and G numbers per token, from which b is computed; n q
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from functools import cache
 from importlib import import_module
 from typing import Any, TypeVar
@@ -20,6 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from qgs.machine import in_threads
 from qgs.precision import full_precision
@@ -41,6 +43,8 @@ _kept = threading.local()
 _UNIT = 2**20
 # Pairs whose `value` is computed at a time: it may need ten times the memory.
 _PART = 2**21
+
+_WITHOUT_CUDNN = [SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
 
 
 class AttentionBias(ABC):
@@ -117,13 +121,13 @@ class AttentionBias(ABC):
         # It needs numba.
         return import_module(self.kernels) if usable else None
 
+    @full_precision
     def dense(self, chosen: Tensor | slice = slice(None)) -> Tensor:
         """Return the bias (B, N, M) of all queries, or (B, Q, M) of the Q queries `chosen`.
 
         chosen: indices (Q,) of queries.
         """
-        bias = type(self)(self.queries[:, chosen], self.tokens)
-        return _outside_graphs(_Dense.apply)(bias.queries, bias.tokens, bias)
+        return torch.vmap(self.value)(self.queries[:, chosen], self.tokens)
 
     def blocks(self, buffers: int, dtype: torch.dtype) -> Iterator[Block]:
         """Yield all queries block by block, each with `buffers` tensors (n, M) to write to."""
@@ -183,15 +187,30 @@ def biased_attention(
     """
     qkv = (q_BhNd, k_BhMd, v_BhMd)
     of_bias = (bias.queries, bias.tokens)
-    chosen = _outside_graphs(chosen_kernel)(q_BhNd, bias, kernel)
+    chosen = chosen_kernel(q_BhNd, bias, kernel)
     if chosen == "plain":
-        mask_B1NM = bias.dense()[:, None].to(q_BhNd.dtype)
-        return F.scaled_dot_product_attention(*qkv, attn_mask=mask_B1NM)
+        eager = q_BhNd.device.type == "cpu" or torch.compiler.is_compiling()
+        mask_B1NM = (attention_mask if eager else _compiled_mask())(bias, q_BhNd.dtype)
+        # cuDNN's gradients would be NaN (pytorch issue 196678).
+        faulty = k_BhMd.shape[2] % 128 == 64
+        with sdpa_kernel(_WITHOUT_CUDNN) if faulty else nullcontext():
+            return F.scaled_dot_product_attention(*qkv, attn_mask=mask_B1NM)
     if chosen == "triton":
-        from qgs_locus.kernels.attention_triton import TritonAttention  # needs triton
+        from qgs_locus.kernels.attention_triton import attention  # needs triton
 
-        return _outside_graphs(TritonAttention.apply)(*qkv, *of_bias)
+        return attention(*qkv, *of_bias)[0]
     return _outside_graphs(_BiasedAttention.apply)(*qkv, *of_bias, bias)
+
+
+def attention_mask(bias: AttentionBias, dtype: torch.dtype) -> Tensor:
+    """Return the bias of all queries and tokens as a mask (B, 1, N, M) in `dtype`."""
+    return bias.dense()[:, None].to(dtype)
+
+
+@cache
+def _compiled_mask() -> Callable[[AttentionBias, torch.dtype], Tensor]:
+    """Return `attention_mask` as one kernel, which stores nothing but the mask."""
+    return torch.compile(attention_mask)
 
 
 def _outside_graphs(function: Callable[..., T]) -> Callable[..., T]:
@@ -202,30 +221,6 @@ def _outside_graphs(function: Callable[..., T]) -> Callable[..., T]:
     """
     outside: Any = torch.compiler.disable if torch.compiler.is_compiling() else lambda f: f
     return outside(function)
-
-
-class _Dense(torch.autograd.Function):
-    """Autograd function that returns the bias (B, N, M) of all queries and tokens."""
-
-    @staticmethod
-    def forward(ctx: Any, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> Tensor:
-        out_BNM = queries.new_empty(*queries.shape[:2], tokens.shape[2])
-        for scene, rows, _ in bias.blocks(0, out_BNM.dtype):
-            bias.write(queries[scene, rows], tokens[scene], out_BNM[scene, rows])
-        # The bias itself is not saved: it is computed again.
-        ctx.save_for_backward(queries, tokens)
-        ctx.bias = bias
-        return out_BNM
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        queries, tokens = ctx.saved_tensors
-        # Block by block, so that the values of all pairs need no memory.
-        sums = _BiasGradients(queries, tokens, ctx.bias)
-        for scene, rows, _ in ctx.bias.blocks(0, gradients[0].dtype):
-            sums.add(scene, rows, gradients[0][scene, rows])
-        return sums.queries, sums.tokens, None
 
 
 class _BiasGradients:

@@ -8,9 +8,7 @@ on sizes only, so all layers, steps and processes make the same choice.
 """
 
 import os
-from functools import cache
-from importlib import import_module
-from importlib.util import find_spec
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -31,6 +29,21 @@ blocks: torch, for some queries at a time. triton: Triton kernels, which never s
 SHARE = 16
 
 
+def has_triton() -> bool:
+    """Return whether triton 3.5 or newer is installed, without importing it."""
+    try:
+        major, minor, *_ = map(int, version("triton").split(".")[:2])
+    except PackageNotFoundError:
+        return False
+    return (major, minor) >= (3, 5)
+
+
+# Constants, so that torch.compile makes one graph of a model.
+TRITON = has_triton()
+# The interpreter runs the kernels on a CPU, which tests do.
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+
+
 def chosen_kernel(
     q_BhNd: Tensor, bias: "AttentionBias", kernel: AttentionKernel
 ) -> AttentionKernel:
@@ -48,7 +61,7 @@ def chosen_kernel(
         return kernel
     if q_BhNd.device.type != "cuda":
         return "blocks"
-    if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
+    if plain_bytes(q_BhNd, bias) <= torch.cuda.get_device_properties(q_BhNd.device).total_memory // SHARE:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
     warn_once(f"attention uses {found}: the bias of all queries and tokens needs too much memory")
@@ -71,22 +84,12 @@ def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
 
 def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:
     """Return whether the Triton kernels are installed and can compute this attention."""
-    # The interpreter runs the kernels on a CPU, which tests do.
-    there = q_BhNd.device.type == "cuda" or os.environ.get("TRITON_INTERPRET") == "1"
     # Blocks of wider heads do not fit into registers.
     return (
-        there
-        and triton_version() >= (3, 5)
+        (q_BhNd.device.type == "cuda" or INTERPRETED)
+        and TRITON
         and bias.in_triton
         and not (bias.tokens.requires_grad and torch.is_grad_enabled())
         and q_BhNd.dtype in (torch.float32, torch.bfloat16, torch.float16)
         and q_BhNd.shape[-1] <= 256
     )
-
-
-@cache
-def triton_version() -> tuple[int, ...]:
-    """Return (major, minor) of the installed triton, or () if it is not installed."""
-    if find_spec("triton") is None:
-        return ()
-    return tuple(map(int, import_module("triton").__version__.split(".")[:2]))
