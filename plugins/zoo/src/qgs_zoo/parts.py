@@ -6,12 +6,13 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from einops import rearrange
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from qgs.containers import concatenated
 from qgs.contracts import FieldSpec, MissingExtraError, Outcome
+from qgs.geometry.constants import constant
+from qgs.geometry.rays import pixel_directions
 from qgs.precision import full_precision
 from qgs.tokengs.blocks import merge_heads, split_heads
 from qgs.types import Cameras
@@ -45,6 +46,13 @@ def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> T
 
 
 @full_precision
+def feature_lenses(cameras: Cameras, size: Sequence[int]) -> Tensor:
+    """Return the intrinsics (B, V, 4) of cameras after resizing the images to `size` (H, W)."""
+    scale = (size[1] / cameras.size[1], size[0] / cameras.size[0])
+    return cameras.intrinsics * constant([*scale, *scale], cameras.intrinsics)
+
+
+@full_precision
 def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
     """Return the rays of each cell of images that are divided into rows x columns cells.
 
@@ -52,19 +60,13 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
     the direction through the cell's upper left corner, and what to add to this direction to reach
     the upper right and the lower left corner.
     """
-    height, width = cameras.size
     c2w = cameras.c2w
-    left = torch.arange(columns, device=c2w.device).to(c2w) * (width / columns)
-    upper = torch.arange(rows, device=c2w.device).to(c2w) * (height / rows)
-    fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
-    x_BV1C1 = rearrange((left - cx) / fx, "b v c -> b v 1 c 1")
-    y_BVR11 = rearrange((upper - cy) / fy, "b v r -> b v r 1 1")
-    right, down, ahead = (x_BV3[:, :, None, None] for x_BV3 in c2w[..., :3, :3].unbind(-1))
-    corner = x_BV1C1 * right + y_BVR11 * down + ahead
-    # Steps across and down one part.
-    across = right * (width / columns / fx)[..., None, None]
-    below = down * (height / rows / fy)[..., None, None]
-    origin = c2w[:, :, None, None, :3, 3]
+    lens = feature_lenses(cameras, (rows, columns))
+    # The half moves rays from the centres of cells to their corners.
+    local = pixel_directions(lens + constant([0, 0, 0.5, 0.5], lens), (rows, columns))
+    corner = torch.einsum("bvij,bvrcj->bvrci", c2w[..., :3, :3], local)
+    across, below = (c2w[..., :3, :2] / lens[..., None, :2]).unbind(-1)
+    origin, across, below = (x[:, :, None, None] for x in (c2w[..., :3, 3], across, below))
     parts = torch.broadcast_tensors(origin, corner, across, below)
     return torch.stack(parts, -2).flatten(1, 3)
 

@@ -5,7 +5,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import torch
@@ -22,6 +22,7 @@ from qgs.geometry.rays import pixel_directions
 from qgs.precision import at_least_float32, full_precision
 from qgs.types import Cameras, ImageMemory, Views
 from qgs_zoo.mvsplat.pixels import OfPixels
+from qgs_zoo.parts import feature_lenses
 
 MIN_DEPTH = 1e-3
 """Least z by which a projection divides, world units. Points behind the camera then project far
@@ -97,13 +98,6 @@ def evenly_spaced(low_N1hw: Tensor, high_N1hw: Tensor, count: int) -> Tensor:
 def relative_poses(c2w_BV44: Tensor, neighbours_BVJ: Tensor) -> Tensor:
     """Return poses (B, V, J, 4, 4) from each view's camera to the cameras of its neighbours."""
     return at_neighbours(c2w_BV44, neighbours_BVJ).inverse() @ c2w_BV44[:, :, None]
-
-
-@full_precision
-def feature_lenses(cameras: Cameras, size: Sequence[int]) -> Tensor:
-    """Return the intrinsics (B, V, 4) of cameras after resizing the images to `size` (H, W)."""
-    scale = (size[1] / cameras.size[1], size[0] / cameras.size[0])
-    return cameras.intrinsics * constant([*scale, *scale], cameras.intrinsics)
 
 
 @full_precision
