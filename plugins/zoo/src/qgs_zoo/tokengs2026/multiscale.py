@@ -244,13 +244,10 @@ class LatentBottleneck(MultiscaleReadout):
         x_BLD = self.latents.expand(len(x_BMC), -1, -1)
         for block in self.latent_blocks:
             x_BLD = block(x_BLD, k_BhMd, v_BhMd)
-        return self._memory(x_BLD)
+        return self.project(x_BLD, ImageMemory(x_BLD))
 
     def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
         """Return the memory for changed latents `features` (B, L, D), with new keys and values."""
         # Tuning at test time changes the latents, and then needs new keys and values.
-        return self._memory(features)
-
-    def _memory(self, latents: Tensor) -> ImageMemory:
-        keys, values = keys_and_values(latents, self.latent_kv_proj, self.k_norm)
-        return ImageMemory(latents, keys, values)
+        keys, values = keys_and_values(features, self.latent_kv_proj, self.k_norm)
+        return ImageMemory(features, keys, values)
