@@ -23,7 +23,7 @@ from qgs.geometry.poses import scaled
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import checked_window, choose_frames, reconstruct
-from qgs.reconstruction.scale import constant_scale
+from qgs.reconstruction.scale import at_factor, constant_scale
 from qgs.reconstruction.scene_formats import about_origin, load_ply
 from qgs.reconstruction.scenes import (
     GivenScene,
@@ -113,8 +113,7 @@ class ModelSource:
         picked, _ = checked_window(len(self.scene), frames)
         own, own_scale = own_world(self.scene, picked, self.views)
         reference, scale = self.world
-        device = next(self.model.parameters()).device
-        inputs = make_sample(self.scene, picked, (), self.views, mirror=False).inputs.to(device)
+        inputs = make_sample(self.scene, picked, (), self.views).inputs.to(self.model.device)
         # other inputs have another world, while the user's view stays
         pose = scaled(torch.linalg.inv(reference.double()) @ own.double(), scale)
         placement = (pose, float(scale) / float(own_scale))
@@ -199,7 +198,7 @@ def open_model(
         shown = _scene(recipe, size, scene)
         chosen = None if frames is None else frame_list(frames, "--frames", shown)
         given, compared = choose_frames(shown, views, inputs, chosen, None, model.trained_on)
-        sample = make_sample(shown, given, compared, views, mirror=False)
+        sample = make_sample(shown, given, compared, views)
         # users learn if these views are like those of the training
         seen = Domain()
         seen.see(sample.inputs.cameras, sample.targets.cameras)
@@ -262,8 +261,7 @@ def open_made(folder: Path) -> Source:
         size = parse_size(words[words.index("--size") + 1])
         # qgs scene PHOTOS
         views = read_photos(words[2], size=size, frames=evenly(record["refined_on"], PHOTOS))
-        c2w = scaled(views.cameras.c2w, record.get("factor", 1.0))
-        views = views.replace(cameras=views.cameras.replace(c2w=c2w))
+        views = at_factor(views, record.get("factor", 1.0))
     except (OSError, ValueError, LookupError) as error:
         notes.append(f"The photos of the scene are not shown: {one_line(error)}")
     shown = QueryScene(gaussians, views, background=(0.0, 0.0, 0.0))
