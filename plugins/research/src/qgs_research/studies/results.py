@@ -166,26 +166,26 @@ def _verdict(results: Results) -> str:
     return f"{word}{where}: {best}, {value}, interval {interval}{of}{small}."
 
 
-def notes(results: Results) -> list[str]:
-    """Return the notes to show below the tables of a study, such as missing runs."""
+def notes(results: Results) -> Iterator[str]:
+    """Yield the notes to show below the tables of a study, such as missing runs."""
     # Readers see the table of the recipes' own evaluation first.
-    found = [*interval_notes([*results.differences().values()]), *training_notes(results)]
+    yield from interval_notes(results.differences().values())
+    yield from training_notes(results)
     if (count := len(results.settings.hypotheses)) > 1:
-        found.append(f"each of the {count} verdicts has 95 % confidence, not all together")
+        yield f"each of the {count} verdicts has 95 % confidence, not all together"
     if results.missing:
-        found.append(f"missing runs: {listed(results.missing)}")
-    found += [f"{run} failed: {run.failed}" for run in results.failed]
+        yield f"missing runs: {listed(results.missing)}"
+    yield from (f"{run} failed: {run.failed}" for run in results.failed)
     # Our order of variants can match the published one even if the values cannot.
     if (rank := results.rank_correlation()) is not None:
-        found.append(f"rank correlation with the published values: {rank:+.2f}")
+        yield f"rank correlation with the published values: {rank:+.2f}"
     for evaluation in results.plan.evaluations:
         where = evaluation or "default evaluation"
         if len(results.protocols(evaluation)) > 1:
-            found.append(f"{where}: protocols differ, so differences between them are not shown")
+            yield f"{where}: protocols differ, so differences between them are not shown"
         unscored = {s for result in results.results_of(evaluation) for s in result.missing}
         if unscored:
-            found.append(f"{where}: some runs have no score for {listed(sorted(unscored))}")
-    return found
+            yield f"{where}: some runs have no score for {listed(sorted(unscored))}"
 
 
 def study_summary(results: Results) -> Summary:
@@ -202,7 +202,7 @@ def study_summary(results: Results) -> Summary:
             published = results.settings.published
             rows = table_rows(results, name, results.metric, others, published)
             tables.append((name, rows))
-    return Summary(answer=answer(results), tables=tables, notes=notes(results))
+    return Summary(answer=answer(results), tables=tables, notes=[*notes(results)])
 
 
 def _hypothesis_row(results: Results, judgement: Judgement) -> list[str]:
@@ -238,7 +238,7 @@ def record(results: Results) -> dict[str, Any]:
             }
             for judgement in results.judgements()
         ],
-        "notes": notes(results),
+        "notes": [*notes(results)],
         "times": [*_times(results)],
     }
 

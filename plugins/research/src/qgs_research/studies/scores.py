@@ -217,11 +217,11 @@ class Scores:
 
         Models for which `difference` returns None are left out.
         """
-        found: dict[str, Estimate] = {}
-        for model in self.models(evaluation):
-            if apart := self.difference(model, self.metric, evaluation, confidence):
-                found[model] = apart
-        return found
+        return {
+            model: apart
+            for model in self.models(evaluation)
+            if (apart := self.difference(model, self.metric, evaluation, confidence))
+        }
 
     def estimate(
         self, terms: Terms, metric: str, confidence: float = CONFIDENCE

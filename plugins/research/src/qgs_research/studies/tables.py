@@ -270,7 +270,7 @@ def record(scores: Scores) -> dict[str, Any]:
 def _notes(scores: Scores) -> Iterator[str]:
     """Yield the notes to show below the tables."""
     yield f"difference: score minus score of {scores.reference}, over common scenes"
-    yield from interval_notes([*scores.differences().values()])
+    yield from interval_notes(scores.differences().values())
     yield from training_notes(scores)
     for sha256 in sorted(scores.protocols(MAIN)):
         yield f"protocol with sha256 {sha256}"
