@@ -6,7 +6,7 @@ axis goes through the centre of the room. Shapes are upright and may be turned a
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -135,14 +135,13 @@ class Furniture(Materials):
         return [self.rng.uniform(-most, most) for _ in range(self.rng.randrange(1, 4))]
 
 
-def _around_table(make: Furniture, sizes: Sizes) -> Piece:
-    """Return chairs around a table, and random ornaments on the table, without the table itself."""
+def _around_table(make: Furniture, sizes: Sizes) -> Iterator[Shape]:
+    """Yield chairs around a table, and random ornaments on the table, without the table itself."""
     rng = make.rng
     w = sizes["w"]
     d = sizes["d"]
-    piece = []
     for x in make.spots(0.38):
-        piece += make.ornament(x * w, rng.uniform(-0.3, 0.3) * d, sizes["h"])
+        yield from make.ornament(x * w, rng.uniform(-0.3, 0.3) * d, sizes["h"])
     # chairs around one table are alike
     alike = {"seat": make.material("fabric"), "frame": make.material("timber")}
     for sign, turn in ((1, 0.0), (-1, math.pi)):
@@ -150,27 +149,25 @@ def _around_table(make: Furniture, sizes: Sizes) -> Piece:
             if rng.random() < 0.75:
                 away = sign * (d / 2 + rng.uniform(0.0, 0.2))
                 at = (sign * x, away, 0.0)
-                chair = make.piece("chair", **alike)
-                piece += [part.moved(turn, at) for part in chair]
-    return piece
+                for part in make.piece("chair", **alike):
+                    yield part.moved(turn, at)
 
 
-def _cushions(make: Furniture, sizes: Sizes) -> Piece:
-    piece = []
+def _cushions(make: Furniture, sizes: Sizes) -> Iterator[Shape]:
     for x in make.spots(0.32):
         (cushion,) = make.piece("cushion", x=x * sizes["w"])
-        piece.append(_turned(cushion, make.rng.gauss(0, 0.15)))
-    return piece
+        yield _turned(cushion, make.rng.gauss(0, 0.15))
 
 
-def _books(make: Furniture, sizes: Sizes) -> Piece:
-    """Return the boards of a shelf, with rows of books and a few balls on the boards."""
+def _books(make: Furniture, sizes: Sizes) -> Iterator[Shape]:
+    """Yield the boards of a shelf, with rows of books and a few balls on the boards."""
     rng = make.rng
     w = sizes["w"]
     levels = sizes["n"]
-    # the top board ends at the height of the sides
-    heights = [min(i * _LEVEL, levels * _LEVEL - 0.03) for i in range(levels + 1)]
-    piece = [solid((0, 0, z), (w, 0.32, 0.03), sizes["wood"]) for z in heights]
+    for i in range(levels + 1):
+        # the top board ends at the height of the sides
+        z = min(i * _LEVEL, levels * _LEVEL - 0.03)
+        yield solid((0, 0, z), (w, 0.32, 0.03), sizes["wood"])
     for i in range(levels):
         z = i * _LEVEL + 0.03
         left = -w / 2 + 0.04
@@ -179,25 +176,22 @@ def _books(make: Furniture, sizes: Sizes) -> Piece:
             x = left + run / 2
             if rng.random() < 0.72:
                 size = (run - 0.02, 0.22, rng.uniform(0.2, 0.3))
-                piece.append(solid((x, 0.02, z), size, make.material("books")))
+                yield solid((x, 0.02, z), size, make.material("books"))
             else:
                 size = [rng.uniform(0.12, 0.18)] * 3
-                piece.append(solid((x, 0, z), size, make.material("paint"), s.BALL))
+                yield solid((x, 0, z), size, make.material("paint"), s.BALL)
             left += run
-    return piece
 
 
-def _doors(make: Furniture, sizes: Sizes) -> Piece:
-    piece = []
+def _doors(make: Furniture, sizes: Sizes) -> Iterator[Shape]:
     h = sizes["h"]
     doors = make.rng.randrange(2, 4)
     wide = sizes["w"] / doors
     for i in range(doors):
         x = (i + 0.5) * sizes["w"] / doors - sizes["w"] / 2
-        piece.append(solid((x, -0.21, 0.12), (wide - 0.04, 0.03, h - 0.18), sizes["front"]))
+        yield solid((x, -0.21, 0.12), (wide - 0.04, 0.03, h - 0.18), sizes["front"])
         knob = (x + 0.3 * wide, -0.24, h / 2)
-        piece.append(solid(knob, (0.05, 0.05, 0.05), sizes["knob"], s.BALL))
-    return piece
+        yield solid(knob, (0.05, 0.05, 0.05), sizes["knob"], s.BALL)
 
 
 # Functions that add to the parts of a piece in the file.

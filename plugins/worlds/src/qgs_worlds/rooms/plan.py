@@ -1,6 +1,7 @@
 """Random plan of a room: walls, window, furniture and lights."""
 
 import math
+from collections.abc import Iterator
 from itertools import product
 from random import Random
 
@@ -159,10 +160,9 @@ def _from_wall(side: int, away: float, along: float) -> Point:
     return rotated(about_z(math.pi + side * math.pi / 2), (away, -along, 0.0))
 
 
-def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
-    """Return the shapes of a window on wall `window_side` and of pictures on the other walls."""
+def _on_walls(make: Furniture, size: Size, window_side: int) -> Iterator[Shape]:
+    """Yield the shapes of a window on wall `window_side` and of pictures on the other walls."""
     rng = make.rng
-    shapes: list[Shape] = []
     for side in range(4):
         across = size[side % 2]
         along = size[1 - side % 2]
@@ -180,26 +180,26 @@ def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
             hung = {place: make.piece("picture") for place in places}
         for place, item in hung.items():
             at = _from_wall(side, across / 2, place)
-            shapes += [shape.moved(turn, at) for shape in item]
-    return shapes
+            yield from (shape.moved(turn, at) for shape in item)
 
 
-def _fixed(make: Furniture, size: Size) -> list[Shape]:
-    """Return the shapes of skirting boards, of a ceiling lamp and, in most rooms, of a rug."""
+def _fixed(make: Furniture, size: Size) -> Iterator[Shape]:
+    """Yield the shapes of skirting boards, of a ceiling lamp and, in most rooms, of a rug."""
     rng = make.rng
     board = make.material("pale")
     w, d, h = size
-    shapes = [solid((0, side * d / 2, 0), (w, 0.04, 0.09), board) for side in (-1, 1)]
-    shapes += [solid((side * w / 2, 0, 0), (0.04, d, 0.09), board) for side in (-1, 1)]
+    for side in (-1, 1):
+        yield solid((0, side * d / 2, 0), (w, 0.04, 0.09), board)
+    for side in (-1, 1):
+        yield solid((side * w / 2, 0, 0), (0.04, d, 0.09), board)
     lamp = (0, 0, h - 0.12)
-    shapes.append(solid(lamp, (0.5, 0.5, 0.12), make.material("glow"), CYLINDER))
+    yield solid(lamp, (0.5, 0.5, 0.12), make.material("glow"), CYLINDER)
     if rng.random() < 0.75:
         wide = rng.uniform(0.35, 0.6) * w
         deep = rng.uniform(0.35, 0.6) * d
         rug = solid((0, 0, 0), (wide, deep, 0.012), make.material("rug"))
         x, y = [rng.uniform(-0.3, 0.3) for _ in range(2)]
-        shapes.append(rug.moved(rng.gauss(0, 0.1), (x, y, 0.0)))
-    return shapes
+        yield rug.moved(rng.gauss(0, 0.1), (x, y, 0.0))
 
 
 def _lights(rng: Random, size: Size, window_side: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Kinds of scenes: rooms with openings, outdoor scenes, and objects on plain ground."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from random import Random
@@ -105,8 +106,8 @@ def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
     return things.skinned(rod(*ends, spread(rng, 0.006, 0.12), rng.random() < 0.5))
 
 
-def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
-    """Return four walls and a ceiling, with random windows or doors.
+def _walls(rng: Random, things: Things, size: Point, most: int) -> Iterator[Shape]:
+    """Yield four walls and a ceiling, with random windows or doors.
 
     size: extent of the room in metres. most: largest number of walls with an opening.
     """
@@ -116,7 +117,6 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
     scale = spread(rng, 0.5, 2)
     common = things.texture()[0]
     open_sides = set(rng.sample(range(4), rng.randint(0, most)))
-    shapes = []
     for side in range(4):
         # walls are drawn at +x, then turned
         across, along = (half_x, half_y) if side % 2 == 0 else (half_y, half_x)
@@ -134,9 +134,9 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
         wall = [Shape(body, hole, texture, 1, common, scale)]
         if hole and rng.random() < 0.6:
             wall += _panes(rng, things, hole)
-        shapes += [part.moved(side * math.pi / 2) for part in wall]
+        yield from (part.moved(side * math.pi / 2) for part in wall)
     ceiling = _box((0.0, 0.0, height + _WALL), (half_x + 2 * _WALL, half_y + 2 * _WALL, _WALL))
-    return [*shapes, things.skinned(ceiling, scale)._replace(faces=1)]
+    yield things.skinned(ceiling, scale)._replace(faces=1)
 
 
 def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
