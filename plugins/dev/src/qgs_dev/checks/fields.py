@@ -1,7 +1,7 @@
 """Checks that a component reads and writes exactly the fields that it declares."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,15 +73,15 @@ def check_reads_are_declared(case: Case) -> None:
             expect_same(trial.state_of(output), trial.state_of(other), where)
 
 
+@dataclass(eq=False)
 class AskedFields(Mapping[str, Tensor]):
     """Fields of a state that record in the set `asked` the names of the fields read.
 
     The base class answers `get` and `in` by reading a field.
     """
 
-    def __init__(self, fields: Mapping[str, Tensor], asked: set[str]) -> None:
-        self.fields = fields
-        self.asked = asked
+    fields: Mapping[str, Tensor]
+    asked: set[str]
 
     def __getitem__(self, name: str) -> Tensor:
         self.asked.add(name)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from itertools import combinations, pairwise, product
 from operator import add, ne
 from random import Random
@@ -64,15 +65,15 @@ VARIED = Style(
 )  # fmt: skip
 
 
+@dataclass
 class Things:
     """Generator of random objects, about 2 units in size, around the origin.
 
     A shape uses one of the TEXTURES of a world, or six consecutive textures, one for each face.
     """
 
-    def __init__(self, rng: Random, style: Style) -> None:
-        self.rng = rng
-        self.style = style
+    rng: Random
+    style: Style
 
     def texture(self) -> tuple[int, int]:
         """Return random textures for a shape: index of the first, and their number, 1 or 6.
