@@ -78,7 +78,7 @@ class EllipsoidBias(AttentionBias):
         cofactors_n33, ball_n33 = (matrix.unflatten(-1, (3, 3)) for matrix in matrices)
         m_M3, d_M3, unit_M3 = (x_3M.mT for x_3M in tokens_GM.split(3))
         # Not expanded into products: far from the cameras, m and mu x d nearly cancel.
-        e_nM3 = m_M3 - torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1)
+        e_nM3 = m_M3 - torch.linalg.cross(center_n3[:, None], d_M3[None])
         moment_nM = _times(cofactors_n33, e_nM3).square().sum(-1)
         along_nM = _times(ball_n33, unit_M3[None]).square().sum(-1)
         return clamped(-factor_n1 * moment_nM / along_nM, lower_n1)

@@ -192,7 +192,7 @@ def check_compiles(case: Case) -> None:
 def _gradients(module: Any, inputs: Inputs, outputs: Any) -> dict[str, Tensor]:
     """Return the gradients of inputs and parameters by name, but no gradient that is all zero."""
     given = {**inputs, "parameter": dict(module.named_parameters())}
-    return {name: x for name, x in gradients(scalar(outputs), given).items() if bool(x.any())}
+    return {name: x for name, x in gradients(scalar(outputs), given).items() if x.any()}
 
 
 def check_construction(case: Case) -> None:

@@ -143,9 +143,7 @@ def chunk_entry(
     entry = {
         "key": key,
         "url": "",
-        "timestamps": torch.tensor(
-            [int(name) for name in (names if stamps else range(len(names)))]
-        ),
+        "timestamps": torch.tensor([*map(int, names if stamps else range(len(names)))]),
         "cameras": torch.from_numpy(np.stack([_camera(frame) for frame in frames])),
         "images": [_bytes(frame.data) for frame in frames],
         "names": names,

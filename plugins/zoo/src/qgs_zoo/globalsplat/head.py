@@ -210,5 +210,5 @@ def rotation_6d(vectors: Tensor) -> Tensor:
     # Gram-Schmidt: the first column keeps its direction.
     second = second - (first * second).sum(-1, keepdim=True) * first
     second = F.normalize(second, dim=-1, eps=LEAST_LENGTH)
-    third = torch.linalg.cross(first, second, dim=-1)
+    third = torch.linalg.cross(first, second)
     return quaternions(torch.stack([first, second, third], -1))

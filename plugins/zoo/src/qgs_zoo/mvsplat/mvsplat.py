@@ -117,7 +117,7 @@ class MVSplatEncoder(SweepEncoder):
         cnn_NDhw = self.backbone["backbone"](normalized_N3HW).features
         cnn_BVDhw = cnn_NDhw.unflatten(0, near_BV.shape)
         # The transformer reads other views in ascending order, the sweep in cyclic order.
-        ascending_BVJ = neighbours.sort(-1).values
+        ascending_BVJ = neighbours.sort().values
         features_BVDhw = self.backbone["transformer"](with_positions(cnn_BVDhw), ascending_BVJ)
         sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
         disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)

@@ -53,9 +53,9 @@ def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
     """
     scenes, views = c2w_BV44.shape[:2]
     if views <= 3:
-        return cyclic_neighbours(scenes, views, c2w_BV44.device).sort(-1).values
+        return cyclic_neighbours(scenes, views, c2w_BV44.device).sort().values
     centre_BV3 = at_least_float32(c2w_BV44[..., :3, 3])
-    order_BVV = torch.cdist(centre_BV3, centre_BV3).argsort(-1)
+    order_BVV = torch.cdist(centre_BV3, centre_BV3).argsort()
     # The first is assumed to be the view itself (released code). If two cameras are at the same
     # place, it may be the other one.
     return order_BVV[..., 1 : count + 1]
