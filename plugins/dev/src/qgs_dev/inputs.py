@@ -2,7 +2,6 @@
 
 import math
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -181,7 +180,7 @@ class Maker:
         if not getattr(self.case.config, "time_channels", 0):
             return views
         times = self.uniform(0, 1, "BV")
-        return replace(views, times=times, target_time=times[:, :1])
+        return views.replace(times=times, target_time=times[:, :1])
 
     def memory(self) -> ImageMemory:
         """Return a random `ImageMemory` with one camera ray per patch of PATCH x PATCH pixels."""
@@ -256,10 +255,10 @@ class Maker:
 
     def target(self) -> Views:
         """Return random images, cameras and masks; and depth maps for a loss that reads them."""
-        views = replace(self.views(), masks=self.uniform(0, 1, "BV1HW").round())
+        views = self.views().replace(masks=self.uniform(0, 1, "BV1HW").round())
         if not getattr(self.case.component, "reads_depths", False):
             return views
-        return replace(views, depths=self.uniform(1, 2, "BV1HW"))
+        return views.replace(depths=self.uniform(1, 2, "BV1HW"))
 
     # Each call draws other images: the inputs of a prediction are not its target.
     inputs = target

@@ -4,7 +4,6 @@ In a round, the model renders the input photos and runs its last decoder layers 
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -96,5 +95,5 @@ class RenderedFeedback(RoundsFeedback):
         x_XDhw = F.gelu(self.embedding(F.pixel_unshuffle(fine, cells)))
         x_BMD = x_XDhw.flatten(2).mT.unflatten(0, photos.images.shape[:2]).flatten(1, 2)
         k_BhMd, v_BhMd = (split_heads(x, keys.shape[1]) for x in self.kv_proj(x_BMD).chunk(2, -1))
-        memory = replace(memory, keys=keys + k_BhMd, values=memory["values"] + v_BhMd)
+        memory = memory.replace(keys=keys + k_BhMd, values=memory["values"] + v_BhMd)
         return state.replace(features=state.features + self.marker), memory

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -33,7 +32,7 @@ def check_memo_is_of_the_memory_alone(case: Case) -> None:
     state = inputs_of(case, seed=1)["state"]
     for seed, what in enumerate(("the state", "a weight")):
         reader = case.lively(seed)
-        fresh = reader(state, replace(memory))
+        fresh = reader(state, memory.replace())
         where = f"a value in `ImageMemory.once` depends on {what}: after another layer read it"
         expect_same(fresh, reader(state, memory), where)
 
@@ -48,7 +47,7 @@ def check_masked_queries_are_not_read(case: Case) -> None:
     mask = mask.to(case.device)
 
     def seen(state: QueryState) -> Any:
-        output = trial.state_of(trial(state=replace(state, mask=mask)))
+        output = trial.state_of(trial(state=state.replace(mask=mask)))
         return {name: x[mask] for name, x in floating(output).items()}
 
     moved = masked(state, mask, inputs_of(case, sizes, seed=1)["state"])
@@ -106,7 +105,7 @@ def check_updates_are_explained(case: Case) -> None:
     factors = []
     updates = []
     for mask in masks:
-        given = {**inputs, "state": replace(inputs["state"], mask=mask[None])}
+        given = {**inputs, "state": inputs["state"].replace(mask=mask[None])}
         found = explanation(module, given)
         if found is None:
             return

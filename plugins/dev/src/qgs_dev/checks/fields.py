@@ -55,7 +55,7 @@ def check_reads_are_declared(case: Case) -> None:
     # A component that reads a NaN returns one.
     poisoned = mapped(inputs, lambda name, x: x + torch.nan if name in unread else x)
     if "memory" in inputs and "memory.grid" not in case.reads:
-        poisoned = {**poisoned, "memory": replace(poisoned["memory"], grid=None)}
+        poisoned = {**poisoned, "memory": poisoned["memory"].replace(grid=None)}
         unread.add("memory.grid")
     asked: set[str] = set()
     for mode, output in trial.in_each_mode(_with_asked_fields(inputs, asked)):
@@ -102,7 +102,7 @@ def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
     if "prediction" in inputs:
         prediction = inputs["prediction"]
         inside = _with_asked_fields({"state": prediction.state}, asked)
-        changed["prediction"] = replace(prediction, **inside)
+        changed["prediction"] = prediction.replace(**inside)
     return changed
 
 
@@ -127,7 +127,7 @@ def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
     if field == "memory.grid":
         views, rows, columns = inputs["memory"].grid
         for grid in ((views, columns, rows), (columns, rows, views)):
-            yield {**inputs, "memory": replace(inputs["memory"], grid=grid)}
+            yield {**inputs, "memory": inputs["memory"].replace(grid=grid)}
         return
     ends = (field, f"rendering.{field.removeprefix('gaussians.')}")
     others = [inputs_of(trial.case, seed=seed) for seed in (1, 2, 3)]
@@ -253,7 +253,7 @@ def _head_with(look: Fields) -> Any:
         made = GaussianHead.forward(self, state)
         parts = {"sh": torch.stack([made.offsets] * 3, -2), "features": made.quats}
         chosen = {name: x for name, x in parts.items() if f"gaussians.{name}" in look}
-        return replace(made, **chosen)
+        return made.replace(**chosen)
 
     return _given(GaussianHead, look, forward=forward)
 
@@ -265,7 +265,7 @@ def _encoder_with(case: Case) -> Any:
     def forward(self: MultiViewViT, views: Any) -> Any:
         memory = MultiViewViT.forward(self, views)
         features = memory.features[..., wide % memory.features.shape[-1]]
-        return replace(memory, features=features)
+        return memory.replace(features=features)
 
     provides = {**MEMORY_FIELDS, "memory.features": case.reads["memory.features"]}
     return _given(MultiViewViT, provides, forward=forward)

@@ -1,6 +1,5 @@
 """Checks of losses, metrics and objectives."""
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -47,8 +46,8 @@ def check_masked_queries_are_not_judged(case: Case) -> None:
     def seen(given: LayerPrediction) -> Any:
         opacities = given.gaussians.opacities
         opacities = masked(opacities, mask_BN, 0 * opacities)
-        gaussians = replace(given.gaussians, opacities=opacities)
-        return trial(prediction=LayerPrediction(gaussians, replace(given.state, mask=mask_BN)))
+        gaussians = given.gaussians.replace(opacities=opacities)
+        return trial(prediction=LayerPrediction(gaussians, given.state.replace(mask=mask_BN)))
 
     # Masked Gaussians have opacity 0 both times, so only their other numbers change.
     moved = masked(prediction, mask_BN, inputs_of(case, seed=1)["prediction"])
@@ -130,7 +129,7 @@ def _metric_input(case: Case, module: Metric, noise: float) -> MetricInput:
     optional = {"gaussians": maker.gaussians(), "depth": depth + off[:, :, :1], "true_depth": depth}
     return MetricInput(
         images=target.images + off,
-        targets=target if "masks" in module.needs else replace(target, masks=None),
+        targets=target if "masks" in module.needs else target.replace(masks=None),
         gaussians_per_query=2,
         **{name: part if name in module.needs else None for name, part in optional.items()},
     )

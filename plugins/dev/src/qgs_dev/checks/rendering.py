@@ -5,7 +5,6 @@ Gaussian contributes to every pixel, with an alpha far above `alpha_min`, no Gau
 one completely, and small steps do not change the order of depths.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -88,17 +87,17 @@ def check_colours_depend_on_the_direction(case: Case) -> None:
     gaussians = trial.inputs["gaussians"]
     maker = Maker(case)
     for count in SH_COUNTS:
-        varying = replace(gaussians, sh=0.3 * maker.normal("BG", count, 3))
+        varying = gaussians.replace(sh=0.3 * maker.normal("BG", count, 3))
         rgb = trial(gaussians=varying).rgb
         colors = seen_colors(varying, cameras)
         for view in range(cameras.shape[1]):
             # The colours of this one view, without dependence on the direction.
-            fixed = replace(gaussians, sh=None, colors=colors[:, view])
+            fixed = gaussians.replace(sh=None, colors=colors[:, view])
             expected = trial(gaussians=fixed, cameras=cameras[:, [view]]).rgb
             where = f"with {count} coefficients, view {view} has other colours than `sh` gives"
             expect_same(expected, rgb[:, [view]], where, atol=1e-4)
     without, zeros = (
-        trial(gaussians=replace(gaussians, sh=sh)).rgb for sh in (None, 0 * gaussians.sh)
+        trial(gaussians=gaussians.replace(sh=sh)).rgb for sh in (None, 0 * gaussians.sh)
     )
     expect_same(without, zeros, "coefficients of zero change the image", atol=1e-4)
 
@@ -110,8 +109,8 @@ def check_features_are_blended_as_colours(case: Case) -> None:
     """
     trial = Trial(case)
     black = torch.zeros(3).to(case.device)
-    gaussians = replace(trial.inputs["gaussians"], sh=None)
-    bare = replace(gaussians, features=None)
+    gaussians = trial.inputs["gaussians"].replace(sh=None)
+    bare = gaussians.replace(features=None)
     plain = trial(gaussians=bare)
     out = trial(gaussians=gaussians)
     expect(plain.features is None, "the rendering has features, but the Gaussians have none")
@@ -119,7 +118,7 @@ def check_features_are_blended_as_colours(case: Case) -> None:
     expect_same(plain.rgb, out.rgb, "features change the colours", atol=1e-4)
     for first in (0, gaussians.features.shape[-1] - 3):
         shown = slice(first, first + 3)
-        painted = replace(bare, colors=gaussians.features[..., shown])
+        painted = bare.replace(colors=gaussians.features[..., shown])
         expected = trial(gaussians=painted, background=black).rgb
         expect_same(
             expected, out.features[:, :, shown], "features are not blended as colours", atol=1e-4
@@ -166,8 +165,7 @@ def _broad(case: Case, seed: int = 0, views: int = 1) -> Trial:
     means = maker.uniform(-0.25, 0.25, "BG3")
     # Depths are far enough apart that no step changes their order.
     means[..., 2] = 1.6 + 0.13 * torch.arange(means.shape[1]).to(means)
-    trial.inputs["gaussians"] = replace(
-        trial.inputs["gaussians"],
+    trial.inputs["gaussians"] = trial.inputs["gaussians"].replace(
         means=means,
         scales=maker.uniform(0.85, 1.7, "BG3"),
         opacities=maker.uniform(0.3, 0.5, "BG"),
