@@ -12,7 +12,7 @@ from qgs.drawing.images import Picture
 
 Color = tuple[int, int, int]
 
-CATEGORICAL: tuple[Color, ...] = (
+CATEGORICAL = (
     (213, 94, 0),
     (0, 114, 178),
     (0, 158, 115),
@@ -22,8 +22,8 @@ CATEGORICAL: tuple[Color, ...] = (
 )
 """RGB colours that colour-blind readers can tell apart, on white and on photos."""
 
-INK: Color = (32, 36, 42)
-MUTED: Color = (122, 128, 136)
+INK = (32, 36, 42)
+MUTED = (122, 128, 136)
 # Pixels on the longer side up to which photos in pages are not compressed with loss.
 EXACT = 128
 

@@ -37,7 +37,7 @@ class Panel:
         self.server = server
         self.source = source
         self.drawing = Drawing(server.scene)
-        self.scene: QueryScene = source.scene_of(source.frames)
+        self.scene = source.scene_of(source.frames)
         self.choice = Choice(layer=self.scene.depth)
         # viser calls back from several threads, also while a control is set here
         self._lock = RLock()

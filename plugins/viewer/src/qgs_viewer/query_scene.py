@@ -15,7 +15,7 @@ from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, SpatialSuppor
 from qgs_viewer.placement import Splats, on_photo, patch_centers, splats
 
 Background = tuple[float, float, float]
-NEUTRAL: Background = RendererConfig().background
+NEUTRAL = RendererConfig().background
 """Default background of renderers, RGB in [0, 1]."""
 Placement = tuple[Tensor, float]
 """Transform into the viewer's world: pose (4, 4), float64, and factor, as for `moved`."""

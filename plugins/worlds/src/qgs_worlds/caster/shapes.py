@@ -13,7 +13,7 @@ from qgs_worlds.caster import tables as s
 Point = tuple[float, ...]
 Turn = tuple[float, ...]
 """Rotation matrix as nine numbers, row by row."""
-UPRIGHT: Turn = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 ROUND = (s.ELLIPSOID, s.CAPSULE, s.TORUS)
 
 

@@ -29,7 +29,7 @@ _GAP = 0.05
 NO_HEIGHTS = np.zeros((1, 2, 2), np.float32)
 
 # Corners of a piece that fits at every place where another piece fits.
-_SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
+_SMALLEST = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 
 def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
