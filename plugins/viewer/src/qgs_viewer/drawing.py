@@ -103,8 +103,7 @@ def painted(scene: QueryScene, choice: Choice) -> Splats:
     opacities = found.opacities
     # Gaussians are ordered by query, so colours repeat in blocks
     if choice.by_query:
-        each = len(colors) // scene.queries
-        colors = query_colors(scene).repeat(each, 0) / 255
+        colors = query_colors(scene).repeat(len(colors) // scene.queries, 0) / 255
     if choice.query is not None and choice.others != "shown":
         mine = np.zeros((len(colors), 1), bool)
         mine[scene.members(choice.query)] = True

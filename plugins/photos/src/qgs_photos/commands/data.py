@@ -158,8 +158,7 @@ def pack(
     source = opened_source(path, options or [], image_size)
     test = None if test_scenes is None else read_scene_list(opened_path(test_scenes))
     splits = packing.chosen_splits(source, test, test_every)
-    hidden = not console.is_terminal
-    with Progress(console=console, transient=True, disable=hidden) as bar:
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=sum(map(len, splits.values())))
         packed = packing.pack(
             source,

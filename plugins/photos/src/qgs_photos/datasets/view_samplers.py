@@ -81,8 +81,7 @@ class Bounded(ViewSampler):
         between = rng.choice(range(1, len(span) - 1), views.inputs - 2, replace=False)
         places = [0, *sorted(map(int, between)), len(span) - 1]
         inputs = one_of_each([span[place] for place in places], range(len(places)))
-        pool = self.seen(scene, span, rng, step)
-        return inputs, tuple(map(int, rng.choice(pool, views.targets)))
+        return inputs, tuple(map(int, rng.choice(self.seen(scene, span, rng, step), views.targets)))
 
     def span(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int, parts: int = 1

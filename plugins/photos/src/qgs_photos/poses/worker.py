@@ -205,8 +205,7 @@ def _match(job: Job, start: Any, links: Linked | None) -> None:
 
     Raises RefusedError without matches, unless there is a model `start`.
     """
-    total = len(job.sizes)
-    tell("matching", 0, total)
+    tell("matching", 0, len(job.sizes))
     settings = {
         "matching_options": {"num_threads": job.threads},
         "verification_options": {"ransac": {"random_seed": job.seed}},

@@ -199,8 +199,7 @@ def study_summary(results: Results) -> Summary:
     others = [name for name in results.columns if name != results.metric]
     for name in results.plan.evaluations:
         if results.models(name):
-            published = results.settings.published
-            rows = table_rows(results, name, results.metric, others, published)
+            rows = table_rows(results, name, results.metric, others, results.settings.published)
             tables.append((name, rows))
     return Summary(answer=answer(results), tables=tables, notes=[*notes(results)])
 

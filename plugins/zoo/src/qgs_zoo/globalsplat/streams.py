@@ -60,8 +60,9 @@ class SlotQueries(LearnedQueries):
         self.slots = nn.Parameter(torch.randn(config.count - config.extra, width) * config.std)
         extra = torch.randn(config.extra, width) * config.std
         self.extra = nn.Parameter(extra) if config.extra else None
-        self.geometry = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width))
-        self.texture = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width))
+        self.geometry, self.texture = (
+            nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width)) for _ in range(2)
+        )
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
