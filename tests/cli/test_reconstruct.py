@@ -3,14 +3,14 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 import tape_source
 import torch
 from commands import done, record_of, saved
+from numpy.testing import assert_allclose
 from photo_formats import put, scene
 from PIL import Image
 from reconstructing import HOLDOUTS, kinds
-from tables import must_refuse, names_in, rows
+from tables import assert_near, must_refuse, names_in, rows
 
 import qgs
 from qgs.reconstruction.scenes import frame_list
@@ -44,12 +44,12 @@ def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, 
     chosen = "inputs images/2.png, images/4.png, compared with images/3.png; 1 of 7 photos held out"
     assert record["remarks"][-1].startswith(chosen)
     back = record["to_photos"]
-    assert back["scale"] == pytest.approx(1 / 0.6)
-    np.testing.assert_allclose(record["views"][0]["c2w"], np.eye(4), atol=1e-6)
+    assert_near(back["scale"], 1 / 0.6)
+    assert_allclose(record["views"][0]["c2w"], np.eye(4), atol=1e-6)
     for view in record["views"]:
         centre = np.array(view["c2w"])[:3, 3] / back["scale"]
         world = back["reference_c2w"] @ np.array([*centre, 1])
-        np.testing.assert_allclose(world, [0.1 * view["frame"], 0, 0, 1], atol=1e-6)
+        assert_allclose(world, [0.1 * view["frame"], 0, 0, 1], atol=1e-6)
     assert Image.open("views/00003_novel.png").size == (36, 16)
     assert Image.open("depth/00004_input.png").size == (16, 16)
     assert Image.open("overview.png").size[0] > 500

@@ -3,7 +3,6 @@ import re
 from functools import partial
 
 import photo_formats
-import pytest
 from photo_formats import numbered_photos
 from PIL import Image
 from tables import assert_near, must_not_find, must_refuse, rows
@@ -21,7 +20,7 @@ read = partial(photo_formats.scene, size=(24, 24))
 def test_intrinsics_follow_the_crop_the_copy_and_the_frame(tmp_path):
     cameras = read(folder(tmp_path, frame={"fl_x": 200.0})).cameras
     assert_near(cameras.intrinsics[0], [50, 55, 11.5, 12.5])
-    assert cameras.intrinsics[1, 0] == pytest.approx(100)
+    assert_near(cameras.intrinsics[1, 0], 100)
     half = read(folder(tmp_path, size=(32, 24)), size=(24, 32)).cameras
     assert_near(half.intrinsics[0], [50, 55, 15.5, 12.5])
 

@@ -3,12 +3,11 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import torch
 import yaml
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
-from tables import assert_equal, must_refuse
+from tables import assert_equal, assert_near, must_refuse
 from torch.testing import assert_close
 from walk import along_x, pinhole
 
@@ -79,7 +78,7 @@ def test_each_scene_has_its_own_views_and_mean_colour():
     both = stack_views([views([0, 1.0]), views([1.0, 0])])
     targets = both.cameras[[0, 0], :1]
     expected = torch.stack([both.images[0, :1], both.images[1, 1:]])
-    assert torch.equal(nearest_input(both, targets), expected)
+    assert_equal(nearest_input(both, targets), expected)
     mean = both.images.mean((1, 3, 4))[:, None, :, None, None]
     assert_close(mean_colour(both, targets), mean.expand(2, 1, 3, 8, 8))
 
@@ -110,5 +109,5 @@ def test_distances_to_the_centroid_of_each_token():
         scene = scene[None]
         given = MetricInput(scene, None, SimpleNamespace(means=scene), 4)
         found = Dispersion(Dispersion.Config())(given)
-        assert float(found["mean"].mean()) == pytest.approx(distances.mean())
-        assert float(found["median"]) == pytest.approx(np.median(distances))
+        assert_near(found["mean"].mean(), distances.mean())
+        assert_near(found["median"], np.median(distances))

@@ -71,7 +71,7 @@ def test_same_recipe_same_parameters_and_the_global_random_state_stays():
     first = compose(SMALL).state_dict()
     second = compose(SMALL).state_dict()
     other = compose(SMALL, ["seed=1"]).queries.features
-    assert torch.equal(torch.get_rng_state(), before)
+    assert_equal(torch.get_rng_state(), before)
     assert_equal(first, second)
     assert not torch.equal(first["queries.features"], other)
 

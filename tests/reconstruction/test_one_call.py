@@ -44,7 +44,7 @@ def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):
     inputs = result.sample.inputs
     assert result.sample.input_frames == (0, 1)  # all of them
     assert_close(inputs.cameras.c2w[0, 0], torch.eye(4))
-    assert float(inputs.cameras.c2w[0, 1, :3, 3].norm()) == pytest.approx(0.5, rel=1e-4)
+    assert_near(inputs.cameras.c2w[0, 1, :3, 3].norm(), 0.5, rtol=1e-4)
     assert not caplog.text
     assert_close(result.gaussians.means, model(inputs).gaussians.means)
     again = qgs.reconstruct(model, views)
@@ -85,10 +85,10 @@ def test_what_cannot_be_reconstructed_is_refused(model, views, photos):
 
 def test_photos_are_read_in_their_own_world_and_size(photos):
     views = qgs.read_photos(photos)
-    assert torch.equal(views.images[0], scene(photos, (20, 24)).images(range(7)))
+    assert_equal(views.images[0], scene(photos, (20, 24)).images(range(7)))
     assert views.cameras.intrinsics[0, 0].tolist() == [20, 20, 12, 10]
     assert_near(views.cameras.c2w[0, :, 0, 3], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     few = qgs.read_photos(photos, size=(10, 12), frames=["2.png", 0])
     assert few.images.shape == (1, 2, 3, 10, 12)
-    assert torch.equal(few.cameras.c2w, views.cameras.c2w[:, [2, 0]])
+    assert_equal(few.cameras.c2w, views.cameras.c2w[:, [2, 0]])
     must_not_find("nothing", qgs.read_photos, photos / "nothing")

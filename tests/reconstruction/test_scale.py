@@ -1,8 +1,7 @@
 """The search for the scale of photos: which photos it judges, and which factors it tries."""
 
-import pytest
 import torch
-from tables import must_refuse
+from tables import assert_near, must_refuse
 from training_runs import run, tiny
 from walk import Walk
 
@@ -59,7 +58,7 @@ def test_the_range_follows_the_unit_and_the_training():
         (far, 3.0, wide),
     ):
         found = scale.search_range(known, Walk(), (1, 4), depth)
-        assert found == pytest.approx(expected, rel=1e-5)
+        assert_near(found, expected, rtol=1e-5)
     turning = Domain({"baseline": [0.0, 0.0]}, 4)
     assert scale.search_range(turning, Walk(), (1, 4), 3.0) == (1.0, 1.0)
     still = Walk()

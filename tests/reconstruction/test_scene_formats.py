@@ -151,7 +151,7 @@ def test_files_of_fewer_degrees_are_read():
 
     first = REST[0:3] + REST[15:18] + REST[30:33]
     zeros = REST[3:15] + REST[18:30]
-    assert torch.equal(load_ply(written(first)).sh, given.sh)
+    assert_equal(load_ply(written(first)).sh, given.sh)
     assert load_ply(written(zeros)).sh is None
     must_refuse("10 properties", load_ply, written(zeros[:10]))
 
@@ -189,9 +189,9 @@ def test_convert_keeps_the_most_opaque():
     few = load_ply("few.ply")
     best = given.opacities[0].topk(7).indices.sort().values  # in the order of the file
     assert_close(few.means[0], given.means[0, best])
-    assert torch.equal(few.sh[0], given.sh[0, best])
+    assert_equal(few.sh[0], given.sh[0, best])
     done("convert all.ply same.PLY")
-    assert torch.equal(load_ply("same.PLY").means, given.means)
+    assert_equal(load_ply("same.PLY").means, given.means)
     assert given.most_opaque(99).count == 50
 
 

@@ -3,10 +3,9 @@
 import signal
 from unittest.mock import Mock
 
-import pytest
 import torch
 from accelerate import PartialState
-from tables import assert_equal, must_refuse
+from tables import assert_equal, assert_near, must_refuse
 from training_runs import resume, run, run_calling, tiny
 
 import qgs
@@ -49,7 +48,7 @@ def test_a_stray_splat_is_no_sign_of_life():
     rendering = Mock(rgb=rgb, alpha=1 - rgb[:, :, :1])
     signs = signs_of(rendering, Mock(images=rgb), torch.ones(3))
     assert signs["alpha"] < EMPTY_ALPHA
-    assert signs["deviation"] == pytest.approx(4 / 32**2)
+    assert_near(signs["deviation"], 4 / 32**2)
     symptom = observed(ALIVE, ALIVE | {"deviation": float(signs["deviation"])}).symptom
     assert "equal the background" in symptom
 

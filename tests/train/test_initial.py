@@ -1,9 +1,8 @@
 """`init_from`: queries grow and shrink by the published rule, all else is taken as it is."""
 
-import pytest
 import torch
 from safetensors.torch import load_file
-from tables import assert_equal, text_console
+from tables import assert_equal, must_refuse, text_console
 from torch.testing import assert_close
 from training_runs import tiny
 
@@ -49,14 +48,14 @@ def test_old_queries_stay_and_new_ones_are_noisy_copies():
                 assert noise.abs().max() < 6
                 assert noise.abs().min() > 0
                 if noise.numel() > 1000:
-                    assert noise.std() == pytest.approx(1, abs=0.1)
-                    assert noise.mean() == pytest.approx(0, abs=0.1)
+                    assert abs(noise.std() - 1) <= 0.1
+                    assert abs(noise.mean()) <= 0.1
 
 
 def test_weights_that_do_not_fit_are_refused():
     recipe = learned("tokengs", "model.head.gaussians_per_query=2")
-    with pytest.raises(CheckpointError, match=r"model\.head\.gaussians_per_query: 4 \(here 2\)"):
-        started(recipe)
+    reason = r"model\.head\.gaussians_per_query: 4 \(here 2\)"
+    must_refuse(reason, started, recipe, kind=CheckpointError)
 
 
 def test_the_recipes_seed_decides_the_noise():

@@ -10,7 +10,7 @@ from unittest.mock import Mock
 
 import pytest
 from size import ROOT
-from tables import assert_equal, contents, must_refuse
+from tables import assert_equal, assert_near, contents, must_refuse
 from training_runs import (
     TRAINED,
     TWO,
@@ -78,13 +78,13 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped():
     assert seen == [(2, pytest.approx(0.3)), (2, 0.2), (1, pytest.approx(0.1)), (1, 0)]
     history = RunFolder("whole").history()
     rates = [5e-4 * (1 + math.cos(math.pi * step / 4)) for step in range(4)]
-    assert column(history, "lr") == pytest.approx(rates)
-    assert history[3]["ssim"] == pytest.approx(history[0]["ssim"] / 4, rel=0.2)  # 0.1 is left
+    assert_near(column(history, "lr"), rates)
+    assert_near(history[3]["ssim"], history[0]["ssim"] / 4, rtol=0.2)  # 0.1 is left
     assert [record["alpha_consistency"] > 0 for record in history] == [False, False, True, True]
     terms = "mse ssim visibility anchor_visibility alpha_consistency depth_consistency"
     for record in history:
         assert record["depth_consistency"] > 0
-        assert sum(record[term] for term in terms.split()) == pytest.approx(record["loss"])
+        assert_near(sum(record[term] for term in terms.split()), record["loss"])
 
 
 def test_a_kill_between_the_first_two_files_loses_nothing(monkeypatch):
@@ -113,7 +113,7 @@ def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog
     assert "steps: 4" in (copied / "recipe.yaml").read_text()
     last = resumed(in_halves, *longer, "training.accumulate=2").folder.history()[-1]
     for name in ("lr", "loss", "gradient"):
-        assert last[name] == pytest.approx(history[-1][name], rel=1e-4)
+        assert_near(last[name], history[-1][name], rtol=1e-4)
 
 
 def test_the_clock_goes_on(copied):

@@ -1,7 +1,6 @@
 from itertools import product
 
 import numpy as np
-import pytest
 import torch
 import torch.nn.functional as F
 from numpy.testing import assert_allclose
@@ -10,7 +9,7 @@ from qgs_viewer.look import CATEGORICAL
 from qgs_viewer.placement import hit, on_photo, splats
 from renderers.scenes import make_scene
 from scipy.spatial.transform import Rotation
-from tables import assert_equal
+from tables import assert_equal, assert_near
 from walk import arc, cloud, pinhole
 
 from qgs.drawing.images import NOTHING, finer
@@ -39,7 +38,7 @@ def test_a_centre_is_drawn_where_it_lies_though_its_support_reaches_behind_the_c
     support = SpatialSupport(torch.tensor([[[0.1, 0.0, 0.5]]]), torch.eye(3)[None, None])
     drawn = queries.support_picture(photo, support, cameras[:, :1], {0: CATEGORICAL[0]})
     places = np.argwhere(drawn[..., 0] != drawn[0, 0, 0])
-    assert places.mean(0) == pytest.approx((63.5, 89.1), abs=1)
+    assert_allclose(places.mean(0), (63.5, 89.1), 0, 1)
 
 
 def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(model, cameras):
@@ -61,7 +60,7 @@ def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(model
     assert {first, *others} - {0, 1} == {2, 3, 4, 6}
     assert others[3] == 6
     own = means.view(7, 4, 3)[others[0]]
-    assert drawn[1].dispersion == pytest.approx(float((own - own.mean(0)).norm(dim=-1).mean()))
+    assert_near(drawn[1].dispersion, (own - own.mean(0)).norm(dim=-1).mean())
     assert len(queries.notable_queries(model, scene, cameras, 7)) == 7
 
 

@@ -12,6 +12,7 @@ from qgs_worlds.caster.shadows import shadow_maps
 from qgs_worlds.caster.shapes import Primitive, Shape, packed
 from qgs_worlds.caster.textures import color
 from qgs_worlds.worlds.cameras import Rig
+from tables import assert_near
 
 GROUND = Shape(Primitive(s.BOX, (0.0, 0.0, -1.0), (50.0, 50.0, 1.0)))
 WALL = Primitive(s.BOX, (1.0, 0.0, 1.0), (0.1, 5.0, 2.0))
@@ -93,5 +94,5 @@ def test_patterns_keep_their_mean_from_afar():
 
 def test_the_field_of_view_is_across_the_longer_side():
     rig = Rig(np.eye(4)[None], 90.0, 1.0, "walk")
-    assert [*rig.lens((40, 130))] == pytest.approx([65, 65, 65, 20])
-    assert [*rig.lens((130, 40))] == pytest.approx([65, 65, 20, 65])
+    assert_near(rig.lens((40, 130)), [65, 65, 65, 20])
+    assert_near(rig.lens((130, 40)), [65, 65, 20, 65])

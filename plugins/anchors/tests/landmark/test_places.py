@@ -2,7 +2,6 @@
 
 from itertools import product
 
-import pytest
 import torch
 import torch.nn.functional as F
 import yaml
@@ -11,6 +10,7 @@ from qgs_anchors.landmark.places import cells, colors_at, sampled, spread
 from qgs_anchors.landmark.sweep import mismatch
 from qgs_locus.fields import CENTER
 from small_parts import made
+from tables import assert_near
 from torch.testing import assert_close
 from walk import along_x, arc, pinhole
 
@@ -76,13 +76,13 @@ def test_points_are_in_tiles_where_these_divide_the_photos():
     for count, views, height, width, aspect, *grid in yaml.safe_load(TILES):
         view, place, share = spread(count, views, (height, width), aspect, CPU)
         wide, high = (share * torch.tensor([width, height])).tolist()
-        assert wide * high * count == pytest.approx(views * height * width, rel=1e-5)
+        assert_near(wide * high * count, views * height * width, rtol=1e-5)
         if grid:
-            assert [height / high, width / wide] == pytest.approx(grid, rel=1e-5)
+            assert_near([height / high, width / wide], grid, rtol=1e-5)
             for of in range(views):
                 assert_close(place[view == of], patch_centres(*grid))
         else:
-            assert wide == pytest.approx(high, rel=1e-5)
+            assert_near(wide, high, rtol=1e-5)
 
 
 def within(pixels, at, side):

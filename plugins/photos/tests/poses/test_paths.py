@@ -90,7 +90,7 @@ def test_a_file_that_is_no_path_is_refused(tmp_path):
 def test_size_length_and_angle_of_view():
     world = torch.eye(4).double(), 1.0
     scene = FilmScene(wall(3.0), cameras(), VIEWER, world)
-    assert seen_depth(scene) == pytest.approx(3.0, rel=0.02)
+    assert_near(seen_depth(scene), 3.0, rtol=0.02)
     path = cameras_of(scene, "orbit", None, 5, None)
     assert path.shape == (1, 5)
     assert path.size == (480, 720)

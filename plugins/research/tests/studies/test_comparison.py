@@ -10,7 +10,7 @@ from qgs_research.studies.scores import crossed_error, interval
 from qgs_research.studies.stored import StoredResults
 from qgs_research.studies.tables import compare, summary
 from scipy import stats
-from tables import must_refuse, read_json
+from tables import assert_near, must_refuse, read_json
 
 from qgs.contracts import Column
 from qgs.evaluate.protocol import Protocol
@@ -31,7 +31,7 @@ def test_scenes_pair_by_name():
     scores = compare([first, results("second", a=10.0, b=12.0, c=11.0, only=50.0)])
     psnr, lpips = (scores.difference("second", metric) for metric in COLUMNS)
     assert (psnr.mean, psnr.scenes) == (pytest.approx(1.0), 3)
-    assert lpips.mean == pytest.approx(0.01)
+    assert_near(lpips.mean, 0.01)
     assert "second: scenes not in both (3): another, only, other" in summary(scores).notes
 
 
@@ -90,7 +90,7 @@ def test_two_runs_compare_scene_by_scene(tmp_path):
     assert "95 % interval" in done(f"compare --out {tmp_path}", *runs).output
     table = read_json(tmp_path / "comparison.json")["table"]
     apart = next(row["difference"] for row in table if row["variant"] == str(runs[1]))
-    assert apart["mean"] == pytest.approx(means[1] - means[0])
+    assert_near(apart["mean"], means[1] - means[0])
     low, high = apart["interval"]
     assert low <= apart["mean"] <= high
     assert apart["scenes"] == 2
@@ -110,7 +110,7 @@ def test_the_interval_over_trainings_and_scenes_holds_the_truth():
         error, freedom = crossed_error(values)
         half = stats.t.ppf(0.975, freedom) * error
         low, high = interval(values[0])
-        assert high - low == pytest.approx(2 * half[0])
+        assert_near(high - low, 2 * half[0])
         assert 0.93 <= (np.abs(values.mean((1, 2))) <= half).mean() <= 0.985, case
         truth = of_training**2 / trainings + of_scene**2 / scenes + rest**2 / (trainings * scenes)
         least = stats.t.ppf(0.975, min(trainings, scenes) - 1) * truth**0.5
