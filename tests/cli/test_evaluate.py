@@ -47,7 +47,8 @@ def test_other_settings_go_into_a_folder_of_their_own_and_are_told(run):
     done(f"eval {run} --tune 2 --set evaluation.scenes=1 --device cpu")
     told = summary(run / "evaluation-2")
     assert told["tuning"]["steps"] == 2
-    assert (told["scenes"], told["step"]) == (1, 2)
+    assert told["scenes"] == 1
+    assert told["step"] == 2
     assert before.items() <= contents(run).items()
 
 

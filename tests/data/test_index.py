@@ -48,8 +48,10 @@ def test_samples_are_those_of_the_index_in_its_order(tmp_path):
     three = {**entry([4, 1], [2, 3, 2]), "overlap": 0.5}
     index = {"three": three, "two": None, "one": entry([0, 7], [5])}
     first, second = samples_of(source, VIEWS, indexed(tmp_path, index, scenes=1))
-    assert (first.scene, second.scene) == ("three", "one")
-    assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))
+    assert first.scene == "three"
+    assert second.scene == "one"
+    assert first.input_frames == (4, 1)
+    assert first.target_frames == (2, 3, 2)
     assert_near(first.targets.images[0, :, 0, 0, 0], [0.02, 0.03, 0.02])
     assert_equal(first.inputs.cameras.c2w[0, 0], torch.eye(4))
 

@@ -78,7 +78,8 @@ def test_splits(caplog):
         LISTING.write_text(whole)
         change(**splits)
         scene = read(holdout=2)
-        assert (len(scene), scene.held_out) == (count, held_out)
+        assert len(scene) == count
+        assert scene.held_out == held_out
         assert ("in none of its splits" in caplog.text) == (count == 5)
 
 

@@ -64,7 +64,8 @@ def test_the_file_is_that_of_the_3dgs_release():
             given.quats,
         ]
         whole = PlyData.read(str(saved("scene.ply", gaussians)))
-        assert (whole.text, whole.byte_order) == (False, "<")
+        assert whole.text is False
+        assert whole.byte_order == "<"
         vertex = whole["vertex"].data
         assert vertex.dtype == np.dtype([(name, "<f4") for name in names])
         assert_close(torch.tensor(vertex.tolist()), torch.cat(columns, 1))

@@ -20,7 +20,8 @@ def rasterization(
     *, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d, backgrounds, **given
 ):
     """What gsplat's function of this name gives, by our renderer; colors: (B, V, G, C)."""
-    assert (given.pop("packed"), given.pop("render_mode")) == (False, "RGB+ED")
+    assert given.pop("packed") is False
+    assert given.pop("render_mode") == "RGB+ED"
     assert Ks[0, 0, 2].tolist() == [0, 0, 1]
     assert colors.shape[2], "kernels divide by the number of Gaussians"
     renderer = TorchRenderer(RendererConfig(near=near_plane, far=far_plane, dilation=eps2d))

@@ -124,7 +124,8 @@ def test_a_stop_is_heard_between_two_scenes(monkeypatch):
 
     monkeypatch.setattr(periodic, "evaluate", asked)
     result = run(tiny("tokengs", "training.evaluate_every=1"))
-    assert (result.steps, result.stopped_by) == (1, "SIGTERM")
+    assert result.steps == 1
+    assert result.stopped_by == "SIGTERM"
     assert not Path("run/evaluations.jsonl").exists()
 
 

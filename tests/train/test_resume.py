@@ -65,7 +65,8 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped():
             stop.append(signal.SIGTERM)
 
     stopped = run_calling(note, recipe)
-    assert (stopped.steps, stopped.stopped_by) == (2, "SIGTERM")
+    assert stopped.steps == 2
+    assert stopped.stopped_by == "SIGTERM"
     qgs.save(qgs.load(stopped.folder.checkpoint), again)
     assert CheckpointFile(again).step == 2
     assert qgs.load(again).renderer.config.dilation == 2
@@ -139,7 +140,9 @@ def test_a_run_killed_before_its_first_save_starts_again(trained_run, copied):
 def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, copied):
     before = contents(copied)
     again = resumed(copied)
-    assert (again.resumed_at, again.steps, again.stopped_by) == (3, 3, None)
+    assert again.resumed_at == 3
+    assert again.steps == 3
+    assert again.stopped_by is None
     assert_equal(trained_run.model.state_dict(), again.model.state_dict())
     changes = ("optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
     reason = r"rate: 0\.001 here, 0\.0015 in"

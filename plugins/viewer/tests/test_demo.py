@@ -81,13 +81,15 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
     reconstruct, refine, view = commands
     for _, name, model, place, *options in (reconstruct, view):
         assert model in models
-        assert (place, options[:2]) == (str(photos), ["--scale", "0.5"])
+        assert place == str(photos)
+        assert options[:2] == ["--scale", "0.5"]
         known = done(f"{name} --help").output
         assert all(word in known for word in options if word.startswith("--"))
     assert refine[2:] == ["report/scene", str(photos)]
     done(*reconstruct[1:])
     record = record_of(Path("report/scene"))["to_photos"]
-    assert (record["scale"], record["search"]) == (0.5, None)
+    assert record["scale"] == 0.5
+    assert record["search"] is None
 
 
 def test_no_model_is_marked_by_few_samples_or_below_a_baseline(models, tmp_path, monkeypatch):

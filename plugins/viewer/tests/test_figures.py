@@ -52,7 +52,8 @@ def test_anchors_are_shown_layer_by_layer_of_models_that_have_them():
     assert [*rows] == ["locus"]
     captions = [tile.caption for tile in rows["locus"]]
     depth = model_scenes_of("locus").scene.depth
-    assert (captions[0], captions[-1]) == ("learned start", f"after layer {depth}")
+    assert captions[0] == "learned start"
+    assert captions[-1] == f"after layer {depth}"
     assert len(captions) <= LAYERS + 1
 
 

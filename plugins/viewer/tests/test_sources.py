@@ -52,7 +52,8 @@ def test_a_scene_is_shown_with_photos_that_are_still_there(tmp_path):
     write_json(scene / "metrics.json", record)
     source = open_source(str(scene))
     shown = source.scene_of(())
-    assert (shown.gaussians.count, shown.background) == (5, (0.0, 0.0, 0.0))
+    assert shown.gaussians.count == 5
+    assert shown.background == (0.0, 0.0, 0.0)
     cameras = qgs.read_photos(photos).cameras.c2w
     assert_equal(shown.views.cameras.c2w, cameras[:, [0, 2]])
     assert shown.views.images.shape[-2:] == (16, 16)
@@ -80,7 +81,8 @@ def opened(finished, tmp_path):
 def test_a_finished_reconstruction_has_its_queries(finished):
     source = open_source(str(finished))
     assert isinstance(source, ModelSource)
-    assert ([*source.frames], [*source.notes]) == ([0, 1], [])
+    assert [*source.frames] == [0, 1]
+    assert [*source.notes] == []
     assert source.labels == [f"photos/0{frame}.png" for frame in (1, 4, 0, 2, 3, 5)]
     scene = source.scene_of(source.frames)
     ply = load_ply(finished / "gaussians.ply")

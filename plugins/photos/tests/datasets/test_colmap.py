@@ -71,7 +71,8 @@ def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera):
         Image.fromarray(colours(directions)).save(file)
     folders = [write_colmap(tmp_path / kind, photos, kind, (name, parameters)) for kind in KINDS]
     (of_text, _), (of_binary, _) = map(frames, folders)
-    assert (of_text.intrinsics, of_text.lens) == (of_binary.intrinsics, of_binary.lens)
+    assert of_text.intrinsics == of_binary.intrinsics
+    assert of_text.lens == of_binary.lens
     for size in ((60, 60), SIZE):
         scene = read(folders[1], size)
         fx, fy, cx, cy = scene.cameras.intrinsics[0].tolist()

@@ -103,7 +103,9 @@ def test_numbers_of_inputs_and_gaps_as_in_depthsplat():
             gap = inputs[-1] - inputs[0]
             found.add(gap)
             # on a line the ends are the farthest points, so inputs are the ends of the gap
-            assert (len(inputs), len(targets), len({*targets})) == (count, 8, min(8, gap + 1))
+            assert len(inputs) == count
+            assert len(targets) == 8
+            assert len({*targets}) == min(8, gap + 1)
             assert inputs[0] <= min(targets) <= max(targets) <= inputs[-1]
         assert (min(found), max(found)) == gaps
 
@@ -155,7 +157,8 @@ def test_inputs_stand_beside_the_target_wherever_their_files_are():
     for count in (1, 2, 4):
         for inputs, targets in draws(60, ViewsConfig(inputs=count, targets=3)):
             assert list(inputs) == sorted({*inputs})
-            assert (len(inputs), len(targets)) == (count, 3)
+            assert len(inputs) == count
+            assert len(targets) == 3
             assert {*inputs}.isdisjoint(targets)
             assert {*inputs, *targets}.isdisjoint(HELD_OUT.held_out)
             assert apart(inputs, targets[0]) <= 10  # .5 depths

@@ -23,10 +23,12 @@ def opened(path):
     data = path.read_bytes()
     assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
     length, kind = struct.unpack_from("<I4s", data, 12)
-    assert (kind, length % 4) == (b"JSON", 0)
+    assert kind == b"JSON"
+    assert length % 4 == 0
     size, kind = struct.unpack_from("<I4s", data, 20 + length)
     numbers = data[28 + length :]
-    assert (kind, size) == (b"BIN\0", len(numbers))
+    assert kind == b"BIN\0"
+    assert size == len(numbers)
     return json.loads(data[20 : 20 + length]), numbers
 
 

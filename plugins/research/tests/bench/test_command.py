@@ -24,14 +24,18 @@ def test_recipes_are_compared_with_the_first(tmp_path, monkeypatch):
     told = bench(f"{TOKENGS} {LOCUS} {GSLRM} {everything}").output
     report = read_json(tmp_path / "reports/bench.json")
     assert report["machine"].keys() >= {"device", "processor", "threads", "torch"}
-    assert (report["overrides"], report["rounds"], report["warmup"]) == (SETTINGS, 3, 0)
+    assert report["overrides"] == SETTINGS
+    assert report["rounds"] == 3
+    assert report["warmup"] == 0
     recipes = report["recipes"]
     first = recipes[0]
     gaussians = {TOKENGS: 512, LOCUS: 512, GSLRM: None}
     assert {recipe["recipe"]: recipe["gaussians"] for recipe in recipes} == gaussians
     for recipe in recipes:
         count = recipe["parameters"]["count"]
-        assert (recipe["views"], recipe["size"], recipe["precision"]) == (3, [16, 24], "float32")
+        assert recipe["views"] == 3
+        assert recipe["size"] == [16, 24]
+        assert recipe["precision"] == "float32"
         assert recipe["parameters"]["weight_bytes"] == 4 * count
         assert recipe["parameters"]["ratio"] == count / first["parameters"]["count"]
         assert f"{count:,}" in told

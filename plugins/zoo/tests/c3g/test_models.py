@@ -29,7 +29,8 @@ def test_the_published_recipe():
     counts = parameter_counts(model)
     assert counts.pop("encoder") == 314_199_296  # the backbone, for which a ViT stands
     assert sum(counts.values()) == 71_368_718
-    assert (model.queries.count, model.head.gaussians_per_query) == (2048, 1)
+    assert model.queries.count == 2048
+    assert model.head.gaussians_per_query == 1
     dilation = model.renderer.schedules["dilation"].number
     for step in (0, 999, 1000, 1001, 2500, 3000, 3999, 4000, 449_999):
         assert dilation(step) == pytest.approx(max(0.3, 10 / 3 ** (step // 1000)))
