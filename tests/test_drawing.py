@@ -17,5 +17,4 @@ def test_depth_pictures_share_a_scale_and_show_where_nothing_is():
 
 def test_pictures_keep_their_pixels():
     image = torch.rand(3, 4, 6)
-    picture = rgb_picture(image)
-    assert abs(picture / 255 - image.permute(1, 2, 0).numpy()).max() < 0.51 / 255
+    assert abs(rgb_picture(image) / 255 - image.permute(1, 2, 0).numpy()).max() < 0.51 / 255

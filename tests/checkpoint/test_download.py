@@ -85,8 +85,7 @@ def test_failures(server, cache, capsys):
     for kind, cause in FAILURES.items():
         began = time.monotonic()
         url = f"http://me:p%40ss@{server}/{kind}/a.safetensors?token=hidden"
-        reason = rf"{kind}/a\.safetensors.*{cause}"
-        error = must_refuse(reason, checkpoint_path, url, kind=OSError)
+        error = must_refuse(rf"{kind}/a\.safetensors.*{cause}", checkpoint_path, url, kind=OSError)
         assert time.monotonic() - began < 5
         assert not re.search("p%40ss|hidden", str(error) + capsys.readouterr().err)
         assert error.__suppress_context__

@@ -38,8 +38,7 @@ def test_a_model_comes_back_and_its_card_says_what_the_checkpoint_knows(hub, tmp
     put(run / SCORES, b"| method | PSNR |\n")
     url = qgs.push_to_hub(run, "me/locus", license="apache-2.0", branch="v1")
     pushed = Path(url)
-    back = qgs.from_pretrained(url)
-    assert_equal(back.state_dict(), model.state_dict())
+    assert_equal(qgs.from_pretrained(url).state_dict(), model.state_dict())
 
     assert names_in(pushed) == {"README.md", "config.json", "checkpoint.safetensors"}
     _, data, text = (pushed / "README.md").read_text().split("---\n", 2)
@@ -61,6 +60,5 @@ def test_a_model_comes_back_and_its_card_says_what_the_checkpoint_knows(hub, tmp
 
 def test_a_model_that_ships_keeps_its_card(hub):
     url = qgs.push_to_hub("rooms/locus-64", "me/rooms", license="apache-2.0", branch="v1")
-    card = (Path(url) / "README.md").read_text()
-    assert "procedural rooms" in card
+    assert "procedural rooms" in (Path(url) / "README.md").read_text()
     assert qgs.from_pretrained(url).trained_on.values

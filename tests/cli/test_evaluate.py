@@ -67,8 +67,7 @@ def test_a_metric_of_a_plugin_that_was_installed_later(run, tmp_path, install):
     install("mine", "mine", PLUGIN)
     out = tmp_path / "out"
     more = ("plugins=[mine]", "metrics.level.type=mine/mean")
-    line = f"eval {run}/checkpoint.safetensors --out {out}"
-    done(" --set ".join((line, *more)))
+    done(" --set ".join((f"eval {run}/checkpoint.safetensors --out {out}", *more)))
     assert "level" in summary(out)["columns"]
     judged = resolve(resolve(run / "recipe.yaml").tree, ("training.steps=3", *more))
     result = resume(judged, run)
@@ -87,8 +86,7 @@ def test_other_weights_of_a_run_keep_its_evaluation(tmp_path):
 
 def test_settings_of_the_trained_model_are_refused(trained):
     for setting in ("training.steps=1", "model.feedback.rounds_more=1"):
-        line = f"eval {trained[1]} --set {setting}"
-        must_refuse("would change the trained model", done, line)
+        must_refuse("would change the trained model", done, f"eval {trained[1]} --set {setting}")
 
 
 def test_tune_says_what_and_how_often():

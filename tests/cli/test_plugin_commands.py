@@ -54,8 +54,7 @@ def test_one_that_cannot_be_used_is_told_and_the_others_work(offer, code, reason
 def test_of_two_with_one_name_neither_runs_and_our_own_are_never_hidden(offer):
     offer("colours", "paint", APP)
     offer("more-colours", "paint", APP)
-    reason = r"`qgs paint` of colours 2\.1, more-colours 2\.1"
-    must_refuse(reason, done, "paint first 1")
+    must_refuse(r"`qgs paint` of colours 2\.1, more-colours 2\.1", done, "paint first 1")
     offer("trains", "train", "raise RuntimeError")
     assert "Recipe file" in run_qgs("train --help").output
     assert "trains" not in run_qgs("--help").output

@@ -32,8 +32,7 @@ def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, 
         (".", "", "--overwrite"),
         (".", "--overwrite", "views"),
     ):
-        line = f"{checkpoint} {photos} {flags}"
-        must_refuse(word, written, out, line, kind=FileExistsError)
+        must_refuse(word, written, out, f"{checkpoint} {photos} {flags}", kind=FileExistsError)
         assert {*here.rglob("*")} == {notes, old.parent, old}
     Path("gaussians.ply").touch()  # as an earlier result has it
     record = written(".", f"{checkpoint} {photos} --overwrite --set views.scale=auto")
@@ -69,8 +68,7 @@ def test_a_call_gives_what_the_command_gives(checkpoint, photos, here, small_pic
     chosen = {"frames": [0, "4.png"], "compare": [1, "3.png"], "overrides": ["views.scale=auto"]}
     result = qgs.reconstruct(qgs.load(checkpoint), photos, **chosen)
     for file in result.save("call"):
-        by_command = Path("command", file.name)
-        assert file.is_dir() or file.read_bytes() == by_command.read_bytes(), file
+        assert file.is_dir() or file.read_bytes() == Path("command", file.name).read_bytes(), file
     own = qgs.load_ply("call/gaussians.ply")
     torch.testing.assert_close(own.means, result.gaussians.means)  # in the model's world
 

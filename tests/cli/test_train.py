@@ -54,8 +54,7 @@ def test_what_is_missing_is_told_before_training(here):
         (("evaluation.index=null", "plugins=[rooms]", ROOMS), "runs/locus/dl3dv"),
     )
     for overrides, message in cases:
-        line = f"train {FINETUNE} --out run --device cpu"
-        must_not_find(message, done, line, *sets(*overrides))
+        must_not_find(message, done, f"train {FINETUNE} --out run --device cpu", *sets(*overrides))
         assert not names_in(here)
 
 

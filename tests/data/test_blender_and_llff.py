@@ -30,8 +30,7 @@ def test_alpha_is_the_mask_and_shows_the_background(tmp_path, photos):
     scene = read(tmp_path, background=(0.0, 1.0, 0.0))
     masks = scene.masks([1, 2])
     assert_near(masks[0, 0, 5, [3, 35]], [1, 0.4])
-    whole = torch.ones(1, 30, 40)
-    assert torch.equal(masks[1], whole), "a photo without alpha has nothing to hide"
+    assert torch.equal(masks[1], torch.ones(1, 30, 40)), "a photo without alpha has nothing to hide"
     shown = scene.images([1])[0, :, 5].mul(255).round()
     assert shown[:, 3].tolist() == [10, 20, 30]
     assert shown[:, 35].tolist() == [36, 189, 36]
@@ -41,8 +40,7 @@ def test_the_angle_of_view_goes_with_the_images_which_cannot_be_replaced(tmp_pat
     write_blender(tmp_path, photos, train=6)
     for file in (tmp_path / "train").iterdir():
         Image.open(file).resize((80, 60)).save(file)
-    scene = read(tmp_path, (60, 80))
-    assert_near(scene.cameras.intrinsics[0], [100, 100, 40, 30])
+    assert_near(read(tmp_path, (60, 80)).cameras.intrinsics[0], [100, 100, 40, 30])
     must_refuse("`images`", read, tmp_path, images="images_2")
 
 

@@ -82,5 +82,4 @@ def test_masks_are_found_and_are_no_photos(spoon):
     names = ("images/N.jpg", "images/N.jpg", "masks/N.png")
     scene = read(spoon("a", *names, mask_path="C:/b/Masks/N.jpg"))
     assert [photo.mask.parent.name for photo in scene.photos] == ["masks"] * 3
-    absent = spoon("b", *names[:2], mask_path="N.png")
-    must_not_find("masks", read, absent)
+    must_not_find("masks", read, spoon("b", *names[:2], mask_path="N.png"))

@@ -35,8 +35,7 @@ def assert_same(read, photos):
     assert_allclose(read.cameras.intrinsics, expected, rtol=0, atol=1e-9)
     for i, file in enumerate(photos.files):
         assert Path(read.frame_name(i)).stem == file.stem
-        pixels = rgb_picture(read.images([i])[0])
-        assert np.array_equal(pixels, Image.open(file))
+        assert np.array_equal(rgb_picture(read.images([i])[0]), Image.open(file))
 
 
 def test_the_same_photos_in_every_format(tmp_path):
@@ -134,8 +133,7 @@ def test_a_distribution_adds_a_format(install, tmp_path, caplog):
         install(f"{name}-photos", name, source, group=GROUP)
     assert PhotosSource.Config(path="photos", format="csv").format == "csv"
     (folder := UPath(tmp_path / "photos")).mkdir()
-    reason = r"transforms\.json.*poses\.csv \(csv\)"
-    must_not_find(reason, formats.read_listing, folder)
+    must_not_find(r"transforms\.json.*poses\.csv \(csv\)", formats.read_listing, folder)
     photos = synthetic(tmp_path / "photos", count=2)
     lines = [
         ",".join(map(str, [file.name, *photos.intrinsics, *pose.flatten().tolist()]))

@@ -111,8 +111,7 @@ def test_the_world_is_that_of_the_poses():
 
 def test_images_of_another_size_are_told_when_decoded():
     Image.new("RGB", (40, 40)).save(NAMES[3])
-    scene = read()
-    must_refuse(r"view_003\.png", scene.images, [3])
+    must_refuse(r"view_003\.png", read().images, [3])
 
 
 def test_a_matrix_of_intrinsics_and_numbers_as_text_are_read():
@@ -135,8 +134,7 @@ def test_a_scale_of_rotations_is_divided_out_and_a_stray_camera_left_out(caplog)
         pose[:3, :3] *= 2.5
         pose[0, 3] += 4500 * (number == 3)
         change(number, transform_matrix=pose.tolist())
-    found = read().cameras.c2w
-    assert torch.allclose(found, expected[[0, 1, 2, 4, 5]])
+    assert torch.allclose(read().cameras.c2w, expected[[0, 1, 2, 4, 5]])
     assert "rotations of 6 frames" in caplog.text
     assert "frame 3 (images/view_003.png): the camera stands" in caplog.text
     pose[:3, 0] *= 1.1

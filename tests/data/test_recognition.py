@@ -43,8 +43,7 @@ def test_by_content(tmp_path):
         found = {}
         for number, held in enumerate(expected):
             root = UPath(place) / f"place{number}"
-            file = root / held
-            put(file, b"")
+            put(root / held, b"")
             found[held] = recognised(root, SOURCES)
         assert found == expected
 
@@ -52,8 +51,7 @@ def test_by_content(tmp_path):
 def test_files_and_nothing(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"")
     assert recognised(UPath(tmp_path / "a.zip"), SOURCES) == "datasets/dl3dv"
-    absent = UPath(tmp_path / "b")
-    must_not_find("does not exist", recognised, absent, SOURCES)
+    must_not_find("does not exist", recognised, UPath(tmp_path / "b"), SOURCES)
 
 
 def test_a_plugin_is_asked_before_qgs_and_both_are_named(tmp_path, caplog):

@@ -86,9 +86,8 @@ def test_photos_that_look_elsewhere_are_no_inputs():
 
 
 def test_the_depth_of_a_walk_is_seen_in_its_photos():
-    views = photos_of(walk(6))
     # walls at 1.5, seen from -1.1 to -0.6 along the axis
-    assert 1.5 < scene_depth(GivenScene(views)) < 2.7
+    assert 1.5 < scene_depth(GivenScene(photos_of(walk(6)))) < 2.7
 
 
 def test_photos_without_texture_leave_the_reach_of_the_cameras():

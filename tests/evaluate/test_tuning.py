@@ -57,8 +57,7 @@ def test_latents_are_tuned_at_their_own_rate():
 
 
 def test_every_floating_field_is_tuned_and_no_other(monkeypatch):
-    steps = "evaluation={tuning_steps: 1, tuning_rate: 1.0e-3}"
-    recipe, model, inputs = opened("locus", steps)
+    recipe, model, inputs = opened("locus", "evaluation={tuning_steps: 1, tuning_rate: 1.0e-3}")
     start = model.queries.start(1)
     numbers = torch.arange(start.features.shape[1])[None]
     labelled = start.replace(fields={"stranger.label": numbers})

@@ -31,9 +31,8 @@ def test_quick_start_runs():
 def test_the_code_of_the_five_ideas_computes_its_formula_and_keeps_its_contract(
     tmp_path, monkeypatch
 ):
-    code = blocks("ideas.md", "python")
     # a module that other processes can import too
-    Path("component_of_the_guide.py").write_text(code["ahead.py"])
+    Path("component_of_the_guide.py").write_text(blocks("ideas.md", "python")["ahead.py"])
     monkeypatch.syspath_prepend(tmp_path)
     near = import_module("component_of_the_guide").AheadCenters
     centers = near(near.Config(distance=2.0), ModelDims(16, 2, 1))

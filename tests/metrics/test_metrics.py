@@ -20,8 +20,7 @@ from qgs.types import Views
 
 
 def pair(noise, size=(24, 37)):
-    coarse = torch.rand(2, 3, 6, 8)
-    truth = torch.nn.functional.interpolate(coarse, size, mode="bilinear")
+    truth = torch.nn.functional.interpolate(torch.rand(2, 3, 6, 8), size, mode="bilinear")
     return truth + noise * torch.randn(truth.shape), truth
 
 

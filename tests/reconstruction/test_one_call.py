@@ -64,8 +64,7 @@ def test_gaussians_with_harmonics_lie_in_the_world_of_the_photos(model, far, tmp
     renderer = AutoRenderer(AutoRenderer.Config(far=1e5))  # in the unit of the photos
     for seen in (renderer(qgs.load_ply(file), far.cameras), result.render(far.cameras)):
         assert_equal(seen.rgb, own.rgb, atol=5e-3)
-        depth = seen.depth * float(result.sample.world[1])
-        assert_close(depth, own.depth, atol=5e-3, rtol=1e-2)
+        assert_close(seen.depth * float(result.sample.world[1]), own.depth, atol=5e-3, rtol=1e-2)
 
 
 def test_what_cannot_be_reconstructed_is_refused(model, views, photos):

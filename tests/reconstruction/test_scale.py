@@ -57,8 +57,7 @@ def test_the_range_follows_the_unit_and_the_training():
         (trained, 100.0, wide),  # the training has another unit
         (far, 3.0, wide),
     ):
-        found = scale.search_range(known, Walk(), (1, 4), depth)
-        assert_near(found, expected, rtol=1e-5)
+        assert_near(scale.search_range(known, Walk(), (1, 4), depth), expected, rtol=1e-5)
     turning = Domain({"baseline": [0.0, 0.0]}, 4)
     assert scale.search_range(turning, Walk(), (1, 4), 3.0) == (1.0, 1.0)
     still = Walk()

@@ -25,8 +25,7 @@ def rasterization(
     assert Ks[0, 0, 2].tolist() == [0, 0, 1]
     assert colors.shape[2], "kernels divide by the number of Gaussians"
     renderer = TorchRenderer(RendererConfig(near=near_plane, far=far_plane, dilation=eps2d))
-    c2w = torch.linalg.inv(viewmats)
-    cameras = Cameras(c2w, Ks.flatten(2)[..., [0, 4, 2, 5]], (height, width))
+    cameras = Cameras(torch.linalg.inv(viewmats), Ks.flatten(2)[..., [0, 4, 2, 5]], (height, width))
     parts = []
     for view in range(len(colors[0])):
         seen = Gaussians(**given, colors=colors[:, view, :, :3], features=colors[:, view])

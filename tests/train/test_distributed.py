@@ -57,8 +57,7 @@ def test_two_processes_have_the_loss_curve_of_one(name, options):
 
 def test_all_processes_leave_out_a_step_that_one_found_bad(here):
     options = "{on_nonfinite: skip, render_views: 1, ema: 0.9, evaluate_every: 2}"
-    recipe = tiny("locus", f"training={options}")
-    train_in_two_processes(recipe, here, {3}, True)
+    train_in_two_processes(tiny("locus", f"training={options}"), here, {3}, True)
     records = read_jsonl(here / "history.jsonl")
     assert ["loss" in record for record in records] == [True, False, True]
     assert column(read_jsonl(here / "evaluations.jsonl"), "step") == [2, 2, 3, 3]

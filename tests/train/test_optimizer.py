@@ -108,8 +108,7 @@ def test_a_pattern_names_a_part_and_all_below_it():
 
 def test_a_pattern_that_matches_nothing_ends_the_start(here):
     pattern = "decoder.1.self_atention"
-    recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
-    problem = refused(recipe, by=run)
+    problem = refused(tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}'), by=run)
     assert problem.file[:5] == "--set"
     assert problem.option == f"optimizer.parts.{pattern}"
     assert "`decoder.1.self_attention`" in problem.fix
@@ -162,8 +161,7 @@ def test_a_plugin_adds_an_optimiser_by_one_class(install):
         "plugins=[rooms, locus, plain]",
         "optimizer={type: plain/plain, learning_rate: 0.02, parts: {encoder: 0, head: 0.5}}",
     )
-    history = run(recipe).folder.history()
-    assert column(history, "lr") == [0.02] * 3
+    assert column(run(recipe).folder.history(), "lr") == [0.02] * 3
     run(resolve(recipe.tree, ["training.steps=2"]), "halves")
     assert resume(recipe, "halves").resumed_at == 2
     assert_equal_runs("run", "halves")

@@ -71,8 +71,7 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped():
     assert CheckpointFile(again).step == 2
     assert qgs.load(again).renderer.config.dilation == 2
     for other in ("objective.depth_weight=0.5", "losses.photometric.ssim_weight.values=[0.4, 0.1]"):
-        changed = tiny("locus", *options, other)
-        must_refuse(other.split("=")[0], resume, changed, kind=OtherRunError)
+        must_refuse(other.split("=")[0], resume, tiny("locus", *options, other), kind=OtherRunError)
     assert run_calling(note, recipe, resume=True).resumed_at == 2
     assert_equal_runs("whole", "run")
     # After a step there stand the numbers of the next one.

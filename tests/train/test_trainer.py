@@ -121,8 +121,7 @@ def test_bad_steps_are_skipped_on_demand(monkeypatch, caplog):
     assert parts_of(through)["guard"]["skipped"] == 1  # a good step lies between the two
     recipe = tiny("locus", options)
     for begin in (run, resume):
-        place = r"targets\.images \(1 of"
-        told = str(must_refuse(place, begin, recipe, kind=NonFiniteError))
+        told = str(must_refuse(r"targets\.images \(1 of", begin, recipe, kind=NonFiniteError))
         assert "step 2 has NaN or infinity" in told
         assert "mse is nan" in told
     assert len(losses()) == 1

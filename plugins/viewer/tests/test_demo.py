@@ -212,8 +212,7 @@ def room(tmp_path_factory):
     c2w = scene.cameras.c2w.double().numpy()
     c2w[:, :3, 3] *= UNIT
     lens = scene.cameras.intrinsics[0].tolist()
-    photos = photo_set(folder, images, c2w, lens, "{:02d}.png")
-    return write_nerfstudio(folder / "photos", photos)
+    return write_nerfstudio(folder / "photos", photo_set(folder, images, c2w, lens, "{:02d}.png"))
 
 
 def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path, small_pictures):

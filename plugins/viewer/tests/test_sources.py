@@ -23,8 +23,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     qgs.save(model_of("locus"), folder / "model.safetensors")
     model = qgs.load(folder / "model.safetensors")
-    sample = sample_of(targets=(0, 2, 3, 5))
-    reconstruct_sample(model, sample).save(folder / "scene")
+    reconstruct_sample(model, sample_of(targets=(0, 2, 3, 5))).save(folder / "scene")
     return folder / "scene"
 
 
@@ -48,14 +47,12 @@ def test_a_scene_is_shown_with_photos_that_are_still_there(tmp_path):
     save_ply(cloud(5), scene / "scene.ply")
     command = shlex.join(["qgs", "scene", str(photos), "--size", "16x16"])
     names = [f"images/{frame}.png" for frame in (0, 2)]
-    record = {"command": command, "refined_on": names}
-    write_json(scene / "metrics.json", record)
+    write_json(scene / "metrics.json", {"command": command, "refined_on": names})
     source = open_source(str(scene))
     shown = source.scene_of(())
     assert shown.gaussians.count == 5
     assert shown.background == (0.0, 0.0, 0.0)
-    cameras = qgs.read_photos(photos).cameras.c2w
-    assert_equal(shown.views.cameras.c2w, cameras[:, [0, 2]])
+    assert_equal(shown.views.cameras.c2w, qgs.read_photos(photos).cameras.c2w[:, [0, 2]])
     assert shown.views.images.shape[-2:] == (16, 16)
     assert not source.notes
     shutil.rmtree(photos)

@@ -166,8 +166,7 @@ def test_a_page_is_small_and_asks_for_nothing():
 
 
 def test_a_tour_lists_cameras_and_names():
-    lens = (60.0, 50.0, 32.0, 24.0)
-    cameras = pinhole(arc([-20.0, 20], 3).float(), lens, (48, 64))[None]
+    cameras = pinhole(arc([-20.0, 20], 3).float(), (60.0, 50.0, 32.0, 24.0), (48, 64))[None]
     views = Views(torch.rand(1, 2, 3, 48, 64), cameras)
     black = [np.zeros((48, 64, 3), np.uint8)] * 2
     page = gaussians_html(cloud(64), Tour("a", "b", views, ["</script>", "c"], 1, cameras, black))

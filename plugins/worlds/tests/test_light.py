@@ -45,8 +45,7 @@ def seen_from_above(shapes, points, sun=(), ambient=0.0):
     world = s.World(table, heights, textures, lights, air, shadows)
     c2w = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (len(points), 1, 1))
     c2w[:, :3, 3] = [(x, y, 1.0) for x, y in points]
-    lens = np.array([100.0, 100.0, 0.5, 0.5])
-    _, images = cast(world, c2w, lens, (1, 1), 1, paint)
+    _, images = cast(world, c2w, np.array([100.0, 100.0, 0.5, 0.5]), (1, 1), 1, paint)
     return images[:, 0, 0, 0].tolist()
 
 

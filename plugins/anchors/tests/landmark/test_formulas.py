@@ -144,8 +144,7 @@ def test_refinement_steps_in_radii_along_the_axes_of_the_photo():
     ours.load_state_dict(theirs.state_dict())
     radii = support_radius(state[RAW_RADIUS], ours.config)
     steps = radii * (theirs(state)[CENTER] - state[CENTER])
-    expected = torch.einsum("bnij,bnj->bni", AXES, steps)
-    assert_close(ours(state)[CENTER] - state[CENTER], expected)
+    assert_close(ours(state)[CENTER] - state[CENTER], torch.einsum("bnij,bnj->bni", AXES, steps))
     assert torch.equal(ours(state)[RAW_RADIUS], theirs(state)[RAW_RADIUS])
 
 

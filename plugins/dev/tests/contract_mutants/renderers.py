@@ -97,8 +97,7 @@ class DetachesDepth(ChangedRenderer):
 @mutant(GAUSSIANS, "gaussians.colors")
 class DoublesAGradient(ChangedRenderer):
     def drawn(self, gaussians):
-        colors = 2 * gaussians.colors - gaussians.colors.detach()
-        return gaussians.replace(colors=colors)
+        return gaussians.replace(colors=2 * gaussians.colors - gaussians.colors.detach())
 
 
 @mutant(CAMERAS, "and gets none")

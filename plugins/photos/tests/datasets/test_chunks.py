@@ -47,8 +47,7 @@ def data_set(here):
     """With an index of the scenes for training."""
     write("train", a=[record("s0"), record("s1", 7)], b=[record("s2")])
     write("test", a=[record("t0")])
-    index = {"s0": "a.torch", "s1": "a.torch", "s2": "b.torch"}
-    write_json(INDEX, index)
+    write_json(INDEX, {"s0": "a.torch", "s1": "a.torch", "s2": "b.torch"})
 
 
 opened = partial(photo_formats.opened, path=".", size=(16, 16), source=ChunksSource)
@@ -199,8 +198,7 @@ def test_a_small_file_does_not_fill_the_memory():
     ):
         write(a=[record("s0", **{name: value})])
         assert Path("a.torch").stat().st_size < 20_000
-        reason = rf"\A.*a\.torch: scene 's0': '{name}' holds a tensor.*\Z"
-        must_refuse(reason, all_images)
+        must_refuse(rf"\A.*a\.torch: scene 's0': '{name}' holds a tensor.*\Z", all_images)
 
 
 def test_an_index_does_not_lead_outside(data_set):

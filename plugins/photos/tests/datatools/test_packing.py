@@ -141,8 +141,7 @@ def test_named_scenes_are_for_testing(six):
     train, test = packing.chosen_splits(six, ["s4", "s1"]).values()
     assert [*train] == ["s0", "s2", "s3", "s5"]
     assert [*test] == ["s1", "s4"]
-    absent = "1 of 2 test scenes do not exist: gone"
-    must_refuse(absent, packing.chosen_splits, six, ["s1", "gone"])
+    must_refuse("1 of 2 test scenes do not exist: gone", packing.chosen_splits, six, ["s1", "gone"])
 
 
 def test_what_is_there_is_never_overwritten(six):

@@ -58,8 +58,7 @@ def test_the_round_trip(tmp_path, count):
 
 def test_cameras_see_what_ours_see(tmp_path):
     """In glTF, -Z is forward and +Y is up: that of the cameras, from the ground at 0."""
-    lens = (60.0, 50.0, 32.0, 24.0)
-    cameras = pinhole(arc([-20, 0, 20], 3, 0.2).float(), lens, (48, 64))[None]
+    cameras = pinhole(arc([-20, 0, 20], 3, 0.2).float(), (60.0, 50.0, 32.0, 24.0), (48, 64))[None]
     given = cloud(20)
     named = {f"photo {view}": cameras[:, [view]] for view in range(3)}
     save_glb(given, tmp_path / "a.glb", named)
@@ -93,8 +92,7 @@ def test_cameras_in_a_ring_and_maps_keep_the_scene(tmp_path):
     c2w[:, :3, 3] += place
     far = cloud(20).replace(means=cloud(20).means.double() + place)
     save_glb(far, tmp_path / "a.glb", {f"{i}": pinhole(c2w[[i]])[None] for i in range(4)})
-    found = qgs.load_ply(tmp_path / "a.glb")
-    assert_equal(found.means - place, far.means - place, atol=1e-5)
+    assert_equal(qgs.load_ply(tmp_path / "a.glb").means - place, far.means - place, atol=1e-5)
     content, _ = opened(tmp_path / "a.glb")
     assert np.linalg.norm(content["nodes"][1]["translation"]) < 9
 

@@ -38,8 +38,7 @@ def assert_close_enough(found, given, sh=0.04):
 def test_the_round_trip(tmp_path, suffix):
     sizes = []
     for count in (3, 8, 15):
-        sh = torch.rand(1, 300, count, 3) - 0.5
-        given = cloud(300).replace(sh=sh)
+        given = cloud(300).replace(sh=torch.rand(1, 300, count, 3) - 0.5)
         save_gaussians(given, tmp_path / f"a.{suffix}")
         assert_close_enough(qgs.load_ply(tmp_path / f"a.{suffix}"), given)
         sizes.append((tmp_path / f"a.{suffix}").stat().st_size)
@@ -92,8 +91,7 @@ def test_splat_transform_reads_our_files_and_we_its(tmp_path):
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium: apt install chromium")
 def test_three_draws_our_scene_from_50_cameras_of_the_file(tmp_path):
     node("npm", "install", "three@0.187", folder=tmp_path)
-    sh = torch.rand(1, 300, 15, 3) - 0.5
-    given = cloud(300).replace(sh=sh, opacities=torch.ones(1, 300))
+    given = cloud(300).replace(sh=torch.rand(1, 300, 15, 3) - 0.5, opacities=torch.ones(1, 300))
     cameras = {f"camera_{place}": AROUND[:, [place]] for place in range(50)}
     save_glb(given, tmp_path / "a.glb", cameras)
     html = Path(__file__).with_name("read_glb.html").read_text()

@@ -44,8 +44,7 @@ def found(tmp_path):
     """What begins from pixels of two photos with equal descriptors; EXIF gives some focals."""
 
     def found(pixels, *focals):
-        rng = np.random.default_rng(1)
-        descriptors = rng.integers(0, 256, (len(pixels[0]), 128), np.uint8)
+        descriptors = np.random.default_rng(1).integers(0, 256, (len(pixels[0]), 128), np.uint8)
         kind = pycolmap.FeatureExtractorType.SIFT
         with pycolmap.Database.open(tmp_path / "database.db") as database:
             for place, focal in enumerate(focals):

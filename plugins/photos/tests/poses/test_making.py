@@ -49,8 +49,7 @@ def test_a_video_gets_poses_of_its_frames_where_it_is_read(shots, images, tmp_pa
     # poses by several threads differ from run to run, and so do x264's B-frames
     monkeypatch.setattr(door, "Options", partial(Options, threads=1))
     video = write_video(tmp_path / "phone.mp4", images, bf="0")
-    views = qgs.read_photos(video, size=(36, 54))
-    assert views.images.shape == (1, PHOTOS, 3, 36, 54)
+    assert qgs.read_photos(video, size=(36, 54)).images.shape == (1, PHOTOS, 3, 36, 54)
     assert read_json(tmp_path / "phone_poses/poses.json")["made_by"] == "qgs poses"
     assert_close(tmp_path / "phone_poses", shots)
 

@@ -40,8 +40,7 @@ def wall(depth):
 
 
 def test_paths_are_rigid_and_take_small_steps():
-    paths = [path_of(kind, cameras(), 3.0, 40) for kind in ("orbit", "spiral", "walk")]
-    c2w = torch.stack(paths)
+    c2w = torch.stack([path_of(kind, cameras(), 3.0, 40) for kind in ("orbit", "spiral", "walk")])
     assert_rigid(c2w)
     assert c2w[..., :3, 3].diff(dim=1).norm(dim=-1).max() < 0.15
 
@@ -165,8 +164,7 @@ def test_a_film_shows_what_the_reconstruction_renders_of_the_photos_world(here):
 
     scene = reconstruct(qgs.load(checkpoint), photos, inputs=2, overrides=scale_settings(2.0))
     c2w, focal = read_path(path, (480, 480))
-    filmed = pinhole(c2w, (*focal[0], 240, 240), (480, 480))
-    rendered = scene.render(filmed[None]).rgb[0]
+    rendered = scene.render(pinhole(c2w, (*focal[0], 240, 240), (480, 480))[None]).rgb[0]
     expected = 255 * rendered.clamp(0, 1).permute(0, 2, 3, 1).numpy()
     assert np.abs(expected[0] - expected[1]).mean() > 0.05 * 255
     assert np.shape(shown) == expected.shape

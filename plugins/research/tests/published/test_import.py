@@ -38,8 +38,7 @@ def imported(folder, weights, **options):
 def arrived(file, weights):
     """Names of the layout of a checkpoint that holds these weights, bit by bit."""
     known = names_of(resolve(file.with_suffix(".yaml")))
-    ours = load_file(file)
-    assert_equal(ours, {key: weights[theirs] for key, theirs in known.published.items()})
+    assert_equal(load_file(file), {key: weights[theirs] for key, theirs in known.published.items()})
     return known
 
 

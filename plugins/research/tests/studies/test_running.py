@@ -63,8 +63,7 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
     assert "2 seeds x 4 scenes" in (out / "table.md").read_text()
 
     study.write_text(study.read_text().replace("seeds: [0, 1]", "seeds: [0, 1, 2]"))
-    told = done(f"study {study} --out {out} --only 4 --device cpu").output
-    assert "6 runs, 2 missing" in told
+    assert "6 runs, 2 missing" in done(f"study {study} --out {out} --only 4 --device cpu").output
     assert begun(out) == {**runs, "locus/seed-2": 1}
 
     changed = study.read_text().replace("qgs/content}", "locus/ray_biased, bandwidth: fixed}")

@@ -63,8 +63,7 @@ def test_it_gives_the_patch_tokens_of_the_last_layer(weights):
     for told, images in (({}, GIVEN.images * 2 - 1), ({"images": "unit"}, GIVEN.images)):
         component = encoder(weights, **told)
         memory = component(GIVEN)
-        expected = component.aggregator(images)[0][-1][:, :, 5:]
-        assert_equal(memory.features, expected.flatten(1, 2))
+        assert_equal(memory.features, component.aggregator(images)[0][-1][:, :, 5:].flatten(1, 2))
         assert memory.grid == (3, 2, 3)
         assert memory.keys is memory.values is memory.patch_rays is None
 

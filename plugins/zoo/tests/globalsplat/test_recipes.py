@@ -59,8 +59,7 @@ def test_two_passes_train_a_head_that_grows(here):
     recipe = resolve(TINY, [*SMALL.split(), two, growing])
     folder = run(recipe).folder
     assert [record["frustum"] > 0 for record in folder.history()] == [True] * 6
-    model = qgs.load(folder.checkpoint)
-    assert model.head.gaussians_per_query == 8  # those of the last step
+    assert qgs.load(folder.checkpoint).head.gaussians_per_query == 8  # those of the last step
     assert qgs.compose(TINY, overrides=[growing]).head.gaussians_per_query == 1  # of the first one
 
 
