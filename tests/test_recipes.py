@@ -63,11 +63,11 @@ PARAMETERS = {
     "locus/(re10k|dl3dv)|ablations/": LOCUSGS,
 }
 """Parameters of recipes whose names begin so, with N queries in place of 1024."""
-EQUALS = {
-    "tiny/c3g.yaml": "tiny/tokengs.yaml",
-    "tiny/gslrm.yaml": "tiny/locus.yaml",
-    "tiny/globalsplat.yaml": "tiny/locus.yaml",
-}
+EQUALS = yaml.safe_load("""
+tiny/c3g.yaml: tiny/tokengs.yaml
+tiny/gslrm.yaml: tiny/locus.yaml
+tiny/globalsplat.yaml: tiny/locus.yaml
+""")
 """Other models, and the one whose budget they have."""
 
 

@@ -10,15 +10,10 @@ import torch
 from commands import SMALL
 from safetensors.torch import save_file
 from small_parts import Code, shaken
-from tables import assert_equal, must_refuse
+from tables import assert_equal, must_refuse, rows
 
 import qgs
-from qgs.checkpoint.model_file import (
-    CheckpointFile,
-    save,
-    unique_tensors,
-    write_checkpoint,
-)
+from qgs.checkpoint.model_file import CheckpointFile, save, unique_tensors, write_checkpoint
 from qgs.checkpoint.tensors import SEAL, CheckpointError, TensorFile, copied, write_tensors
 from qgs.domain import KEY, Domain
 from qgs.recipe import RecipeError, resolve
@@ -169,11 +164,17 @@ def test_a_changed_letter_in_any_metadata_is_refused(saved):
             must_not_load(".", saved, CheckpointFile)
 
 
+VERSIONS = """
+2 | format_version 2
+99 | qgs.format_version 99
+3 | lack
+"""
+
+
 def test_files_of_another_format_or_without_a_seal_are_refused(saved):
     metadata = metadata_of(saved)
     del metadata[SEAL]
-    versions = (("2", "format_version 2"), ("99", "qgs.format_version 99"), ("3", "lack"))
-    for version, fault in versions:
+    for version, fault in rows(VERSIONS):
         save_file(tensors_of(saved), saved, metadata | {"qgs.format_version": version})
         must_not_load(fault, saved, CheckpointFile)
 

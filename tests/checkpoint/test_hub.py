@@ -33,7 +33,7 @@ def hub(tmp_path, monkeypatch):
 def test_a_model_comes_back_and_its_card_says_what_the_checkpoint_knows(hub, tmp_path):
     run = tmp_path / "run"
     model = tiny("locus").build_model()
-    seen = Domain(values={"views": [2.0, 4.0], "fov": [50.0, 61.0]}, samples=2)
+    seen = Domain(yaml.safe_load("{views: [2.0, 4.0], fov: [50.0, 61.0]}"), samples=2)
     qgs.save(model, run / "checkpoint.safetensors", extra={"step": "1200", KEY: seen.text})
     put(run / SCORES, b"| method | PSNR |\n")
     url = qgs.push_to_hub(run, "me/locus", license="apache-2.0", branch="v1")

@@ -5,7 +5,7 @@ from importlib.metadata import entry_points
 
 import pytest
 from commands import done, run_qgs
-from tables import must_refuse
+from tables import must_refuse, rows
 
 from qgs.cli import COMMANDS, GROUP
 
@@ -36,14 +36,15 @@ def test_it_is_listed_with_its_help_and_called(offer):
     assert "second" in run_qgs("paint --help").output
 
 
-@pytest.mark.parametrize(
-    ("code", "reason"),
-    [
-        ("import no_such_package", "ModuleNotFoundError: No module named"),
-        ("plugin = 3", "not a typer.Typer; update it"),
-        ("raise SystemExit('no display')", "SystemExit: no display; update it"),
-    ],
-)
+BROKEN = """
+import no_such_package | ModuleNotFoundError: No module named
+plugin = 3 | not a typer.Typer; update it
+raise SystemExit('no display') | SystemExit: no display; update it
+"""
+"""A module, and what is told of it."""
+
+
+@pytest.mark.parametrize(("code", "reason"), rows(BROKEN))
 def test_one_that_cannot_be_used_is_told_and_the_others_work(offer, code, reason):
     offer("colours", "paint", code)
     error = must_refuse(r"the command `qgs paint` of colours 2\.1", done, "paint first")

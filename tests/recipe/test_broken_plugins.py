@@ -8,7 +8,7 @@ from pathlib import Path
 
 from commands import done
 from refusals import refused
-from tables import must_not_find, must_refuse
+from tables import must_not_find, must_refuse, rows
 
 from qgs.recipe import RecipeError, resolve
 from qgs.recipe.registry import available_plugins, load_usable_plugins
@@ -91,16 +91,20 @@ def test_a_plugin_that_comes_to_a_folder_or_leaves_it_is_noticed(tmp_path, monke
     assert "late" not in available_plugins().names
 
 
+BROKEN = """
+[first, second] | {}
+[faulty] | {self_attention: {type: faulty/strict, word: x}}
+[faulty] | {refinement: {type: faulty/silent}}
+"""
+"""Plugins, and options of the decoder."""
+
+
 def test_the_tracebacks_of_plugins_and_components_are_all_shown(here, install):
     install("qgs-faulty", "faulty", FAULTY)
     for name in ("first", "second"):
         install(f"qgs-{name}", name, "{}['x']\n")
     shown = ""
-    for plugins, decoder in (
-        ("[first, second]", "{}"),
-        ("[faulty]", "{self_attention: {type: faulty/strict, word: x}}"),
-        ("[faulty]", "{refinement: {type: faulty/silent}}"),
-    ):
+    for plugins, decoder in rows(BROKEN):
         recipe = write(f"recipe: 1\nplugins: {plugins}\nmodel: {{decoder: {decoder}}}\n")
         error = must_refuse(None, resolve, recipe, kind=RecipeError)
         shown += "".join(traceback.format_exception(error))

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import yaml
 from photo_formats import noisy_photos
 from tables import must_refuse
 from walk import Walk
@@ -45,7 +46,8 @@ def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
 
 def test_a_photo_between_two_inputs_is_an_input_unless_two_are_asked_for():
     walk = Walk()
-    wide = Domain({"baseline": [1.8, 1.9], "depth": [3.0, 3.0], "turn": [30.0, 40.0]}, 4)
+    ranges = "{baseline: [1.8, 1.9], depth: [3.0, 3.0], turn: [30.0, 40.0]}"
+    wide = Domain(yaml.safe_load(ranges), 4)
     for inputs, walk.held_out, compare, expected in (
         (None, (2,), None, (0, 1, 3)),
         (2, (2,), None, (0, 3)),

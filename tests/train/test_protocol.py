@@ -11,7 +11,7 @@ from qgs.evaluate.plan import read_index
 from qgs.evaluate.protocol import protocol_of
 from qgs.recipe import resolve
 
-INDEX = {"a": {"context": [0, 3], "target": [1, 2]}, "b": None}
+INDEX = json.loads('{"a": {"context": [0, 3], "target": [1, 2]}, "b": null}')
 OTHERS = """
 {"a": {"context": [3, 0], "target": [1, 2]}, "b": null}
 {"a": {"context": [0, 3], "target": [1]}, "b": null}

@@ -20,6 +20,11 @@ from qgs.recipe.yaml_text import load_mapping
 from qgs.types import ImageMemory, QueryState
 
 LISTED = cache(packages_distributions)
+NAMES = """
+a wide far-sighted far_sighted view2d
+no on yes off n inf nan
+"""
+"""The last are values for other readers of YAML."""
 WRITTEN = """
 .gitignore README.md pyproject.toml recipe.yaml src/qgs_far_sighted/__init__.py
 src/qgs_far_sighted/abstaining.py src/qgs_far_sighted/py.typed tests/test_contract.py
@@ -51,8 +56,7 @@ def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
 
 
 def test_names_that_are_taken_as_they_are() -> None:
-    values = ("no", "on", "yes", "off", "n", "inf", "nan")  # for other readers of YAML
-    for name in ("a", "wide", "far-sighted", "far_sighted", "view2d", *values):
+    for name in NAMES.split():
         check_name(name)
         text = dict(rendered(name))[Path("recipe.yaml")]
         assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name

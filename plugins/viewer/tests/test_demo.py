@@ -104,8 +104,9 @@ def test_no_model_is_marked_by_few_samples_or_below_a_baseline(models, tmp_path,
 
 
 def test_small_scenes_keep_their_photos_and_others_every_eighth(models, tmp_path):
-    for name, count in (("large", 20), ("small", 3), ("tiny", 2)):
-        noisy_photos(tmp_path / name, count)
+    noisy_photos(tmp_path / "large", 20)
+    noisy_photos(tmp_path / "small", 3)
+    noisy_photos(tmp_path / "tiny", 2)
     (result,) = opened(models[:1], tmp_path)
     compared = {
         score.scene: {frame for _, frames in score.views for frame in frames}

@@ -179,8 +179,9 @@ def test_faults_of_chunks_and_their_index(chunks):
     """0 is sound but for its index, 1 is missing, and 2 to 4 hold no scenes."""
     index = '{"a": "0.torch", "c": "1.torch", "d": "0.torch", "e": "2.torch", "f": "3.torch"}'
     (chunks / "test/index.json").write_text(index)
-    for number, content in ((2, {"key": "e"}), (3, [torch.zeros(2)] * 2), (4, [])):
-        save(chunks / f"test/{number}.torch", content)
+    save(chunks / "test/2.torch", {"key": "e"})
+    save(chunks / "test/3.torch", [torch.zeros(2)] * 2)
+    save(chunks / "test/4.torch", [])
     expected = (
         "error: test/2.torch: *",
         "error: test/3.torch: 0 of its 2 entries are mappings with a 'key'*",

@@ -69,4 +69,4 @@ def test_pack(tapes):
     done(f"data pack {tapes} --out {tapes}/chunks --set image_size=[16,16]")
     scenes = photo_formats.opened(tapes / "chunks", (16, 16), ChunksSource).scenes("train")
     told = [(scene.name, len(scene), scene.held_out) for scene in scenes]
-    assert told == [("a", 6, (1, 4)), ("b", 6, (1, 4))]
+    assert told == [(name, 6, (1, 4)) for name in "ab"]

@@ -34,22 +34,22 @@ MODELS = f"""
 from qgs.contracts import Plugin
 plugin = Plugin("box", 1, (), models={{"m": {NAME + ".safetensors"!r}}})
 """
-COMMANDS = (
-    f"compose {NAME}.yaml",
-    f"compose {NAME}.yaml --set model.{NAME}=1",
-    f"compose {NAME}",
-    f"train {NAME}.yaml --out {NAME}",
-    f"eval {NAME}.safetensors",
-    f"reconstruct rooms/locus-64 {NAME} --out out",
-    f"list {NAME}",
-    "list box/m",
-    f"recipes {NAME}",
-    f"data check {NAME}",
-    f"data check {NAME} --format colmap",
-    "faulty",
-    NAME,
-    f"list --{NAME}",
-)
+COMMANDS = """
+compose NAME.yaml
+compose NAME.yaml --set model.NAME=1
+compose NAME
+train NAME.yaml --out NAME
+eval NAME.safetensors
+reconstruct rooms/locus-64 NAME --out out
+list NAME
+list box/m
+recipes NAME
+data check NAME
+data check NAME --format colmap
+faulty
+NAME
+list --NAME
+"""
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def printed(install, here, monkeypatch, capsys):
 
 
 def test_no_command_prints_control_characters(printed):
-    texts = {command: printed(command) for command in COMMANDS}
+    texts = {line: printed(line.replace("NAME", NAME)) for line in COMMANDS.strip().splitlines()}
     assert not [command for command, text in texts.items() if RAW.search(text)]
     assert not [command for command, text in texts.items() if r"\u202e" not in text]
 
