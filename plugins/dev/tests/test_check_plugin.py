@@ -33,7 +33,7 @@ class CannotDefault(MlpFeedForward):
     name = "cannot_default"
 
     class Config(MlpFeedForward.Config):
-        def model_post_init(self, context) -> None:
+        def model_post_init(self, context):
             raise RuntimeError("no defaults today")
 
 
@@ -49,7 +49,7 @@ class OnOtherDevices(TorchRenderer):
     devices = ("cuda",)
 
 
-def _installed(*components, **parts) -> InstalledPlugin:
+def _installed(*components, **parts):
     return InstalledPlugin(Plugin("mine", CONTRACT_VERSION, components, **parts), "qgs-mine", "1.2")
 
 
@@ -100,7 +100,7 @@ exit code 1""",
 """What is told of plugins after the first line, and the exit code; any text for a star."""
 
 
-def test_reports(monkeypatch) -> None:
+def test_reports(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     for installed, told in REPORTS:
         for module in ("qgs.recipe.registry", "qgs_dev.running"):
@@ -111,7 +111,7 @@ def test_reports(monkeypatch) -> None:
         assert [*map(fnmatchcase, lines, (head + told).splitlines())] == [True] * len(lines), lines
 
 
-def test_exemptions_are_of_a_class_or_of_options() -> None:
+def test_exemptions_are_of_a_class_or_of_options():
     exempt = {FreeCenters: {GRADIENTS: "all"}, UNBOUNDED: {INPUTS: "these"}}
     installed = _installed(FreeCenters, examples=(UNBOUNDED,), exemptions=exempt)
     known = [(run.case.config, run.variant, run.expected) for run in runs_of(installed)]
@@ -119,7 +119,7 @@ def test_exemptions_are_of_a_class_or_of_options() -> None:
     assert known == [first, (UNBOUNDED, True, {GRADIENTS: "all", INPUTS: "these"})]
 
 
-def test_unsound_exemptions_are_refused() -> None:
+def test_unsound_exemptions_are_refused():
     for exemptions, examples in (
         ({FreeCenters: {"large_number_stay_finite": "why"}}, ()),
         ({FreeCenters: {"supervision_weights": "why"}}, ()),
@@ -133,7 +133,7 @@ def test_unsound_exemptions_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_locus_passes() -> None:
+def test_locus_passes():
     output = done("check-plugin locus").output
     assert "7 components" in output
     assert " 0 failed" in output
@@ -142,7 +142,7 @@ def test_locus_passes() -> None:
 CASE = Case(MlpFeedForward.Config())
 
 
-def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeypatch) -> None:
+def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeypatch):
     run = CaseRun(Case(CachesByShape.Config()), expected={"construction": "it might"})
     told = (
         rf"^{run}: forward_keeps_no_state\n  seen: .*\n  contract: .*\n\n"
@@ -158,20 +158,20 @@ def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeyp
     )
 
 
-def test_further_options_of_a_class_have_the_checks_that_see_options() -> None:
+def test_further_options_of_a_class_have_the_checks_that_see_options():
     variant = {check.name for check in checks_for(CASE, variant=True)}
     assert {"builds", "runs", "gradients_match_differences"} <= variant
     assert variant < {check.name for check in checks_for(CASE)}
 
 
-def test_every_check_is_in_the_table() -> None:
+def test_every_check_is_in_the_table():
     modules = {import_module(check.function.__module__) for check in CHECKS.values()}
     written = {name for module in modules for name in vars(module) if name.startswith("check_")}
     assert written == {f"check_{name}" for name in CHECKS}
 
 
 class Keeper(nn.Module):
-    def __init__(self, kept: object) -> None:
+    def __init__(self, kept):
         super().__init__()
         self.part = nn.Linear(2, 2)
         vars(self.part)["_kept"] = kept
@@ -186,7 +186,7 @@ KEPT = {
 }
 
 
-def test_a_change_is_seen() -> None:
+def test_a_change_is_seen():
     for what, (kept, change) in KEPT.items():
         module = Keeper(kept)
         before = attributes(module)
@@ -196,7 +196,7 @@ def test_a_change_is_seen() -> None:
         assert [name for name, value in after if before.get(name) != value], what
 
 
-def test_what_contains_itself_comes_to_an_end() -> None:
-    circle: list[object] = []
+def test_what_contains_itself_comes_to_an_end():
+    circle = []
     circle.append(circle)
     assert attributes(Keeper(circle))["part._kept"] == [None]

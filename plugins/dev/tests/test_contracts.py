@@ -6,7 +6,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
-from qgs_dev import CaseRun, runs_of
+from qgs_dev import runs_of
 from qgs_dev.running import without_case
 from tables import read_json
 
@@ -20,7 +20,7 @@ WITHOUT_CASE = {"vggt_features"}
 """Components that need weights of their own, which the tests of their plugin make."""
 
 
-RUNS: list[CaseRun] = []
+RUNS = []
 for plugin, pinned in PINNED.items():
     for run in runs_of(plugin):
         run.case = replace(run.case, state_dict=pinned.get(run.case.label))
@@ -31,17 +31,17 @@ MARKED = [pytest.param(run, marks=[pytest.mark.slow] * (run.case.slot == "data")
 
 
 @pytest.mark.parametrize("run", MARKED, ids=str)
-def test_contract(run: CaseRun) -> None:
+def test_contract(run):
     run.check(["core"])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("run", [run for run in RUNS if not run.variant], ids=str)
-def test_extended_contract(run: CaseRun) -> None:
+def test_extended_contract(run):
     run.check(["construction", "extended"])
 
 
-def test_every_component_is_checked_and_its_weights_are_pinned() -> None:
+def test_every_component_is_checked_and_its_weights_are_pinned():
     unchecked = set()
     for plugin, pinned in PINNED.items():
         runs = {run.case.label: run for run in runs_of(plugin) if run.case.has_parameters}
@@ -53,7 +53,7 @@ def test_every_component_is_checked_and_its_weights_are_pinned() -> None:
     assert unchecked == WITHOUT_CASE
 
 
-def test_every_plugin_of_this_repository_is_checked() -> None:
+def test_every_plugin_of_this_repository_is_checked():
     entries = entry_points(group="qgs.plugins")
     ours = {x.name for x in entries if x.dist and x.dist.name.startswith("query-gaussians-")}
     assert PINNED.keys() == {"qgs", *ours}

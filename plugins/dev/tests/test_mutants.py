@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from contract_mutants import sound
-from contract_mutants.mutant import MUTANTS, SOUND, Mutant
+from contract_mutants.mutant import MUTANTS, SOUND
 from qgs_dev import CHECKS, Case, CaseRun, run_check
 
 from qgs.contracts import ModelDims
@@ -18,12 +18,12 @@ for file in sorted(Path(sound.__file__).parent.glob("*.py")):
 pytestmark = pytest.mark.slow
 
 
-def test_every_check_has_a_mutant() -> None:
+def test_every_check_has_a_mutant():
     assert {mutant.check for mutant in MUTANTS} == set(CHECKS)
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=str)
-def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None:
+def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant):
     meant = CHECKS[mutant.check]
     result = run_check(meant, mutant.case)
     assert result.verdict == "failed", result
@@ -33,7 +33,7 @@ def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None
 
 
 @pytest.mark.parametrize("case", SOUND)
-def test_a_sound_component_passes(case: Case) -> None:
+def test_a_sound_component_passes(case):
     CaseRun(case).check(["core"])
 
 
@@ -56,6 +56,6 @@ RENDERED = [("dilation", 0.1), ("dilation", 1.0), ("alpha_min", 1 / 128), ("back
         (GRADIENTS, Case(TorchRenderer.Config(), image_size=(17, 23))),
     ],
 )
-def test_a_sound_component_of_unusual_options_passes(checks: list[str], case: Case) -> None:
+def test_a_sound_component_of_unusual_options_passes(checks, case):
     for name in checks:
         CHECKS[name].function(case)

@@ -32,11 +32,11 @@ src/qgs_far_sighted/abstaining.py src/qgs_far_sighted/py.typed tests/test_contra
 
 
 @pytest.fixture(autouse=True)
-def _in_an_empty_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _in_an_empty_folder(here, monkeypatch):
     monkeypatch.setattr("qgs_dev.new_command.packages_distributions", LISTED)
 
 
-def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
+def test_it_writes_a_complete_distribution(tmp_path):
     done("new-plugin far-sighted")
     folder = tmp_path / "qgs-far-sighted"
     files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
@@ -47,7 +47,7 @@ def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
     assert names_in(tmp_path) == {"qgs-far-sighted"}, "nothing is left over"
 
 
-def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
+def test_what_it_writes_needs_no_tidying(tmp_path):
     run_qgs("new-plugin tidy")
     for command in (["check", "--select", "E,F,W,I,UP,B"], ["format", "--check"]):
         ruff = [sys.executable, "-m", "ruff", *command, "--no-cache", "qgs-tidy"]
@@ -55,29 +55,29 @@ def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
         assert checked.returncode == 0, checked.stdout
 
 
-def test_names_that_are_taken_as_they_are() -> None:
+def test_names_that_are_taken_as_they_are():
     for name in NAMES.split():
         check_name(name)
         text = dict(rendered(name))[Path("recipe.yaml")]
         assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name
 
 
-def test_names_that_are_refused(tmp_path: Path) -> None:
+def test_names_that_are_refused(tmp_path):
     names = ("Far Sighted", "../escape", "", "locus", "class", "torch")
     errors = {name: run_qgs("new-plugin --", name).exception for name in names}
     assert not [name for name, error in errors.items() if not isinstance(error, ValueError)]
     assert not names_in(tmp_path)
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_nothing_is_overwritten(tmp_path):
     (tmp_path / "mine").mkdir()
     assert isinstance(run_qgs("new-plugin wide --out mine").exception, FileExistsError)
     assert list(tmp_path.rglob("*")) == [tmp_path / "mine"]
 
 
-def test_its_component_computes_its_formula() -> None:
+def test_its_component_computes_its_formula():
     source = dict(rendered("mine"))[Path("src/qgs_mine/abstaining.py")]
-    names: dict = {}
+    names = {}
     exec(source, names)
     attention = names["AbstainingAttention"]
     state = QueryState(torch.randn(2, 3, 16))

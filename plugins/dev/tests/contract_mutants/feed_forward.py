@@ -1,19 +1,16 @@
 """MLPs that break the contract in one expression of their forward pass."""
 
 import random
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from contract_mutants.mutant import mutant
-from torch import Tensor
 
 from qgs.tokengs import MlpFeedForward
 
 sound = MlpFeedForward.forward
 
 
-def register(name: str, check: str, seen: str, forward: Callable[[Any, Tensor], Any]) -> None:
+def register(name, check, seen, forward):
     """forward: of the component and features (B, N, D)."""
     mutant(check, seen)(type(name, (MlpFeedForward,), {"forward": forward}))
 

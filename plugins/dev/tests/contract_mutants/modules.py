@@ -7,7 +7,7 @@ from contract_mutants.sound import ChangedEncoder
 from contract_mutants.spatial import AtPlaces, BiasedAttention, Extended, PlacesByALayer
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 from small_parts import made
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.checkpoint.tensors import shapes_of
 from qgs.contracts import ModelDims
@@ -177,7 +177,7 @@ class ClampsItsInputInPlace(FreeCenters):
 @mutant("forward_keeps_no_state", "_cache: changed by")
 class CachesByShape(ExtendedMlp):
     def add(self, dims):
-        self._cache: dict[tuple[int, ...], Tensor] = {}
+        self._cache = {}
 
     def forward(self, features):
         zeros = self._cache.setdefault(tuple(features.shape), torch.zeros_like(features))
@@ -189,9 +189,9 @@ class ScalesByItsFirstInput(ExtendedMlp):
     """Keeps a number in a closure, which no attribute shows."""
 
     def add(self, dims):
-        kept: list[float] = []
+        kept = []
 
-        def first(x: Tensor) -> float:
+        def first(x):
             if not kept and x.device.type != "meta":
                 kept.append(x.detach().mean().item())
             return kept[0] if kept else 0.0
@@ -218,7 +218,7 @@ class DetachesTheImages(ContentCrossAttention):
 
 @mutant("terms_have_gradients", "no gradient comes from this term")
 class DetachedLoss(ChangedSquares):
-    def mean(self, error: Tensor) -> Tensor:
+    def mean(self, error):
         return error.detach().mean()
 
 

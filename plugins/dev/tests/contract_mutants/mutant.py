@@ -1,15 +1,9 @@
 """Register components that break the contract, each with the check that must catch it."""
 
 import re
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 from qgs_dev import Case
-
-from qgs.checkpoint.tensors import Shapes
-from qgs.contracts import Component
-
-C = TypeVar("C", bound=type[Component])
 
 
 class Mutant(NamedTuple):
@@ -19,32 +13,30 @@ class Mutant(NamedTuple):
     seen: str
     case: Case
 
-    def __str__(self) -> str:
+    def __str__(self):
         return f"{self.check}-{self.case.component.name}"
 
 
-MUTANTS: list[Mutant] = []
-SOUND: list[Case] = []
+MUTANTS = []
+SOUND = []
 
 
-def named(component: C, **options: Any) -> Any:
+def named(component, **options):
     """Name a component as its class, in snake case, and return these options of it."""
     component.name = re.sub(r"(?<!^)(?=[A-Z])", "_", component.__name__).lower()
     return component.Config(**options)
 
 
-def sound(component: C) -> C:
+def sound(component):
     """Register a component that must pass."""
     SOUND.append(Case(named(component)))
     return component
 
 
-def mutant(
-    check: str, seen: str, state_dict: Shapes | None = None, **options: Any
-) -> Callable[[C], C]:
+def mutant(check, seen, state_dict=None, **options):
     """Register a component as a mutant. state_dict: of its case."""
 
-    def register(component: C) -> C:
+    def register(component):
         case = Case(named(component, **options), state_dict=state_dict)
         MUTANTS.append(Mutant(check, seen, case))
         return component

@@ -1,11 +1,8 @@
 """Renderers with a wrong background, alpha, depth or gradient."""
 
-from typing import Any
-
 from contract_mutants.mutant import mutant
 
 from qgs.renderers import TorchRenderer
-from qgs.types import Cameras, Gaussians
 
 CAMERAS = "camera_gradients_match_differences"
 FEATURES = "features_are_blended_as_colours"
@@ -16,7 +13,7 @@ GAUSSIANS = "render_gradients_match_differences"
 class ChangedResult:
     """A sound component, whose output mutants change."""
 
-    def result(self, out: Any) -> Any:
+    def result(self, out):
         return out
 
     def forward(self, *given):
@@ -26,10 +23,10 @@ class ChangedResult:
 class ChangedRenderer(ChangedResult, TorchRenderer):
     """A sound renderer, whose inputs or output mutants change."""
 
-    def drawn(self, gaussians: Gaussians) -> Gaussians:
+    def drawn(self, gaussians):
         return gaussians
 
-    def seen_by(self, cameras: Cameras) -> Cameras:
+    def seen_by(self, cameras):
         return cameras
 
     def forward(self, gaussians, cameras, background=None):

@@ -8,7 +8,7 @@ from contract_mutants.renderers import ChangedResult
 from contract_mutants.sound import ChangedEncoder, StridedConvolutions
 from contract_mutants.spatial import Extended
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck
-from torch import Tensor, nn
+from torch import nn
 from walk import Walk
 
 from qgs.contracts import (
@@ -112,13 +112,13 @@ class ChangedSquares(Loss):
 
 @mutant("loss_is_a_mean_over_scenes", "compared with the mean over scenes")
 class SumsOverScenes(ChangedSquares):
-    def mean(self, error: Tensor) -> Tensor:
+    def mean(self, error):
         return error.mean((1, 2, 3, 4)).sum()
 
 
 @mutant("renderings_as_declared", "compared with the mean over views")
 class TakesTheWorstView(ChangedSquares):
-    def mean(self, error: Tensor) -> Tensor:
+    def mean(self, error):
         return error.mean((2, 3, 4)).amax(1).mean()
 
 
@@ -157,7 +157,7 @@ class RoundsItsRays(ChangedEncoder):
 @mutant("tokens_are_those_of_the_grid", "for `keys`: 8% of what changes a token comes from its own")
 class OrdersTokensByColumn(ChangedEncoder):
     def result(self, memory):
-        def turned(x: Tensor, tokens: int) -> Tensor:
+        def turned(x, tokens):
             x = x.unflatten(tokens, memory.grid).transpose(tokens + 1, tokens + 2)
             return x.flatten(tokens, tokens + 2)
 

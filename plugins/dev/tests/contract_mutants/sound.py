@@ -16,7 +16,7 @@ from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.tokengs import ContentCrossAttention, MlpFeedForward, MultiViewViT
 from qgs.tokengs.blocks import merge_heads
 from qgs.tokengs.encoder import keys_and_values
-from qgs.types import ImageMemory, Views
+from qgs.types import ImageMemory
 
 
 @sound
@@ -60,7 +60,7 @@ class ChangedEncoder(ChangedResult, MultiViewViT):
     class Config(MultiViewViT.Config):
         depth: int = 1
 
-    def given(self, views: Views) -> Views:
+    def given(self, views):
         return views
 
     def forward(self, views):

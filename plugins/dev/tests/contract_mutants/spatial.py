@@ -4,7 +4,7 @@ import torch
 from contract_mutants.mutant import mutant
 from torch import nn
 
-from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, Loss, Refinement, memory_fields
+from qgs.contracts import MEMORY_FIELDS, FieldSpec, Loss, Refinement, memory_fields
 from qgs.renderers import TorchRenderer
 from qgs.tokengs import (
     ContentCrossAttention,
@@ -20,7 +20,7 @@ from qgs.types import QueryState
 CHECK = "reads_are_declared"
 
 
-PLACE: Fields = {"place.center": FieldSpec((3,), frame="world")}
+PLACE = {"place.center": FieldSpec((3,), frame="world")}
 
 
 class Extended:
