@@ -28,7 +28,6 @@ from qgs.contracts import Component, ComponentConfig
 from qgs.recipe import slots
 from qgs.recipe.registry import default_config, load_usable_plugins
 from qgs.recipe.sections import SETTINGS
-from qgs.recipe.slots import summary_of
 
 ROOT = Path(__file__).parents[1]
 PART = re.compile(r"^<!-- from the code: (.*) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
@@ -94,7 +93,7 @@ def _entry(found: re.Match[str]) -> str:
     """Return a link from docs/api/ to the file of a name, with its docstring's first paragraph."""
     name, options = found.groups()
     named = resolve_name(name)
-    line = f"[`{name}`](../../{_file(named)}): {summary_of(named)}"
+    line = f"[`{name}`](../../{_file(named)}): {slots.summary_of(named)}"
     return line + (f"\n<!-- {options} -->" if options else "")
 
 
@@ -117,7 +116,7 @@ def check_list() -> str:
         "guide_checks.md.jinja",
         modules=groupby(CHECKS.values(), key=lambda check: check.function.__module__),
         title=lambda module: module.rpartition(".")[2].capitalize(),
-        summary=lambda module: summary_of(sys.modules[module]),
+        summary=lambda module: slots.summary_of(sys.modules[module]),
         in_words=_slots_in_words,
     )
 

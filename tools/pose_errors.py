@@ -83,8 +83,7 @@ def errors(photos: Sequence[Any], known: str) -> list[float]:
     products = one[:, :3] * other[:, :3]
     lengths = np.linalg.norm(one[:, :3, 3], axis=1) * np.linalg.norm(other[:, :3, 3], axis=1)
     turn = (products[..., :3].sum((1, 2)) - 1) / 2
-    direction = products[..., 3].sum(1) / lengths
-    cosines = np.minimum(turn, direction).clip(-1, 1)
+    cosines = np.minimum(turn, products[..., 3].sum(1) / lengths).clip(-1, 1)
     return np.nan_to_num(np.degrees(np.arccos(cosines)), nan=np.inf).tolist()
 
 

@@ -95,7 +95,7 @@ def scene_rows(
         if seconds:
             shown["refined"] = rendered(model, sample, found, seconds)
         row: Row = {"model": name, "scene": photos.name, "scale": found}
-        row |= {"inputs": list(inputs), "targets": list(targets)}
+        row |= {"inputs": inputs, "targets": targets}
         for kind, images in shown.items():
             row[f"{kind} PSNR"] = float(psnr(images, sample.targets.images).mean())
             row[f"{kind} SSIM"] = float(ssim(images, sample.targets.images).mean())
@@ -121,8 +121,7 @@ def rendered(
 
 def on_a_plane(inputs: Views, targets: Cameras, depth: float) -> Tensor:
     """Return for each target the nearest input, warped as a plane at `depth`, (1, T, 3, H, W)."""
-    index = pose_distance(inputs.cameras.c2w, targets.c2w)[0].argmin(-1)
-    views = inputs.select(index.tolist())
+    views = inputs.select(pose_distance(inputs.cameras.c2w, targets.c2w)[0].argmin(-1).tolist())
     nearest = views.cameras
     pose_T44 = targets.w2c[0] @ nearest.c2w[0]
     # Of a point at this depth, z / depth is 1: it adds the shift to the turned point.

@@ -79,7 +79,7 @@ def sources() -> dict[str, str]:
     """Return the contents of all Python files that git tracks, by path."""
     listed = subprocess.check_output(["git", "-C", ROOT, "ls-files", "*.py"], text=True)
     names = [name for name in listed.split() if (ROOT / name).is_file()]
-    return {name: (ROOT / name).read_text(encoding="utf-8") for name in names}
+    return {name: (ROOT / name).read_text("utf-8") for name in names}
 
 
 def sizes() -> dict[str, dict[str, float]]:

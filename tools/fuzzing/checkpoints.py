@@ -155,8 +155,7 @@ def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None)
 
 def prepare(scratch: Path) -> None:
     """Write a checkpoint, a PLY and a .splat file."""
-    model = qgs.compose(RECIPE, SMALL)
-    qgs.save(model, scratch / "a.safetensors", extra={"step": "3"})
+    qgs.save(qgs.compose(RECIPE, SMALL), scratch / "a.safetensors", extra={"step": "3"})
     decode(scratch / "a.safetensors")
     save_splat(qgs.load_ply(scratch / "a.ply"), scratch / "a.splat")
 

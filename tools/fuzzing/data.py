@@ -158,7 +158,7 @@ def judged(folder: Path) -> str:
         if not errors:
             raise FaultError(f"the check finds no error, but reading raises: {error}") from error
         return f"{refused(error, str(folder))}: {error}"
-    return "success" if not errors else f"success, with errors of the check: {errors}"
+    return f"success, with errors of the check: {errors}" if errors else "success"
 
 
 def prepare(_: Path) -> None:

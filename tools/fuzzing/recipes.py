@@ -42,9 +42,9 @@ def any_value(options: Options) -> Change:
 
 def scaled(options: Options) -> Change:
     """Multiply a random number: make it larger, smaller, negative or a fraction."""
-    path = choice([path for path, value in options.items() if type(value) in (int, float)])
-    number = options[path] * choice(TABLES["factors"])
-    whole = isinstance(options[path], int) and random.random() < 0.9
+    path, value = choice([item for item in options.items() if type(item[1]) in (int, float)])
+    number = value * choice(TABLES["factors"])
+    whole = isinstance(value, int) and random.random() < 0.9
     return path.split("."), str(int(number) if whole else number)
 
 
@@ -70,8 +70,7 @@ def elsewhere(options: Options) -> Change:
 
 def broken(text: str) -> str:
     """Damage a text: cut it off, remove or repeat a piece, or insert odd characters."""
-    lines = text.splitlines(keepends=True)
-    pieces = choice((lines, list(text)))
+    pieces = choice((text.splitlines(keepends=True), list(text)))
     first, last = sorted(randrange(len(pieces) + 1) for _ in range(2))
     head = pieces[:first]
     rest = pieces[first:]
@@ -84,7 +83,7 @@ def judged(text: str, overrides: list[str], file: Path) -> str:
 
     Raises an error that no user should see.
     """
-    file.write_text(text, encoding="utf-8")
+    file.write_text(text, "utf-8")
     try:
         recipe = resolve(file, overrides)
         recipe.rate_factors(recipe.build_model("meta"))
@@ -93,7 +92,7 @@ def judged(text: str, overrides: list[str], file: Path) -> str:
             if problem.cause and not isinstance(problem.cause, PluginError):
                 raise FaultError(f"{problem} {problem.cause!r}") from error
         return refused(error)
-    file.write_text(annotated(recipe), encoding="utf-8")
+    file.write_text(annotated(recipe), "utf-8")
     for again in (file, json.loads(json.dumps(recipe.tree))):
         if resolve(again).tree != recipe.tree:
             raise FaultError(f"the recipe changes when it is written and read as {type(again)}")
@@ -117,7 +116,7 @@ def case_in(scratch: Path, _: Path) -> tuple[str, Use]:
     if path != ["extends"]:
         text = f"extends: {shipped.name}\n{text}"
     if random.random() < 0.3:
-        text = broken(choice((text, shipped.read_text(encoding="utf-8"))))
+        text = broken(choice((text, shipped.read_text("utf-8"))))
     overrides = [f"{'.'.join(path)}={value}" for path, value in changes]
     shown = f"{name}, {overrides}\n{text[:3000]}"
     return shown, partial(judged, text, overrides, shipped.with_name("case.yaml"))

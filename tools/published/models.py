@@ -43,17 +43,14 @@ def golden_tensors(golden: GoldenFile) -> Tensors:
     if memory.patch_rays is not None:
         # Then its features are those of image tokens.
         found |= {"encoder_features": memory.features, "plucker_patch": memory.patch_rays}
-    states = {0: state}
+    found |= of_state(model, memory, state, 0)
     for number, layer in prediction.layers.items():
         found[f"gaussians_layer.{number}"] = packed(layer.gaussians)
-        states[number] = layer.state
-    for number, after in states.items():
-        found |= of_state(model, memory, after, number)
+        found |= of_state(model, memory, layer.state, number)
     if TUNED in golden.tensors:
         # Latents to decode in place of those that the photos give.
         memory = model.encoder.project(golden.input(TUNED), memory)
-        tuned = model.predict(views, memory, state)
-        found["gaussians_of_tuned_latents"] = packed(tuned.gaussians)
+        found["gaussians_of_tuned_latents"] = packed(model.predict(views, memory, state).gaussians)
     return found
 
 
@@ -103,14 +100,12 @@ def of_state(
     if isinstance(queries, AnchoredQueries):
         found[f"anchor_center.{number}"] = state[CENTER]
         if queries.config.radius:
-            radius = support_radius(state[RAW_RADIUS], queries.config)
-            found[f"anchor_radius.{number}"] = radius
+            found[f"anchor_radius.{number}"] = support_radius(state[RAW_RADIUS], queries.config)
     following: Any = model.decoder[number] if number < len(model.decoder) else None
     attention = getattr(following, "cross_attention", None)
     if isinstance(attention, RayBiasedCrossAttention):
         found[f"geo_gamma.{number}"] = attention.gamma
-        bias = attention.bias(state, memory).dense()
-        found[f"geo_bias.{number}"] = bias / attention.gamma
+        found[f"geo_bias.{number}"] = attention.bias(state, memory).dense() / attention.gamma
     return found
 
 

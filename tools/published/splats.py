@@ -8,12 +8,7 @@ from typing import Any
 
 import torch
 from qgs_research.published.layouts import fitting_recipe, names_of
-from qgs_zoo.mvsplat.adapter import (
-    band_mask,
-    camera_quaternions,
-    coefficients,
-    turn_of_harmonics,
-)
+from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, coefficients, turn_of_harmonics
 from qgs_zoo.mvsplat.pixels import PIXEL, degree_of, mapped_opacity, ray_directions
 from qgs_zoo.mvsplat.sweep import feature_lenses, warp_grid, warped
 from qgs_zoo.mvsplat.windows import out_of_windows
@@ -86,7 +81,7 @@ def lens_of(k: Tensor, size: tuple[int, int] = (1, 1)) -> Tensor:
     size: image size (H, W) by which the matrices were divided; (1, 1) for matrices in pixels.
     """
     lens = torch.stack([k[..., 0, 0], k[..., 1, 1], k[..., 0, 2], k[..., 1, 2]], -1)
-    return lens * lens.new_tensor([size[1], size[0], size[1], size[0]])
+    return lens * lens.new_tensor([size[1], size[0]] * 2)
 
 
 def seeded_weights(golden: GoldenFile) -> Tensors:
@@ -151,8 +146,7 @@ def warps(cameras: Cameras, poses_BVJ44: Tensor, low: Sequence[int], inverse_BVD
     pairs = poses_BVJ44.shape[:3]
     lens = feature_lenses(cameras, low)[:, :, None].expand(*pairs, 4)
     depth = (1 / inverse_BVD)[:, :, None, :, None, None].expand(*pairs, -1, *low)
-    grid = warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses_BVJ44)))
-    return grid.unflatten(0, pairs)
+    return warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses_BVJ44))).unflatten(0, pairs)
 
 
 def predicted(model: QueryGaussianModel, views: Views, numbers: Tensor) -> Prediction:
