@@ -7,17 +7,7 @@ import torch
 from PIL import Image
 from qgs_viewer.curves import curves_of
 from tables import assert_equal, assert_near, must_refuse, names_in
-from training_runs import (
-    TRAINED,
-    column,
-    losses,
-    parts_of,
-    read_jsonl,
-    resume,
-    run,
-    spoil,
-    tiny,
-)
+from training_runs import TRAINED, column, losses, parts_of, read_jsonl, resume, run, spoil, tiny
 
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile

@@ -15,12 +15,7 @@ def register(name, check, seen, forward):
     mutant(check, seen)(type(name, (MlpFeedForward,), {"forward": forward}))
 
 
-register(
-    "ForgetsToReturn",
-    "runs",
-    "component returns NoneType, not Tensor",
-    lambda self, x: None,
-)
+register("ForgetsToReturn", "runs", "component returns NoneType, not Tensor", lambda self, x: None)
 register(
     "DetachesASummand", "gradients_match_differences", "in evaluation: Jacobian",
     lambda self, x: sound(self, x) + x.square().detach()

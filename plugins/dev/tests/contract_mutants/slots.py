@@ -11,14 +11,7 @@ from qgs_zoo.tokengs2026.multiscale import LatentBottleneck
 from torch import nn
 from walk import Walk
 
-from qgs.contracts import (
-    AttentionWeights,
-    Column,
-    CrossAttention,
-    Loss,
-    SceneSource,
-    memory_fields,
-)
+from qgs.contracts import AttentionWeights, Column, CrossAttention, Loss, SceneSource, memory_fields
 from qgs.metrics.images import Psnr
 from qgs.tokengs import (
     ContentCrossAttention,

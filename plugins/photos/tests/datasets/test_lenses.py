@@ -24,10 +24,7 @@ def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path):
     """x (1 - 0.6 x^2) is largest at 0.745, and x of its angle's polynomial at an angle of it."""
     largest = math.sqrt(1 / 1.8)
     wide = {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
-    for model, turn in (
-        ("OPENCV", largest),
-        ("OPENCV_FISHEYE", math.tan(largest)),
-    ):
+    for model, turn in (("OPENCV", largest), ("OPENCV_FISHEYE", math.tan(largest))):
         lens = bending(model, {"k1": -0.6})
         image = lens.undistorted(np.ones((48, 64), np.uint8), (*wide.values(),))
         reach = math.ceil(30 * turn - 0.5)

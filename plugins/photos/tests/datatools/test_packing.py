@@ -165,13 +165,7 @@ def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six):
     result = pack(six, "others", leave_out_broken=True)
     assert result.scenes["train"] == 5
     assert "images/1.png" in result.left_out["s3"]
-    must_refuse(
-        "no scene to pack: s3: ",
-        pack,
-        source("scenes/s3"),
-        "none",
-        leave_out_broken=True,
-    )
+    must_refuse("no scene to pack: s3: ", pack, source("scenes/s3"), "none", leave_out_broken=True)
 
     image.write_bytes(whole)
     six = source("scenes")

@@ -136,10 +136,7 @@ def matcher(given):
     if not len(one) or not len(other):
         return {"matches": [torch.zeros(0, 2).long()], "scores": [torch.zeros(0)]}
     links = linked(one, other)
-    return {
-        "matches": [torch.from_numpy(links.indices)],
-        "scores": [torch.from_numpy(links.right)],
-    }
+    return {"matches": [torch.from_numpy(links.indices)], "scores": [torch.from_numpy(links.right)]}
 
 
 @pytest.fixture

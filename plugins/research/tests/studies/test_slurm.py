@@ -22,11 +22,7 @@ def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(here):
     assert "training.batch_size=8 --out 'my runs/a' --threads 2 --resume & job=$!\n" in script
     must_refuse(r"training\.batch_size", done, f"{line} --out b --gpus 3", *more)
     must_not_find(
-        "nowhere",
-        done,
-        f"{line} --out b",
-        *more,
-        *sets("data={type: qgs/photos, path: nowhere}"),
+        "nowhere", done, f"{line} --out b", *more, *sets("data={type: qgs/photos, path: nowhere}")
     )
     assert run_qgs(f"{line} --out b --gpu 2", *more).exit_code == 2
     assert names_in(here) == {"my runs"}
