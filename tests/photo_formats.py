@@ -4,7 +4,6 @@ The writers share no code with the readers: they follow the descriptions of the 
 """
 
 import io
-import math
 import pickle  # noqa: TID251  as multiprocessing does
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -187,7 +186,7 @@ def write_blender(folder, photos, train, val=0, times=()):
         if i < len(times) and times[i] is not ...:
             frame["time"] = times[i]
         parts[part].append({**frame, "transform_matrix": opengl(photos.c2w[i])})
-    angle = 2 * math.atan(photos.size[1] / 2 / photos.intrinsics[0])
+    angle = 2 * np.arctan(photos.size[1] / 2 / photos.intrinsics[0])
     for part, frames in parts.items():
         if frames:
             content = {"camera_angle_x": angle, "frames": frames}

@@ -16,7 +16,7 @@ def pair(*shape):
 
 def slow(x, y):
     """Equation 13 of Wang et al. 2004, every window of 11 x 11 pixels at once, in float64."""
-    offset = torch.arange(-5.0, 6.0, dtype=torch.float64)
+    offset = torch.arange(-5.0, 6.0).double()
     weights = torch.exp(-(offset[:, None] ** 2 + offset**2) / (2 * 1.5**2))
     window = (weights / weights.sum())[None, None]
     x = x.double()

@@ -21,7 +21,6 @@ CAMERA = Cameras(torch.eye(4)[None, None], torch.ones(1, 1, 4), (8, 8))
 
 THREE = zeros(1, 2, 5, 3)
 ONE = zeros(1, 2, 5)
-RGB = zeros(1, 2, 3, 4, 5)
 ALPHA = zeros(1, 2, 1, 4, 5)
 BALLS = [x[:, 0] for x in (THREE, THREE, zeros(1, 2, 5, 4), ONE, THREE)]
 
@@ -34,7 +33,7 @@ def test_what_does_not_fit_together_is_refused():
     must_refuse(r"Gaussians\.sh .*\(1, 5, C, 3\), got", Gaussians, *BALLS, zeros(1, 5, 3))
     must_refuse(r"sh has 4 coefficients.* 3, 8 or 15", Gaussians, *BALLS, zeros(1, 5, 4, 3))
     must_refuse("sh", concatenated, [Gaussians(*BALLS), Gaussians(*BALLS, zeros(1, 5, 3, 3))], 1)
-    must_refuse(r"Rendering\.depth", Rendering, RGB, ALPHA, ALPHA[..., :4])
+    must_refuse(r"Rendering\.depth", Rendering, zeros(1, 2, 3, 4, 5), ALPHA, ALPHA[..., :4])
     must_refuse(r"SpatialSupport\.axes", SpatialSupport, zeros(1, 2, 3), zeros(1, 2, 3))
 
 

@@ -95,8 +95,8 @@ def test_a_folder_of_scenes(tmp_path, caplog):
 
 
 def test_scenes_split_by_folder(tmp_path):
-    for part, name in (("train", "a"), ("train", "b"), ("test", "c")):
-        write_llff(tmp_path / part / name, synthetic(tmp_path / "photos"))
+    for name in ("train/a", "train/b", "test/c"):
+        write_llff(tmp_path / name, synthetic(tmp_path / "photos"))
     (tmp_path / "train/b/images/view_001.png").unlink()
     source = opened(tmp_path)
     assert [len(source.scenes(split)) for split in ("train", "test")] == [2, 1]

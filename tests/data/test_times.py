@@ -84,21 +84,21 @@ def test_targets_of_two_times_are_judged_apart():
     assert all(sample.inputs.target_time is not None for sample in samples)
 
 
-DYNAMIC = (
-    "plugins=[rooms, tokengs2026]",
-    "model.encoder={type: tokengs2026/multiscale_vit, depth: 2, blocks: [2], time_channels: 2}",
-    "model.queries={type: tokengs2026/dynamic, count: 64, dynamic: 16, std: 0.3, time_channels: 2}",
-    "model.decoder.self_attention={type: tokengs2026/block_causal}",
-    "objective={type: tokengs2026/dynamic, weight: 0.3}",
-    "views.scale=constant",
-    "training.steps=2",
-    "training.seconds=null",
-    "optimizer.warmup=1",
-    "evaluation.scenes=1",
-)
+DYNAMIC = """
+plugins=[rooms, tokengs2026]
+model.encoder={type: tokengs2026/multiscale_vit, depth: 2, blocks: [2], time_channels: 2}
+model.queries={type: tokengs2026/dynamic, count: 64, dynamic: 16, std: 0.3, time_channels: 2}
+model.decoder.self_attention={type: tokengs2026/block_causal}
+objective={type: tokengs2026/dynamic, weight: 0.3}
+views.scale=constant
+training.steps=2
+training.seconds=null
+optimizer.warmup=1
+evaluation.scenes=1
+"""
 
 
 def test_a_dynamic_model_trains_on_photos_with_times(here):
     folder = dnerf(here, *(i / 7 for i in range(8)), 0.3)
     data = f"data={{type: qgs/photos, path: '{folder}', image_size: [16, 16]}}"
-    assert run(resolve("tiny/tokengs.yaml", [*DYNAMIC, data])).steps == 2
+    assert run(resolve("tiny/tokengs.yaml", [*DYNAMIC.strip().splitlines(), data])).steps == 2

@@ -3,7 +3,6 @@
 import csv
 import hashlib
 import json
-import math
 from collections import Counter
 from unittest.mock import Mock
 
@@ -198,7 +197,7 @@ def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(monkeypatch):
         place = source.names("test").index(scene.name)
         if place == 2 and decoded[scene.name] > 1:
             raise OSError("/data/set/truncated.png is cut off")
-        return images(scene, frames) * [0, math.nan, 1, 1][place]
+        return images(scene, frames) * [0, torch.nan, 1, 1][place]
 
     def refuse_black(encoder, given):
         if (given[0].images == 0).all((1, 2, 3, 4)).any():

@@ -1,7 +1,5 @@
 """Spherical harmonics against SciPy's, and as a camera sees them."""
 
-import math
-
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -25,7 +23,7 @@ def real_harmonic(degree, order, d):
     x, y, z = d.numpy().T
     found = sph_harm_y(degree, abs(order), np.arccos(z), np.arctan2(y, x))
     part = found.imag if order < 0 else found.real
-    return torch.from_numpy(part * (math.sqrt(2) if order else 1))
+    return torch.from_numpy(part * (2**0.5 if order else 1))
 
 
 def test_they_are_the_real_harmonics_by_degree_and_order():

@@ -25,7 +25,7 @@ def test_every_tensor_of_the_golden_files():
     for path in FILES.values():
         golden = read_golden(path)
         rows = parity.compared(golden)
-        assert [row for row in rows if row.problem] == []
+        assert not [row for row in rows if row.problem]
         assert [row.name for row in rows] == compared_names(golden)
 
 

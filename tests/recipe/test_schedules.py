@@ -12,7 +12,6 @@ from qgs.recipe import resolve
 from qgs.tokengs import MlpFeedForward
 from qgs.tokengs.schedules import SCHEDULES
 
-TINY = "tiny/tokengs.yaml"
 NUMBERS = """
 - [{schedule: constant, value: 2}, {0: 2, 1000000000: 2}]
 - - {schedule: linear, values: [10, 0], at: [100, 200]}
@@ -50,7 +49,7 @@ def test_components_of_layers_follow_too_and_whole_numbers_are_rounded():
     options = f"model.decoder.feed_forward={{type: mine/blend, level: {level}, share: {share}}}"
     own = "model.decoder.layers.1.feed_forward={level: {schedule: constant, value: 7}}"
     plugins = [qgs.Plugin("mine", qgs.CONTRACT_VERSION, (Blend,))]
-    recipe = resolve(TINY, ["plugins=[mine]", options, own], plugins)
+    recipe = resolve("tiny/tokengs.yaml", ["plugins=[mine]", options, own], plugins)
     model = recipe.build_model("meta")
     assert resolve(recipe.tree, plugins=plugins).tree == recipe.tree
     for step, wanted in ((0, 1), (3, 2), (9, 4), (99, 4)):

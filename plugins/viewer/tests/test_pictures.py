@@ -2,7 +2,6 @@ from itertools import product
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.testing import assert_allclose
 from qgs_viewer import queries
 from qgs_viewer.look import CATEGORICAL
@@ -25,7 +24,7 @@ def test_an_outline_touches_the_outermost_of_the_projected_surface_points(camera
     angles = torch.linspace(0, 2 * torch.pi, 64)
     directions = torch.stack([angles.cos(), angles.sin()])
     for query in range(5):
-        ball = F.normalize(torch.randn(20000, 3), dim=-1)
+        ball = torch.nn.functional.normalize(torch.randn(20000, 3), dim=-1)
         surface = centers[0, query] + ball @ support.axes[0, query].mT
         pixels = to_pixels(to_camera(surface[None], camera)[0, 0], camera.intrinsics[0, 0])
         reach = (queries.outline(support, query, camera) @ directions).amax(0)

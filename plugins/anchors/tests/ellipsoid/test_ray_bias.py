@@ -75,7 +75,7 @@ def test_the_bias_is_by_the_least_distance_along_the_ray(radii):
     assert_equal(bias(double(inputs)), best, atol=1e-12)
     fast = bias(inputs)
     assert_equal(fast.double(), best, atol=1e-5)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+    with torch.autocast("cpu", torch.bfloat16):
         assert_equal(bias(inputs), fast)
     assert fast.dtype == torch.float32
     assert best.min() < -1.999 < -0.5 < best.max(), "some pairs must reach the clamp, some not"

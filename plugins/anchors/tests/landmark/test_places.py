@@ -104,7 +104,7 @@ WALL_SIZE = (24, 32)
 WALL = 1.5
 """H x W; depth of the wall z = 0, that the first camera looks at."""
 DEPTHS = torch.tensor([0.8, 1.1, WALL, 2.0, 3.0]).double()
-FIRST = torch.zeros(1, dtype=torch.long)
+FIRST = torch.zeros(1).long()
 
 
 def photos(count=2):

@@ -7,7 +7,6 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-import torch.nn.functional as F
 from commands import run_qgs
 from PIL import Image
 from qgs_photos.poses import learned, making, worker
@@ -126,7 +125,7 @@ def detector(pixels):
     grey = (255 * pixels[0].mean(0)).byte().numpy()
     points, found = extractor.extract_from_uint8_array(grey)
     places = torch.tensor([(point.x - 0.5, point.y - 0.5) for point in points])
-    data = F.normalize(torch.from_numpy(found.data.astype(np.float32)), dim=-1)
+    data = torch.nn.functional.normalize(torch.from_numpy(found.data.astype(np.float32)), dim=-1)
     return [SimpleNamespace(keypoints=places.reshape(-1, 2), descriptors=data.reshape(-1, 128))]
 
 

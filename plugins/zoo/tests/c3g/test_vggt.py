@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 import qgs_zoo.c3g.vggt
 import torch
-import torch.nn.functional as F
 from odd_views import odd_views
 from qgs_dev import Case, CaseRun
 from qgs_zoo.c3g.vggt import MODULE, VggtFeatures
@@ -35,7 +34,7 @@ class Aggregator(nn.Module):
     def forward(self, images):
         tokens = self.patch(images.flatten(0, 1)).flatten(2).mT.unflatten(0, images.shape[:2])
         tokens = torch.tanh(tokens) + tokens[:, :1].mean(2, keepdim=True)
-        return [torch.zeros(()), F.pad(tokens, (0, 0, 5, 0), value=7.0)], 5
+        return [torch.zeros(()), nn.functional.pad(tokens, (0, 0, 5, 0), value=7.0)], 5
 
 
 @pytest.fixture(autouse=True)

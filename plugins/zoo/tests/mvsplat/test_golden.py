@@ -6,7 +6,6 @@ from pathlib import Path
 import parity
 import pytest
 import torch
-import torch.nn.functional as F
 from published.files import read_golden
 from published.splats import model_of, views_of
 from qgs_zoo.mvsplat import sweep
@@ -60,7 +59,7 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     theirs = golden.tensors
     # Colours in 50 directions in place of harmonics: the family's rasteriser reads directions as
     # z, x, y, and never degree 4.
-    seen = F.normalize(torch.randn(50, 3), dim=-1)
+    seen = nn.functional.normalize(torch.randn(50, 3), dim=-1)
     sh = theirs["harmonics"][..., :16]
     turned = harmonics(seen[:, [2, 0, 1]], sh.shape[-1] - 1) @ sh[..., 1:].mT
     colours = ours.colors[..., None, :] + harmonics(seen, ours.sh.shape[-2]) @ ours.sh
