@@ -33,8 +33,7 @@ class Line(GivenScene):
     def __init__(self, count, held_out=(), step=0.5, name="", c2w=None, **more):
         c2w = along_x(step * torch.arange(count) + 3) if c2w is None else c2w
         images = values(range(count)) + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
-        cameras = pinhole(c2w, (8.0, 8, 3, 4), (8, 8))
-        super().__init__(Views(images[None], cameras[None], **more))
+        super().__init__(Views(images[None], pinhole(c2w, (8.0, 8, 3, 4), (8, 8))[None], **more))
         self.name = name or f"line{count}"
         self.held_out = held_out
 

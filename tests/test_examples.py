@@ -43,8 +43,7 @@ def test_loss_and_gradients_are_the_frameworks(nano):
     value.backward()
     assert_close(value, loss)
     gradients = {name: parameter.grad for name, parameter in model.named_parameters()}
-    found = {name: weight.grad for name, weight in p.items()}
-    assert_close(found, gradients, rtol=1e-3, atol=1e-5)
+    assert_close({name: weight.grad for name, weight in p.items()}, gradients, rtol=1e-3, atol=1e-5)
 
 
 def test_it_trains(nano, monkeypatch, capsys):

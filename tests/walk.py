@@ -48,8 +48,7 @@ def cloud(number, seed=0):
     even = torch.rand(1, number, 7, generator=generator)
     quats = torch.nn.functional.normalize(normal[..., 3:], dim=-1)
     scales = 0.05 + 0.1 * even[..., :3]
-    opacities = 0.3 + 0.6 * even[..., 3]
-    return Gaussians(0.3 * normal[..., :3], scales, quats, opacities, even[..., 4:])
+    return Gaussians(0.3 * normal[..., :3], scales, quats, 0.3 + 0.6 * even[..., 3], even[..., 4:])
 
 
 def covariances(gaussians):

@@ -33,8 +33,7 @@ def model():
 @pytest.fixture
 def far(views):
     """The views by cameras far from the origin, in units of which 30 lie between them."""
-    c2w = scaled(POSE @ views.cameras.c2w, 100)
-    return views.replace(cameras=views.cameras.replace(c2w=c2w))
+    return views.replace(cameras=views.cameras.replace(c2w=scaled(POSE @ views.cameras.c2w, 100)))
 
 
 def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):

@@ -26,8 +26,6 @@ def test_chosen_layers_and_queries_are_recorded_of_a_pass_that_predicts_the_same
 def test_hooks_go_away_even_on_errors(model):
     with pytest.raises(AttributeError), qgs.trace(model):
         model(None)
-    layers = qgs.trace(model, layers=[0, 4])
-    must_refuse(r"layers \[0, 4\] do not exist.*1\.\.3", layers.__enter__)
-    queries = qgs.trace(model, queries=[12])
-    must_refuse(r"queries \[12\] do not exist.*0\.\.11", queries.__enter__)
+    must_refuse(r"layers \[0, 4\] do not exist.*1\.\.3", qgs.trace(model, layers=[0, 4]).__enter__)
+    must_refuse(r"queries \[12\] do not exist.*0\.\.11", qgs.trace(model, queries=[12]).__enter__)
     assert not any(m._forward_hooks or m._forward_pre_hooks for m in model.modules())

@@ -45,8 +45,7 @@ def test_steps_without_signs_of_life_are_counted():
 def test_a_stray_splat_is_no_sign_of_life():
     rgb = torch.ones(2, 3, 3, 32, 32)
     rgb[0, 0, :, 4:6, 4:6] = 0
-    rendering = Mock(rgb=rgb, alpha=1 - rgb[:, :, :1])
-    signs = signs_of(rendering, Mock(images=rgb), torch.ones(3))
+    signs = signs_of(Mock(rgb=rgb, alpha=1 - rgb[:, :, :1]), Mock(images=rgb), torch.ones(3))
     assert signs["alpha"] < EMPTY_ALPHA
     assert_near(signs["deviation"], 4 / 32**2)
     symptom = observed(ALIVE, ALIVE | {"deviation": float(signs["deviation"])}).symptom

@@ -165,6 +165,5 @@ def test_killed_runs_go_on_from_whole_files(monkeypatch):
     """Some kills must come inside a save, for this to prove anything."""
     tool = ROOT / "tools/fuzz.py"
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    command = [sys.executable, tool, "kill-training", "--count=12"]
-    told = subprocess.check_output(command, text=True)
+    told = subprocess.check_output([sys.executable, tool, "kill-training", "--count=12"], text=True)
     assert re.match(r"12 kills, [1-9]\d* of them during a save", told), told

@@ -140,8 +140,7 @@ def test_two_passes_have_the_terms_and_gradients_of_the_definition():
     """As one graph, in which the two passes and both comparisons stand written out."""
     weights = "objective={alpha_weight: 0.1, depth_weight: 0.2}"
     frustum = "losses.frustum={type: globalsplat/frustum, weight: 1}"  # of each pass's own cameras
-    recipe = tiny("locus", *TWO, weights, frustum)
-    step, batch = begun(recipe)
+    step, batch = begun(tiny("locus", *TWO, weights, frustum))
     parts = [batch.inputs.select(views) for views in ([0, 1, 3, 4], [0, 2, 4])]
     first, second = (written_out(step, part, batch.targets) for part in parts)
     terms = {name: (first[name] + second[name]) / 2 for name in first}
@@ -209,8 +208,7 @@ def test_a_term_named_as_a_number_of_a_step_is_refused(monkeypatch):
 
 
 def test_input_views_are_judged_too():
-    recipe = tiny("tokengs", "training.judge_inputs=true", "losses.visibility=null")
-    step, batch = begun(recipe)
+    step, batch = begun(tiny("tokengs", "training.judge_inputs=true", "losses.visibility=null"))
     inputs = batch.inputs
     targets = batch.targets.select([0])
     of_inputs, of_targets = (written_out(step, inputs, views) for views in (inputs, targets))

@@ -44,8 +44,7 @@ def colours_of_16_bits():
     codec.height, codec.width = SIZE
     codec.pix_fmt = "rgb48be"
     codec.framerate = 1
-    frame = av.VideoFrame.from_ndarray(wide(RGB, 257), "rgb48be")
-    return b"".join(map(bytes, codec.encode(frame)))
+    return b"".join(map(bytes, codec.encode(av.VideoFrame.from_ndarray(wide(RGB, 257), "rgb48be"))))
 
 
 def with_alpha(alpha):

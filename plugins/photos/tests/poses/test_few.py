@@ -92,8 +92,7 @@ def test_two_photos_without_a_pose_are_refused(found, pixels, reason):
 
 
 def test_two_photos_get_poses_and_a_blank_one_none(images, shots, tmp_path):
-    blank = np.full_like(images[0], 127)
-    write_photos(tmp_path / "two", [images[3], images[5], blank])
+    write_photos(tmp_path / "two", [images[3], images[5], np.full_like(images[0], 127)])
     shown = run_qgs(f"poses {tmp_path}/two --threads 1").output
     assert "2 of 3 photos have poses" in shown
     assert "times their longer side" in shown
@@ -122,8 +121,7 @@ def test_a_start_of_colmap_or_of_a_pair_is_enough(walk, tmp_path, monkeypatch, l
 def detector(pixels):
     """The features of SIFT, as ALIKED finds its own."""
     extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
-    grey = (255 * pixels[0].mean(0)).byte().numpy()
-    points, found = extractor.extract_from_uint8_array(grey)
+    points, found = extractor.extract_from_uint8_array((255 * pixels[0].mean(0)).byte().numpy())
     places = torch.tensor([(point.x - 0.5, point.y - 0.5) for point in points])
     data = torch.nn.functional.normalize(torch.from_numpy(found.data.astype(np.float32)), dim=-1)
     return [SimpleNamespace(keypoints=places.reshape(-1, 2), descriptors=data.reshape(-1, 128))]

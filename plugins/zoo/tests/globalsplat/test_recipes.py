@@ -56,8 +56,7 @@ def test_published_training():
 def test_two_passes_train_a_head_that_grows(here):
     growing = "model.head.level={schedule: steps, values: [0, 0.5, 1, 3], at: [1, 2, 4]}"
     two = "objective={type: globalsplat/two_passes}"
-    recipe = resolve(TINY, [*SMALL.split(), two, growing])
-    folder = run(recipe).folder
+    folder = run(resolve(TINY, [*SMALL.split(), two, growing])).folder
     assert [record["frustum"] > 0 for record in folder.history()] == [True] * 6
     assert qgs.load(folder.checkpoint).head.gaussians_per_query == 8  # those of the last step
     assert qgs.compose(TINY, overrides=[growing]).head.gaussians_per_query == 1  # of the first one

@@ -87,8 +87,7 @@ def test_both_ways_to_correlate_agree(monkeypatch):
         gradients += torch.autograd.grad(volume.square().sum(), learned)
         # Sums cancel: twice the rounding of the released code's own.
         assert_close(volume, golden.tensors["cost_volume.0"], rtol=1e-4, atol=1.5e-4)
-        atol = 1.5e-4 * gradients[0].abs().max()
-        assert_close(gradients[-1], gradients[0], rtol=1e-4, atol=atol)
+        assert_close(gradients[-1], gradients[0], rtol=1e-4, atol=1.5e-4 * gradients[0].abs().max())
 
 
 def test_a_module_that_is_imported_in_inference_can_train():
