@@ -173,10 +173,7 @@ class CheckpointFile(TensorFile):
 
 
 def load(
-    name: AnyPath,
-    device: str | torch.device | None = None,
-    *,
-    gaussians: int | None = None,
+    name: AnyPath, device: str | torch.device | None = None, *, gaussians: int | None = None
 ) -> QueryGaussianModel:
     """Load the model of a checkpoint in evaluation mode.
 

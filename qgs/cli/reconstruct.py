@@ -49,8 +49,7 @@ def reconstruct(
     scale: Scale = None,
     overrides: ViewsSettings = None,
     overwrite: Annotated[
-        bool,
-        typer.Option("--overwrite", help="Write into a non-empty folder, or over a file."),
+        bool, typer.Option("--overwrite", help="Write into a non-empty folder, or over a file.")
     ] = False,
     size: Size = None,
     gaussians: Gaussians = None,

@@ -181,12 +181,7 @@ class Feedback(ModelComponent):
 
     @abstractmethod
     def forward(
-        self,
-        state: QueryState,
-        memory: ImageMemory,
-        views: Views,
-        decode: Decode,
-        render: Render,
+        self, state: QueryState, memory: ImageMemory, views: Views, decode: Decode, render: Render
     ) -> tuple[QueryState, ImageMemory]:
         """Return the query state and image memory that the first repeated layer reads.
 

@@ -208,8 +208,7 @@ class SampleStream(Dataset[Batch | Exception]):
 
     def _sample_after(self, number: int, attempt: int) -> Sample:
         """Make sample `number`; or its replacement, if `attempt` earlier attempts failed."""
-        step = number // self.per_step
-        scene, rng, mirror, inputs, targets = self._drawn(number, step, attempt)
+        scene, rng, mirror, inputs, targets = self._drawn(number, number // self.per_step, attempt)
         try:
             return make_sample(scene, inputs, targets, self.views, mirror, rng, self.depths)
         except Exception as error:

@@ -44,7 +44,7 @@ def quat_product(left: Tensor, right: Tensor) -> Tensor:
     w, v = left.split((1, 3), -1)
     w2, v2 = right.split((1, 3), -1)
     real = w * w2 - (v * v2).sum(-1, keepdim=True)
-    return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2, dim=-1)], -1)
+    return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2)], -1)
 
 
 @full_precision

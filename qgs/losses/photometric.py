@@ -57,8 +57,7 @@ class Photometric(Loss):
             terms["l1"] = config.l1_weight * F.l1_loss(*images)
         if config.ssim_weight:
             # SSIM lies between -1 and 1, so this term lies between 0 and its weight.
-            similarity = mean_ssim(*images, config.padding)
-            terms["ssim"] = config.ssim_weight * (1 - similarity) / 2
+            terms["ssim"] = config.ssim_weight * (1 - mean_ssim(*images, config.padding)) / 2
         return terms
 
 

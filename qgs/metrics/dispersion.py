@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
 from qgs.contracts import Column, Metric, MetricInput
@@ -36,7 +35,7 @@ class Dispersion(Metric):
         """
         assert given.gaussians is not None
         distances = token_dispersion(given.gaussians.means, given.gaussians_per_query)
-        return {"mean": distances, "median": torch.quantile(distances, 0.5, dim=-1)}
+        return {"mean": distances, "median": distances.quantile(0.5, -1)}
 
 
 @full_precision

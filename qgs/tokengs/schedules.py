@@ -68,8 +68,7 @@ class Steps(_Listed):
     @property
     def corners(self) -> tuple[int, ...]:
         """Steps in `at`, and the last step before each of them."""
-        before = [at - 1 for at in self.at]
-        return (*before, *self.at)
+        return (*(at - 1 for at in self.at), *self.at)
 
 
 class Linear(_Listed):

@@ -11,11 +11,7 @@ from types import FrameType
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import (
-    DistributedDataParallelKwargs,
-    DistributedType,
-    InitProcessGroupKwargs,
-)
+from accelerate.utils import DistributedDataParallelKwargs, DistributedType, InitProcessGroupKwargs
 
 TIMEOUT = timedelta(hours=24)
 """Longest time that processes wait for each other, such as while one evaluates or saves.

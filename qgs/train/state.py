@@ -1,6 +1,5 @@
 """State of a run besides its weights: steps, random states, optimiser, averaged weights."""
 
-import math
 import time
 from collections import defaultdict
 from collections.abc import Mapping
@@ -76,8 +75,7 @@ class Counters:
     @property
     def used(self) -> float:
         """Used fraction of the budget: that of the steps or of the seconds, whichever is larger."""
-        of_seconds = self.seconds / (self.config.seconds or math.inf)
-        return max(self.step / self.config.steps, of_seconds)
+        return max(self.step / self.config.steps, self.seconds / (self.config.seconds or torch.inf))
 
     def every(self, steps: int) -> bool:
         """Return whether the present step is a multiple of `steps`; False if `steps` is 0."""
