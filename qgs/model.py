@@ -89,6 +89,15 @@ class QueryGaussianModel(nn.Module):
         """Number of decoder layers that an evaluation runs, including repetitions by feedback."""
         return len(self.decoder) + self.feedback.rounds * self.feedback.layers
 
+    def compile(self, *args: Any, **kwargs: Any) -> None:
+        """Compile the model in place; the arguments are those of torch.compile.
+
+        On CUDA, the default mode is "reduce-overhead": a call replays a CUDA graph, and its results
+        are valid until the next call.
+        """
+        captured = {"mode": "reduce-overhead"} if self.device.type == "cuda" else {}
+        super().compile(*args, **captured | kwargs)
+
     def forward(self, views: Views | Photos, layers: Collection[int] | None = None) -> Prediction:
         """Reconstruct every scene of `views`, whose cameras are in the model's frame.
 
@@ -146,8 +155,8 @@ class QueryGaussianModel(nn.Module):
             raise ValueError(
                 f"layers {unknown} do not exist; this model has layers {known[0]}..{len(order)}"
             )
-        scenes = memory.features.shape[0]
-        given = state.features.shape[0]
+        scenes = len(memory.features)
+        given = len(state.features)
         if scenes != given:
             raise ValueError(
                 f"the memory has {scenes} scenes, but the initial state has {given}; both need the "

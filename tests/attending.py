@@ -1,7 +1,12 @@
 """Attention with a bias that is a function, in drawn cases, and what is wrong with its kernels."""
 
+from functools import partial
+
 import torch
 import torch.nn.functional as F
+from qgs_locus.kernels.attention_bias import biased_attention
+from qgs_locus.ray_bias import RayBias
+from torch.nn.attention.flex_attention import flex_attention
 
 
 def case(sizes, factor=1.0, lower=-6.0):
@@ -25,6 +30,38 @@ def direct(q, k, v, bias):
     scenes = zip(bias.queries, bias.tokens, strict=True)
     mask = torch.stack([bias.value(*read) for read in scenes])
     return F.scaled_dot_product_attention(q, k, v, mask[:, None])
+
+
+def flex(q, k, v, bias):
+    """By torch's FlexAttention, with LocusGS's bias in its own words."""
+    queries = bias.queries.unbind(-1)
+    tokens = bias.tokens.unbind(1)
+
+    def biased(logit, scene, head, n, m):
+        x, y, z, factor, lower = (numbers[scene, n] for numbers in queries)
+        m0, m1, m2, d0, d1, d2 = (numbers[scene, m] for numbers in tokens)
+        moments = (y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2)
+        return logit + torch.maximum(-factor * sum(e * e for e in moments), lower)
+
+    return flex_attention(q, k, v, biased)
+
+
+def ways(sizes):
+    """Each way to compute attention on a GPU in bfloat16: a step, with gradients if they are on."""
+    given = {name: x.cuda() for name, x in case(sizes).items()}
+    qkv = [given[name].bfloat16().requires_grad_() for name in "qkv"]
+    bias = RayBias(given["queries"].requires_grad_(), given["tokens"])
+    every = {"no bias": F.scaled_dot_product_attention}
+    for kernel in ("plain", "triton", "blocks"):
+        every[kernel] = partial(biased_attention, bias=bias, kernel=kernel)
+    every["flex"] = partial(torch.compile(flex), bias=bias)
+
+    def step(attention):
+        read = attention(*qkv)
+        if read.requires_grad:
+            read.sum().backward()
+
+    return {name: partial(step, attention) for name, attention in every.items()}
 
 
 def found(attention, kind, given, learnt):

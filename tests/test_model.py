@@ -7,6 +7,7 @@ import torch
 from commands import SMALL
 from odd_views import odd_views
 from tables import must_refuse
+from torch import nn
 
 import qgs
 
@@ -53,3 +54,12 @@ def test_a_model_says_its_slots_in_a_few_lines():
     assert re.search(cells, repr(model), re.M)
     assert sum(int(line.split()[-1].replace(",", "")) for line in lines[:10]) == total
     assert "queries of" not in repr(qgs.compose("tiny/landmark.yaml", device="meta"))
+
+
+def test_compile_captures_graphs_on_cuda(monkeypatch):
+    given = []
+    monkeypatch.setattr(nn.Module, "compile", lambda model, **options: given.append(options))
+    small("tokengs").compile()
+    monkeypatch.setattr(qgs.QueryGaussianModel, "device", torch.device("cuda"))
+    small("tokengs").compile()
+    assert given == [{}, {"mode": "reduce-overhead"}]

@@ -2,35 +2,36 @@
 
     python tools/gpu_check.py OUT [WORD ...]
 
-Each step is a command with a time limit. A failed step does not stop the other steps. Steps that
-measure time run alone; all other steps run in parallel. With WORDs, only steps with one of the
+Each step is a command with a time limit. A failed step does not stop the other steps. After nearly
+ten minutes, all further steps fail at once. Steps that measure time run alone; all other steps run
+in parallel. With WORDs, only steps with one of the
 words in their name run, after the build of gsplat, which all need. OUT/report.md lists commands,
 results and times; OUT/logs has the output of all steps.
 """
 
-import json
 import os
 import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 import yaml
-from qgs_locus.kernels.attention_bias import biased_attention
-from qgs_locus.ray_bias import RayBias
-from qgs_research.bench.run import in_turn, quartiles
+from qgs_research.bench.run import in_turn, make_task, quartiles, workload_of
 from size import ROOT
+
+from qgs.recipe import resolve
 
 PHASES = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text("utf-8"))
 BUILD = "gsplat compiles"
+END = time.perf_counter() + 570
 
 Step = dict[str, Any]
 """Step of the report: name, command and time limit, as in gpu_check.yaml."""
@@ -56,7 +57,7 @@ def steps_of(phase: dict[str, Any], out: Path, words: Sequence[str]) -> Iterator
 def run_step(step: Step, out: Path) -> tuple[bool, str, str]:
     """Run a step; return whether it passed, its row in the report, and the end of its output.
 
-    out: folder OUT.
+    out: folder OUT. A step ends with the time of all steps.
     """
     log = out / "logs" / f"{step['name'].replace(' ', '-').replace(',', '')}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -64,7 +65,8 @@ def run_step(step: Step, out: Path) -> tuple[bool, str, str]:
     env["PATH"] = f"{Path(sys.executable).parent}:{env['PATH']}"
     started = time.perf_counter()
     # Its own processes end with it.
-    command = ["timeout", "--signal=KILL", str(step["limit"]), *shlex.split(step["command"])]
+    limit = max(1.0, min(step["limit"], END - started))
+    command = ["timeout", "--signal=KILL", str(limit), *shlex.split(step["command"])]
     folder = ROOT if "pytest" in step["command"] else out
     with log.open("w") as file:
         code = subprocess.run(command, cwd=folder, env=env, stdout=file, stderr=file).returncode
@@ -92,27 +94,46 @@ def report(out: Path, words: Sequence[str]) -> bool:
     return all(passed for passed, _, _ in results)
 
 
+def median(task: Callable[[], object]) -> float:
+    """Return the median of the milliseconds of ten calls."""
+    (samples,) = in_turn([task], 10, 3)
+    return 1000 * quartiles(samples)["median"]
+
+
 def time_attention() -> None:
-    """Print time and memory of each attention kernel, at the size of the published models."""
+    """Print time and memory of each way of attention, in inference and in training."""
     # Of the tests, which are on the path of a step.
-    case: Any = import_module("attending").case
-    given = {name: x.cuda() for name, x in case((1, 16, 4096, 7168, 64)).items()}
-    q, k, v = (given[name].requires_grad_() for name in "qkv")
-    bias = RayBias(given["queries"], given["tokens"])
+    attending: Any = import_module("attending")
+    for sizes in ((1, 16, 4096, 7168, 64), (1, 6, 1024, 4096, 64)):
+        for (name, step), learns in product(attending.ways(sizes).items(), (False, True)):
+            torch.cuda.reset_peak_memory_stats()
+            with torch.set_grad_enabled(learns):
+                taken = median(step)
+            memory = torch.cuda.max_memory_allocated() / 2**20
+            print(f"{sizes} {name}, {learns=}: {taken:.3f} ms, {memory:.0f} MiB", flush=True)
 
-    def step(kernel: Any) -> None:
-        plain = F.scaled_dot_product_attention
-        out = biased_attention(q, k, v, bias, kernel) if kernel else plain(q, k, v)
-        out.sum().backward()
 
-    for kernel in (None, "plain", "blocks", "triton"):
-        step(kernel)
-        torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_allocated()
-        (samples,) = in_turn([lambda kernel=kernel: step(kernel)], 10, 1)
-        memory = (torch.cuda.max_memory_allocated() - before) / 2**20
-        row = {"kernel": kernel or "no bias", "ms": 1000 * quartiles(samples)["median"]}
-        print(json.dumps(row | {"MiB": memory}), flush=True)
+def time_models(captured: bool) -> None:
+    """Print operators and time by part, or time as a captured graph with its largest difference."""
+    parts: Any = import_module("model_parts")
+    for name in ("tokengs/dl3dv_4096_4views.yaml", "locus/dl3dv_4096_4views.yaml"):
+        recipe = resolve(name)
+        model = recipe.build_model("cuda").eval()
+        task: Any = make_task("forward", recipe, model, workload_of(recipe, device="cuda"))
+        expected = task().means
+        if captured:
+            model.compile()
+            print(f"{(task().means - expected).abs().max():.2e} apart")
+        else:
+            print(parts.report(model, task))
+        print(f"{name}: {median(task):.2f} ms", flush=True)
+
+
+MEASUREMENTS = {
+    "--attention": time_attention,
+    "--models": partial(time_models, False),
+    "--captured": partial(time_models, True),
+}
 
 
 def main() -> int:
@@ -121,8 +142,8 @@ def main() -> int:
     if not torch.cuda.is_available():
         print("gpu_check: torch finds no GPU, so there is nothing to check", file=sys.stderr)
         return 2
-    if sys.argv[1] == "--attention":
-        time_attention()
+    if sys.argv[1] in MEASUREMENTS:
+        MEASUREMENTS[sys.argv[1]]()
         return 0
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs on a machine with a GPU everything that a CPU cannot hold, and writes one report:
+# Runs on a machine with a GPU, in ten minutes, what a CPU cannot hold, and writes a report as it goes:
 #     tools/gpu_check.sh WHEELS [OUT [WORD ...]]      (OUT: a new folder, gpu-report if not given;
 #                                                     WORDs: of the steps' names, all if not given)
 # The machine needs Python 3.11 or newer with pip, torch with CUDA, and nvcc (gsplat compiles), and no
@@ -48,4 +48,6 @@ install+=(--disable-pip-version-check --no-deps)
     exit 1
 }
 export PATH="$environment/bin:$PATH"
+# Kept for the next run.
+export TORCH_EXTENSIONS_DIR=${TORCH_EXTENSIONS_DIR:-$root/build/extensions}
 cd "$root" && exec "$environment/bin/python" tools/gpu_check.py "$out" "${@:3}"

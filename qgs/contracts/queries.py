@@ -79,7 +79,7 @@ class LearnedQueries(Queries):
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Return the initial state for as many scenes as the memory has."""
-        return self.start(memory.features.shape[0])
+        return self.start(len(memory.features))
 
 
 def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:

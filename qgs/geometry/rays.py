@@ -53,4 +53,4 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
     """
     # The mean of moments and directions is a ray through the middle, a little too short.
     pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
-    return pooled.flatten(2).mT.reshape(plucker.shape[0], -1, 6)
+    return pooled.flatten(2).mT.reshape(len(plucker), -1, 6)

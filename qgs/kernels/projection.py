@@ -156,7 +156,7 @@ def project_unit(means, scales, quats, c2w, lenses, opacities, bounds, limits, s
         fall = max(np.log(opacity / alpha_min), ZERO)
         reach = np.sqrt(TWO * fall)
         lowest = -LOG2_E * fall - _SLACK
-        for v in range(c2w.shape[0]):
+        for v in range(len(c2w)):
             _, _, seen, _, (x, _, row_x), (y, _, row_y) = _view(
                 c2w[v], lenses[v], means[g], factor, margin, height, width
             )
@@ -298,7 +298,7 @@ def project_backward_unit(
         of_mean = zeros
         of_opacity = ZERO
         of_factor = (zeros, zeros, zeros)
-        for v in range(c2w.shape[0]):
+        for v in range(len(c2w)):
             splat = splats[v, g]
             if not splat[6] > ZERO:
                 continue

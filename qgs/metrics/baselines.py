@@ -14,7 +14,7 @@ def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
     targets: T cameras per scene, (B, T). `pose_distance` defines the distance.
     """
     index = pose_distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
-    scene = torch.arange(index.shape[0], device=index.device)[:, None]
+    scene = torch.arange(len(index), device=index.device)[:, None]
     return inputs.images[scene, index]
 
 

@@ -196,9 +196,9 @@ class GivenScene(Scene):
     name = "views"
 
     def __init__(self, views: Views) -> None:
-        if views.images.shape[0] != 1:
+        if len(views.images) != 1:
             raise ValueError(
-                f"one scene is reconstructed at a time, got {views.images.shape[0]}; select one, "
+                f"one scene is reconstructed at a time, got {len(views.images)}; select one, "
                 "such as the first: map_tensors(lambda x: x[:1], views)"
             )
         # Resampling overshoots [0, 1] a little at edges.

@@ -69,7 +69,7 @@ def _conics(
     xx = (row_x * row_x).sum(-1)
     xy = (row_x * row_y).sum(-1)
     yy = (row_y * row_y).sum(-1)
-    minors = torch.linalg.cross(row_x, row_y, dim=-1)
+    minors = torch.linalg.cross(row_x, row_y)
     # Cauchy-Binet: unlike xx * yy - xy^2 this does not cancel for needles.
     determinant = (minors * minors).sum(-1) + dilation * (xx + yy) + dilation * dilation
     usable = torch.isfinite(determinant) & (determinant > 0)
@@ -96,7 +96,7 @@ class TorchRenderer(Renderer):
         )
         channels = channels.expand(-1, cameras.shape[1], -1, -1)
         sums = []
-        for image in product(range(cameras.shape[0]), range(cameras.shape[1])):
+        for image in product(*map(range, cameras.shape)):
             # Front to back; equal depths stay in order.
             order = depths[image].argsort(stable=True)
             order = order[visible[image][order]]

@@ -10,8 +10,9 @@ import torch
 from qgs_research.published.layouts import fitting_recipe, names_of
 from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, coefficients, turn_of_harmonics
 from qgs_zoo.mvsplat.pixels import PIXEL, degree_of, mapped_opacity, ray_directions
-from qgs_zoo.mvsplat.sweep import feature_lenses, warp_grid, warped
+from qgs_zoo.mvsplat.sweep import warp_grid, warped
 from qgs_zoo.mvsplat.windows import out_of_windows
+from qgs_zoo.parts import feature_lenses
 from torch import Tensor, nn
 
 import qgs

@@ -5,10 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from attending import case, exact, found, wrong
+from attending import case, exact, flex, found, wrong
 from qgs_locus.kernels import attention_bias
 from qgs_locus.kernels.attention_bias import BLOCK, AttentionBias, biased_attention
 from qgs_locus.ray_bias import RayBias
+from torch.testing import assert_close
 
 PLAIN = partial(biased_attention, kernel="plain")
 
@@ -45,6 +46,13 @@ def test_gradients_are_those_of_float64(monkeypatch):
         sizes = [int(torch.randint(1, most, ())) for most in (3, 4, 30, 60, 33)]
         lower = (-4 * torch.rand(()), 0.0, -1e9)[number % 3]  # reached by some pairs, all, none
         assert not faults(case(sizes, lower=lower)), number
+
+
+@pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")
+def test_flex_attention_gives_the_same():
+    given = case(SIZES)
+    read = given["q"], given["k"], given["v"], RayBias(given["queries"], given["tokens"])
+    assert_close(flex(*read), biased_attention(*read))
 
 
 def test_what_other_devices_compute_is_the_same(monkeypatch):

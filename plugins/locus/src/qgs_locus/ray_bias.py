@@ -86,17 +86,21 @@ class RayBias(AttentionBias):
         parts = [center_BN3, each_BN1 * (gamma / (2 * sigma_sq)), each_BN1 * (gamma * bias_min)]
         return cls(torch.cat(parts, -1), tokens_B6M)
 
-    def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
+    @staticmethod
+    def value(queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
         """Return the bias (n, M) of n queries and the M tokens of a scene.
 
-        D^2 = |mu x d - m|^2 is computed from cross products (n, M, 3). A single matrix product
-        would be off by several logits for anchors far from the cameras.
+        D^2 = |mu x d - m|^2 is computed from the components of mu x d, of which a compiler makes
+        one kernel. A single matrix product would be off by several logits for anchors far from the
+        cameras.
         """
-        center_n3, factor_n1, lower_n1 = queries_nF.split([3, 1, 1], -1)
-        m_M3 = tokens_GM[:3].mT
-        d_M3 = tokens_GM[3:6].mT
-        moment_nM3 = torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1) - m_M3
-        return clamped(-factor_n1 * moment_nM3.square().sum(-1), lower_n1)
+        x_n1, y_n1, z_n1, factor_n1, lower_n1 = queries_nF.split(1, -1)
+        m0_M, m1_M, m2_M, d0_M, d1_M, d2_M = tokens_GM.unbind()
+        e0_nM = y_n1 * d2_M - z_n1 * d1_M - m0_M
+        e1_nM = z_n1 * d0_M - x_n1 * d2_M - m1_M
+        e2_nM = x_n1 * d1_M - y_n1 * d0_M - m2_M
+        distance_sq_nM = e0_nM.square() + e1_nM.square() + e2_nM.square()
+        return clamped(-factor_n1 * distance_sq_nM, lower_n1)
 
 
 def clamped(bias_nM: Tensor, lower_n1: Tensor) -> Tensor:

@@ -69,7 +69,8 @@ class EllipsoidBias(AttentionBias):
         parts = [center_BN3, cofactors_BN9, ball_BN9, rest_BN2]
         return cls(torch.cat(parts, -1), tokens_B9M)
 
-    def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
+    @staticmethod
+    def value(queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
         """Return the bias (n, M) of n queries and the M tokens of a scene.
 
         queries: 23 numbers of each query (n, 23). tokens: nine numbers of each token (9, M).

@@ -28,6 +28,7 @@ from qgs.precision import full_precision
 from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 
 T = TypeVar("T")
+Value = Callable[[Tensor, Tensor], Tensor]
 Block = tuple[int, slice, tuple[Tensor, ...]]
 """Block: index of the scene, slice of its queries, and buffers (n, M) for these n queries."""
 
@@ -69,8 +70,9 @@ class AttentionBias(ABC):
         self.queries = queries
         self.tokens = tokens
 
+    @staticmethod
     @abstractmethod
-    def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
+    def value(queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
         """Return the bias (n, M) of n queries and all tokens of a scene, differentiable."""
 
     @full_precision
@@ -190,7 +192,8 @@ def biased_attention(
     chosen = chosen_kernel(q_BhNd, bias, kernel)
     if chosen == "plain":
         eager = q_BhNd.device.type == "cpu" or torch.compiler.is_compiling()
-        mask_B1NM = (attention_mask if eager else _compiled_mask())(bias, q_BhNd.dtype)
+        mask = attention_mask if eager else _compiled_mask()
+        mask_B1NM = mask(bias.value, *of_bias, q_BhNd.dtype)
         # cuDNN's gradients would be NaN (pytorch issue 196678).
         faulty = k_BhMd.shape[2] % 128 == 64
         with sdpa_kernel(_WITHOUT_CUDNN) if faulty else nullcontext():
@@ -202,13 +205,14 @@ def biased_attention(
     return _outside_graphs(_BiasedAttention.apply)(*qkv, *of_bias, bias)
 
 
-def attention_mask(bias: AttentionBias, dtype: torch.dtype) -> Tensor:
+@full_precision
+def attention_mask(value: Value, queries: Tensor, tokens: Tensor, dtype: torch.dtype) -> Tensor:
     """Return the bias of all queries and tokens as a mask (B, 1, N, M) in `dtype`."""
-    return bias.dense()[:, None].to(dtype)
+    return torch.vmap(value)(queries, tokens)[:, None].to(dtype)
 
 
 @cache
-def _compiled_mask() -> Callable[[AttentionBias, torch.dtype], Tensor]:
+def _compiled_mask() -> Callable[[Value, Tensor, Tensor, torch.dtype], Tensor]:
     """Return `attention_mask` as one kernel, which stores nothing but the mask."""
     return torch.compile(attention_mask)
 

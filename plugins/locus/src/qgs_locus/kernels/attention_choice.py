@@ -3,8 +3,9 @@
 On a CPU, attention is computed block by block. On a GPU, torch's attention is used if the bias of
 all pairs of query and token needs at most 1 / SHARE of the GPU's memory in one layer. Every layer
 keeps this bias for the backward pass. For larger sizes, Triton kernels are used, or blocks if
-Triton cannot be used. The speeds of these three have not been compared on a GPU. The choice depends
-on sizes only, so all layers, steps and processes make the same choice.
+Triton cannot be used. The speeds of these three have not been compared on a GPU (gpu_check.py would
+print them). The choice depends on sizes only, so all layers, steps and processes make the same
+choice, and torch.compile makes one graph of all layers.
 """
 
 import os
@@ -61,7 +62,8 @@ def chosen_kernel(
         return kernel
     if q_BhNd.device.type != "cuda":
         return "blocks"
-    if plain_bytes(q_BhNd, bias) <= torch.cuda.get_device_properties(q_BhNd.device).total_memory // SHARE:
+    memory = torch.cuda.get_device_properties(q_BhNd.device).total_memory
+    if plain_bytes(q_BhNd, bias) <= memory // SHARE:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
     warn_once(f"attention uses {found}: the bias of all queries and tokens needs too much memory")
