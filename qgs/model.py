@@ -92,11 +92,12 @@ class QueryGaussianModel(nn.Module):
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """Compile the model in place; the arguments are those of torch.compile.
 
-        On CUDA, the default mode is "reduce-overhead": a call replays a CUDA graph, and its results
-        are valid until the next call.
+        On CUDA, without arguments, calls replay a CUDA graph (mode "reduce-overhead"): for
+        inference, with results that are valid until the next call.
         """
-        captured = {"mode": "reduce-overhead"} if self.device.type == "cuda" else {}
-        super().compile(*args, **captured | kwargs)
+        if self.device.type == "cuda" and not args and not kwargs:
+            kwargs["mode"] = "reduce-overhead"
+        super().compile(*args, **kwargs)
 
     def forward(self, views: Views | Photos, layers: Collection[int] | None = None) -> Prediction:
         """Reconstruct every scene of `views`, whose cameras are in the model's frame.

@@ -46,22 +46,27 @@ def flex(q, k, v, bias):
     return flex_attention(q, k, v, biased)
 
 
-def ways(sizes):
-    """Each way to compute attention on a GPU in bfloat16: a step, with gradients if they are on."""
-    given = {name: x.cuda() for name, x in case(sizes).items()}
+WAYS = ("no bias", "plain", "triton", "blocks", "flex")
+
+
+def step_of(way, sizes):
+    """Attention on a GPU in bfloat16, with gradients if they are on."""
+    with torch.device("cuda"):
+        given = case(sizes)
     qkv = [given[name].bfloat16().requires_grad_() for name in "qkv"]
     bias = RayBias(given["queries"].requires_grad_(), given["tokens"])
-    every = {"no bias": F.scaled_dot_product_attention}
-    for kernel in ("plain", "triton", "blocks"):
-        every[kernel] = partial(biased_attention, bias=bias, kernel=kernel)
-    every["flex"] = partial(torch.compile(flex), bias=bias)
+    attention = partial(biased_attention, bias=bias, kernel=way)
+    if way == "no bias":
+        attention = F.scaled_dot_product_attention
+    if way == "flex":
+        attention = partial(torch.compile(flex), bias=bias)
 
-    def step(attention):
+    def step():
         read = attention(*qkv)
         if read.requires_grad:
             read.sum().backward()
 
-    return {name: partial(step, attention) for name, attention in every.items()}
+    return step
 
 
 def found(attention, kind, given, learnt):

@@ -9,7 +9,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 
 class Parts(TorchDispatchMode):
-    """While it is active, it counts operators and seconds of each part of the model.
+    """While it is active, it counts operators and seconds of each part of the model, which keeps
+    the hooks.
 
     A part has the name of its module without numbers of layers, such as decoder.cross_attention.
     Operators that only make views do not count. On a GPU, each part waits for its kernels.
@@ -20,24 +21,12 @@ class Parts(TorchDispatchMode):
         self.operators = Counter()
         self.seconds = Counter()
         self.inside = ["model"]
-        self.since = 0.0
-        self.hooks = []
+        self.since = perf_counter()
         for name, module in model.named_modules():
             part = re.sub(r"\.\d+", "", name)
             if part and part.count(".") < 2:
-                self.hooks += [
-                    module.register_forward_pre_hook(lambda *_, part=part: self.spent(part)),
-                    module.register_forward_hook(lambda *_: self.spent(None)),
-                ]
-
-    def __enter__(self):
-        self.since = perf_counter()
-        return super().__enter__()
-
-    def __exit__(self, *error):
-        super().__exit__(*error)
-        for hook in self.hooks:
-            hook.remove()
+                module.register_forward_pre_hook(lambda *_, part=part: self.spent(part))
+                module.register_forward_hook(lambda *_: self.spent(None))
 
     def spent(self, entered):
         if torch.cuda.is_available():
@@ -55,11 +44,8 @@ class Parts(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def report(model, task):
-    """A line for each part of the model that a task calls."""
+def parts_of(model, task):
+    """Operators and seconds of each part of the model that a task calls."""
     with Parts(model) as parts:
         task()
-    return "\n".join(
-        f"{part}: {parts.operators[part]} operators, {1000 * seconds:.2f} ms"
-        for part, seconds in parts.seconds.most_common()
-    )
+    return parts.operators, parts.seconds

@@ -10,11 +10,11 @@ TEXTS = ("qgs", "plugins", "tests", "tools", "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 488_730},
-    "qgs": {"tokens": 99_523, "parallel": 1, "why": 3},
-    "plugins": {"tokens": 203_745, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 163_180, "parallel": 1},
-    "tools": {"tokens": 17_916, "parallel": 1},
+    "all": {"tokens": 488_719},
+    "qgs": {"tokens": 99_524, "parallel": 1, "why": 3},
+    "plugins": {"tokens": 203_736, "parallel": 1, "why": 3.5},
+    "tests": {"tokens": 163_178, "parallel": 1},
+    "tools": {"tokens": 17_917, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,
 comments that say why at least. They only get stricter: a change that adds removes as much."""

@@ -9,7 +9,8 @@
 #         --platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 \
 #         --no-deps -d WHEELS -r <(pip freeze --exclude-editable | grep -v ^torch) \
 #         gsplat==1.5.3 jaxtyping wadler-lindig ninja hatchling editables trove-classifiers
-# Exit code: 0 all steps passed, 1 some failed (the report says which), 2 there is no GPU.
+# Exit code: 0 all steps passed, 1 some failed (the report says which), 2 there is no GPU, 124 time was up (the
+# report lacks the steps that did not end).
 set -uo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 python=${PYTHON:-python3}
@@ -48,6 +49,8 @@ install+=(--disable-pip-version-check --no-deps)
     exit 1
 }
 export PATH="$environment/bin:$PATH"
-# Kept for the next run.
-export TORCH_EXTENSIONS_DIR=${TORCH_EXTENSIONS_DIR:-$root/build/extensions}
-cd "$root" && exec "$environment/bin/python" tools/gpu_check.py "$out" "${@:3}"
+# Compiled code is kept for the next run with this torch.
+cache=$root/build/$("$python" -c 'import sys, torch; print(f"{sys.version_info.minor}-{torch.__version__}")')
+export TORCH_EXTENSIONS_DIR=$cache/extensions TORCHINDUCTOR_CACHE_DIR=$cache/inductor TRITON_CACHE_DIR=$cache/triton
+export PYTHONUNBUFFERED=1
+cd "$root" && exec timeout $((570 - SECONDS)) "$environment/bin/python" tools/gpu_check.py "$out" "${@:3}"

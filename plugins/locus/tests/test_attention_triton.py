@@ -38,6 +38,7 @@ kernels = pytest.mark.parametrize(
 )
 
 LEARNT = ("q", "k", "v", "queries")
+TRITON = partial(biased_attention, kernel="triton")
 
 
 def _on_device(given):
@@ -75,14 +76,24 @@ def test_gradients_are_those_of_float64(kernel):
 
 @runs
 def test_bits_are_the_same_each_time_and_what_is_frozen_gets_no_gradient():
-    attention = partial(biased_attention, kernel="triton")
     given = _on_device(case((1, 2, 70, 70, 16)))
-    whole, again = (found(attention, RayBias, given, LEARNT) for _ in range(2))
+    whole, again = (found(TRITON, RayBias, given, LEARNT) for _ in range(2))
     assert_equal(again, whole)
     for learnt in (*zip(LEARNT, strict=True), ("k", "v"), ("q", "queries")):
         expected = {name: whole[name] for name in ("read", *learnt)}
         # on a GPU other products and sums are fused
-        assert_close(found(attention, RayBias, given, learnt), expected, rtol=1e-5, atol=1e-6)
+        assert_close(found(TRITON, RayBias, given, learnt), expected, rtol=1e-5, atol=1e-6)
+
+
+@runs
+def test_operators_keep_the_rules_of_torch_and_stay_in_graphs():
+    given = _on_device(case((1, 2, 20, 33, 16)))
+    compiled = torch.compile(TRITON, backend="aot_eager", fullgraph=True)
+    seen, expected = (found(x, RayBias, given, LEARNT) for x in (compiled, TRITON))
+    assert_close(seen, expected)
+    read = [given[name].requires_grad_() for name in LEARNT]
+    operator = import_module("qgs_locus.kernels.attention_triton").attention
+    torch.library.opcheck(operator, [*read, given["tokens"]])
 
 
 @runs
@@ -109,6 +120,7 @@ USUAL = (2, 4, 1000, 2000, 64)
         (89, torch.float32, (2, 4, 1000, 2000, 128), LEARNT),
         (89, torch.bfloat16, (1, 1, 100, 100, 256), LEARNT),
         (90, torch.float16, (1, 1, 1, 1, 24), ("v", "queries")),
+        (90, torch.bfloat16, USUAL, LEARNT),
         (90, torch.bfloat16, USUAL, ("q",)),
         (90, torch.bfloat16, USUAL, ("k",)),
     ],

@@ -1,10 +1,12 @@
 """Operators of a forward pass by part, and its graph: each operator is a launch on a GPU."""
 
+from functools import partial
+
 import pytest
 import torch
 from attending import case
 from commands import SMALL
-from model_parts import Parts
+from model_parts import parts_of
 from odd_views import odd_views
 from qgs_locus.kernels import attention_bias
 from qgs_locus.kernels.attention_bias import attention_mask
@@ -30,31 +32,28 @@ landmark queries 310
 """Operators of four layers with plain attention. They may only fall."""
 
 
-@pytest.fixture(autouse=True)
-def _plain(monkeypatch):
+@pytest.fixture
+def small(monkeypatch):
     monkeypatch.setattr(attention_bias, "chosen_kernel", lambda *_: "plain")
-
-
-def small(name):
-    return qgs.compose(f"tiny/{name}.yaml", SMALL).eval()
+    return lambda name: qgs.compose(f"tiny/{name}.yaml", SMALL).eval()
 
 
 @torch.inference_mode()
-def test_operators_of_a_forward_pass_may_only_fall(monkeypatch):
+def test_operators_of_a_forward_pass_may_only_fall(small, monkeypatch):
     # on a GPU, the mask is one kernel
     monkeypatch.setattr(attention_bias, "attention_mask", lambda *_: torch.zeros(1, 1, 1, 1))
     for name, part, most in rows(MOST, " "):
         model = small(name)
-        with Parts(model) as parts:
-            model(VIEWS)
-        found = {"total": parts.operators.total(), **parts.operators}
-        assert found[part] <= int(most), (name, part)
+        operators, _ = parts_of(model, partial(model, VIEWS))
+        operators["total"] = operators.total()
+        assert operators[part] <= int(most), (name, part)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["locus", "landmark"])
-@torch.no_grad()
-def test_a_model_is_one_graph_with_equal_results(name):
+@torch.inference_mode()
+@torch.autocast("cpu", torch.bfloat16)
+def test_a_model_is_one_graph_with_equal_results(small, name):
     model = small(name)
     expected = model(VIEWS).gaussians
     model.compile(backend="aot_eager", fullgraph=True)

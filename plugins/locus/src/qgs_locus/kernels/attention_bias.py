@@ -195,26 +195,28 @@ def biased_attention(
         mask = attention_mask if eager else _compiled_mask()
         mask_B1NM = mask(bias.value, *of_bias, q_BhNd.dtype)
         # cuDNN's gradients would be NaN (pytorch issue 196678).
-        faulty = k_BhMd.shape[2] % 128 == 64
+        faulty = torch.is_grad_enabled() and k_BhMd.shape[2] % 128 == 64
         with sdpa_kernel(_WITHOUT_CUDNN) if faulty else nullcontext():
             return F.scaled_dot_product_attention(*qkv, attn_mask=mask_B1NM)
     if chosen == "triton":
         from qgs_locus.kernels.attention_triton import attention  # needs triton
 
-        return attention(*qkv, *of_bias)[0]
+        # Kernels assume that rows of these are contiguous.
+        return attention(*qkv, *(x.contiguous() for x in of_bias))[0]
     return _outside_graphs(_BiasedAttention.apply)(*qkv, *of_bias, bias)
 
 
-@full_precision
 def attention_mask(value: Value, queries: Tensor, tokens: Tensor, dtype: torch.dtype) -> Tensor:
     """Return the bias of all queries and tokens as a mask (B, 1, N, M) in `dtype`."""
-    return torch.vmap(value)(queries, tokens)[:, None].to(dtype)
+    # Not by `full_precision`, whose code, and so whose limit of compilations, many functions share.
+    with torch.autocast(queries.device.type, enabled=False):
+        return torch.vmap(value)(queries, tokens)[:, None].to(dtype)
 
 
 @cache
 def _compiled_mask() -> Callable[[Value, Tensor, Tensor, torch.dtype], Tensor]:
     """Return `attention_mask` as one kernel, which stores nothing but the mask."""
-    return torch.compile(attention_mask)
+    return torch.compile(attention_mask, dynamic=True)
 
 
 def _outside_graphs(function: Callable[..., T]) -> Callable[..., T]:

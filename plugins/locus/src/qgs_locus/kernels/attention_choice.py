@@ -3,13 +3,13 @@
 On a CPU, attention is computed block by block. On a GPU, torch's attention is used if the bias of
 all pairs of query and token needs at most 1 / SHARE of the GPU's memory in one layer. Every layer
 keeps this bias for the backward pass. For larger sizes, Triton kernels are used, or blocks if
-Triton cannot be used. The speeds of these three have not been compared on a GPU (gpu_check.py would
-print them). The choice depends on sizes only, so all layers, steps and processes make the same
-choice, and torch.compile makes one graph of all layers.
+Triton cannot be used. The speeds of these three have not been compared on a GPU:
+`tools/gpu_check.sh` measures them. The choice depends on sizes only, so all layers, steps and
+processes make the same choice, and torch.compile makes one graph of all layers.
 """
 
 import os
-from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -30,17 +30,8 @@ blocks: torch, for some queries at a time. triton: Triton kernels, which never s
 SHARE = 16
 
 
-def has_triton() -> bool:
-    """Return whether triton 3.5 or newer is installed, without importing it."""
-    try:
-        major, minor, *_ = map(int, version("triton").split(".")[:2])
-    except PackageNotFoundError:
-        return False
-    return (major, minor) >= (3, 5)
-
-
-# Constants, so that torch.compile makes one graph of a model.
-TRITON = has_triton()
+# Constants, so that torch.compile makes one graph of a model. Torch 2.9 comes with triton 3.5.
+TRITON = find_spec("triton") is not None and torch.__version__ >= "2.9"
 # The interpreter runs the kernels on a CPU, which tests do.
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
@@ -62,26 +53,26 @@ def chosen_kernel(
         return kernel
     if q_BhNd.device.type != "cuda":
         return "blocks"
-    memory = torch.cuda.get_device_properties(q_BhNd.device).total_memory
-    if plain_bytes(q_BhNd, bias) <= memory // SHARE:
+    gpu = torch.cuda.get_device_properties(q_BhNd.device)
+    # The bias of all pairs is compiled, by Triton too, which needs tensor cores.
+    compiles = TRITON and gpu.major >= 7
+    if compiles and plain_bytes(q_BhNd, bias) <= gpu.total_memory // SHARE:
         return "plain"
-    found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
-    warn_once(f"attention uses {found}: the bias of all queries and tokens needs too much memory")
+    found = "triton" if compiles and fits_triton(q_BhNd, bias) else "blocks"
+    # A warning would end the graph.
+    if not torch.compiler.is_compiling():
+        needed = "plain attention needs a newer GPU, Triton or more memory"
+        warn_once(f"attention uses {found}: {needed}")
     return found
 
 
 def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
     """Return the bytes that plain attention needs for the bias and, for each head, its gradient."""
     scenes, heads, queries, _ = q_BhNd.shape
-    read = q_BhNd.element_size()
-    each = bias.queries.element_size()
-    # Attention also reads a copy in the dtype of the queries.
-    if q_BhNd.dtype != bias.queries.dtype:
-        each += read
+    learns = bias.queries.requires_grad or bias.tokens.requires_grad
     # Torch computes the gradient of the mask for each head.
-    if torch.is_grad_enabled() and (bias.queries.requires_grad or bias.tokens.requires_grad):
-        each += heads * read
-    return scenes * queries * bias.tokens.shape[2] * each
+    copies = 1 + heads if torch.is_grad_enabled() and learns else 1
+    return scenes * queries * bias.tokens.shape[2] * q_BhNd.element_size() * copies
 
 
 def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:

@@ -62,8 +62,9 @@ def _difference(query, token):
 
 @jit
 def _bias_gradients(query, token, gradient, sums):
-    """Add what the gradients of n queries' five numbers are computed from to `sums`, five (n,).
+    """Return `sums`, five (n,), plus the gradients of n queries' five numbers from these tokens.
 
+    The gradient of the centre lacks the factor -2 factor, which is the same for all tokens.
     gradient: gradient of the loss with respect to the bias (n, m). With e = mu x d - m, the
     gradient of |e|^2 with respect to mu is 2 d x e.
     """
@@ -223,7 +224,7 @@ def _backward_tokens(
     _store(dv, m, v_sums)
 
 
-def _room(q: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
+def _empty_results(q: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
     """Return uninitialised memory for the results of `attention`."""
     return torch.empty_like(q), q.new_empty(*q.shape[:3], 1, dtype=torch.float32)
 
@@ -236,11 +237,10 @@ def attention(
     """Return the result of `biased_attention`, and log2 of the sum of 2^logits (B, h, N, 1).
 
     queries (B, N, F), tokens (B, G, M): the F numbers of each query and the G numbers of each token
-    that `RayBias` lists, float32. Tokens get no gradient.
+    that `RayBias` lists, float32, contiguous. Tokens and the second result get no gradient.
     """
-    results = _room(q)
-    # Kernels assume that rows of these are contiguous.
-    _launch(_forward, q, k, v, queries.contiguous(), tokens.contiguous(), *results)
+    results = _empty_results(q)
+    _launch(_forward, q, k, v, queries, tokens, *results)
     return results
 
 
@@ -264,7 +264,7 @@ def attention_gradients(
     dq, dk, dv = (torch.empty_like(x) if needed[n] else None for n, x in enumerate(learnt))
     by_head = queries.new_empty(*q.shape[:2], *queries.shape[1:]) if needed[3] else None
     rowsum = (gradient.float() * out.float()).sum(-1, keepdim=True)
-    given = *learnt, queries.contiguous(), tokens.contiguous(), gradient, lse, rowsum
+    given = *learnt, queries, tokens, gradient, lse, rowsum
     if dq is not None or by_head is not None:
         _launch(_backward_queries, *given, dq, by_head)
     if dk is not None or dv is not None:
@@ -274,22 +274,24 @@ def attention_gradients(
     return [x for x in (dq, dk, dv, summed) if x is not None]
 
 
-def _keep(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+def _save(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
     ctx.save_for_backward(*inputs, *output)
+    ctx.mark_non_differentiable(output[1])
 
 
 def _backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-    needed = [*ctx.needs_input_grad]
+    *needed, of_tokens = ctx.needs_input_grad
+    assert not of_tokens
     found = iter(attention_gradients(gradient, *ctx.saved_tensors, needed))
-    return tuple(next(found) if each else None for each in needed)
+    return *(next(found) if each else None for each in needed), None
 
 
-attention.register_fake(_room)
-attention.register_autograd(_backward, setup_context=_keep)
+attention.register_fake(_empty_results)
+attention.register_autograd(_backward, setup_context=_save)
 
 
 @attention_gradients.register_fake
-def _room_of_gradients(gradient: Tensor, *given: Any) -> list[Tensor]:
+def _empty_gradients(gradient: Tensor, *given: Any) -> list[Tensor]:
     *tensors, needed = given
     return [torch.empty_like(x) for x, each in zip(tensors[:4], needed, strict=False) if each]
 
@@ -312,10 +314,11 @@ def _launch(kernel: Any, *tensors: Any) -> None:
 def _blocks(q: Tensor, kernel: Any) -> dict[str, int]:
     """Return block sizes and numbers of warps for which 255 registers per thread suffice.
 
-    In half precision with heads of at most 64 channels, the code for an H100 then has 24 (forward),
-    53 and 28 instructions for 32 pairs of query and token (blocks of 64 x 32: 39, 53, 34). Products
-    in float32 do not use the GPU's matrix units, so loading blocks in advance (num_stages above 1)
-    would only cost registers.
+    In half precision with heads of at most 64 channels, a warp on an H100 then takes 24, 53 and 28
+    instructions for 32 pairs of query and token (forward, gradients of queries, of tokens; counted
+    in compiled code). Blocks of 64 x 32 would take 39, 53 and 34, and 128 x 64 with 8 warps 35, 61
+    and 30. Products in float32 do not use the GPU's matrix units, so loading blocks in advance
+    (num_stages above 1) would only cost registers.
     """
     # `tl.dot` needs at least 16.
     width = max(triton.next_power_of_2(q.shape[-1]), 16)
