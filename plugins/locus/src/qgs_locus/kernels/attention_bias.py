@@ -215,7 +215,7 @@ def attention_mask(value: Value, queries: Tensor, tokens: Tensor, dtype: torch.d
 
 @cache
 def _compiled_mask() -> Callable[[Value, Tensor, Tensor, torch.dtype], Tensor]:
-    """Return `attention_mask` as one kernel, which stores nothing but the mask."""
+    """Return `attention_mask` as one kernel, for gradients with a bool for each pair."""
     return torch.compile(attention_mask, dynamic=True)
 
 
