@@ -29,6 +29,7 @@ from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 
 T = TypeVar("T")
 Value = Callable[[Tensor, Tensor], Tensor]
+"""Function of n queries' numbers (n, F) and all tokens' numbers (G, M): the bias (n, M)."""
 Block = tuple[int, slice, tuple[Tensor, ...]]
 """Block: index of the scene, slice of its queries, and buffers (n, M) for these n queries."""
 
