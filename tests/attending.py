@@ -40,7 +40,7 @@ def flex(q, k, v, bias):
     def biased(logit, scene, head, n, m):
         x, y, z, factor, lower = (numbers[scene, n] for numbers in queries)
         m0, m1, m2, d0, d1, d2 = (numbers[scene, m] for numbers in tokens)
-        moments = (y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2)
+        moments = y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2
         return logit + torch.maximum(-factor * sum(e * e for e in moments), lower)
 
     return flex_attention(q, k, v, biased)

@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 assert_equal = partial(assert_close, rtol=0, atol=0)
 """To the bit, or within `atol`, however large the numbers are."""
-assert_near = partial(assert_allclose, rtol=1e-6)
+assert_near = partial(assert_allclose, rtol=1e-6, equal_nan=False)
 """Of a tensor and numbers."""
 
 

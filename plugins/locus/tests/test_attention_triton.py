@@ -92,8 +92,8 @@ def test_operators_keep_the_rules_of_torch_and_stay_in_graphs():
     seen, expected = (found(x, RayBias, given, LEARNT) for x in (compiled, TRITON))
     assert_close(seen, expected)
     read = [given[name].requires_grad_() for name in LEARNT]
-    operator = import_module("qgs_locus.kernels.attention_triton").attention
-    torch.library.opcheck(operator, [*read, given["tokens"]])
+    kernels = import_module("qgs_locus.kernels.attention_triton")
+    torch.library.opcheck(kernels.attention, [*read, given["tokens"]])
 
 
 @runs

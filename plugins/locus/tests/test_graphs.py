@@ -18,16 +18,16 @@ import qgs
 
 VIEWS = odd_views(width=24)
 MOST = """
-tokengs total 161
-tokengs decoder.self_attention 24
-tokengs decoder.cross_attention 20
-locus total 352
-locus decoder.self_attention 88
-locus decoder.cross_attention 81
-locus refinements 44
-landmark total 783
-landmark decoder.self_attention 138
-landmark queries 310
+tokengs | total | 161
+tokengs | decoder.self_attention | 24
+tokengs | decoder.cross_attention | 20
+locus | total | 352
+locus | decoder.self_attention | 88
+locus | decoder.cross_attention | 81
+locus | refinements | 44
+landmark | total | 783
+landmark | decoder.self_attention | 138
+landmark | queries | 310
 """
 """Operators of four layers with plain attention. They may only fall."""
 
@@ -41,8 +41,8 @@ def small(monkeypatch):
 @torch.inference_mode()
 def test_operators_of_a_forward_pass_may_only_fall(small, monkeypatch):
     # on a GPU, the mask is one kernel
-    monkeypatch.setattr(attention_bias, "attention_mask", lambda *_: torch.zeros(1, 1, 1, 1))
-    for name, part, most in rows(MOST, " "):
+    monkeypatch.setattr(attention_bias, "attention_mask", lambda *_: torch.zeros(1, 1, 1))
+    for name, part, most in rows(MOST):
         model = small(name)
         operators, _ = parts_of(model, partial(model, VIEWS))
         operators["total"] = operators.total()

@@ -124,13 +124,13 @@ class AttentionBias(ABC):
         # It needs numba.
         return import_module(self.kernels) if usable else None
 
-    @full_precision
     def dense(self, chosen: Tensor | slice = slice(None)) -> Tensor:
         """Return the bias (B, N, M) of all queries, or (B, Q, M) of the Q queries `chosen`.
 
         chosen: indices (Q,) of queries.
         """
-        return torch.vmap(self.value)(self.queries[:, chosen], self.tokens)
+        queries = self.queries[:, chosen]
+        return attention_mask(self.value, queries, self.tokens, queries.dtype)
 
     def blocks(self, buffers: int, dtype: torch.dtype) -> Iterator[Block]:
         """Yield all queries block by block, each with `buffers` tensors (n, M) to write to."""
@@ -194,11 +194,11 @@ def biased_attention(
     if chosen == "plain":
         eager = q_BhNd.device.type == "cpu" or torch.compiler.is_compiling()
         mask = attention_mask if eager else _compiled_mask()
-        mask_B1NM = mask(bias.value, *of_bias, q_BhNd.dtype)
+        mask_BNM = mask(bias.value, *of_bias, q_BhNd.dtype)
         # cuDNN's gradients would be NaN (pytorch issue 196678).
         faulty = torch.is_grad_enabled() and k_BhMd.shape[2] % 128 == 64
         with sdpa_kernel(_WITHOUT_CUDNN) if faulty else nullcontext():
-            return F.scaled_dot_product_attention(*qkv, attn_mask=mask_B1NM)
+            return F.scaled_dot_product_attention(*qkv, attn_mask=mask_BNM[:, None])
     if chosen == "triton":
         from qgs_locus.kernels.attention_triton import attention  # needs triton
 
@@ -208,10 +208,10 @@ def biased_attention(
 
 
 def attention_mask(value: Value, queries: Tensor, tokens: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return the bias of all queries and tokens as a mask (B, 1, N, M) in `dtype`."""
+    """Return the bias (B, N, M) of all queries and tokens in `dtype`, differentiable."""
     # Not by `full_precision`, whose code, and so whose limit of compilations, many functions share.
     with torch.autocast(queries.device.type, enabled=False):
-        return torch.vmap(value)(queries, tokens)[:, None].to(dtype)
+        return torch.vmap(value)(queries, tokens).to(dtype)
 
 
 @cache
